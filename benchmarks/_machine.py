@@ -1,0 +1,57 @@
+"""Facts about the machine and the process that every benchmark line carries."""
+
+import os
+import platform
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+
+def facts() -> dict[str, str | int | float]:
+    """Describes where and when a figure was measured.
+
+    Returns:
+        ``cpu`` (model name), ``cores`` (those this process may use), ``threads`` (numba's number),
+        ``load`` (1-minute load average at the call, -1 where the system has none), ``date`` (UTC,
+        ISO 8601) and the versions ``python``, ``torch``, ``numba`` and ``numpy``.
+    """
+    import numba
+
+    return {
+        "cpu": _cpu_model(),
+        "cores": _cores(),
+        "threads": numba.get_num_threads(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else -1.0,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "torch": version("torch"),
+        "numba": version("numba"),
+        "numpy": version("numpy"),
+    }
+
+
+def peak_mib() -> float:
+    """Returns the largest resident memory of this process so far, in MiB (NaN on Windows)."""
+    if sys.platform == "win32":
+        return float("nan")
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts KiB, macOS bytes.
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _cpu_model() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,70 @@
+"""Parameters of a backbone and the named blocks that operators and the optimizer work on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import exp, log
+from typing import Literal, TypeAlias
+
+from torch import Tensor
+
+BlockKind = Literal["geometry", "appearance", "neutral"]
+
+#: Tensor name -> leaf tensor. Per-primitive tensors have the primitives as first dimension.
+Parameters: TypeAlias = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class LearningRate:
+    """A log-linear learning rate from `initial` to `final` over the schedule's length.
+
+    Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
+    """
+
+    initial: float
+    final: float | None = None
+
+    def at(self, progress: float) -> float:
+        """The rate when a share `progress` of the schedule is over (clipped to [0, 1])."""
+        if self.final is None or self.final == self.initial:
+            return self.initial
+        u = min(max(progress, 0.0), 1.0)
+        return exp((1.0 - u) * log(self.initial) + u * log(self.final))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A group of tensors that is aggregated as one vector and shares one learning rate.
+
+    Attributes:
+        name: Name of the block.
+        tensors: Names of its tensors in `Parameters`; a single-tensor block carries its name.
+        per_primitive: Whether the first dimension of every tensor counts primitives.
+        kind: Geometry, appearance or neutral (for `group` granularity and per-block dispatch).
+        lr: Learning rate of all its tensors; 0 freezes the block.
+    """
+
+    name: str
+    tensors: tuple[str, ...]
+    per_primitive: bool
+    kind: BlockKind
+    lr: LearningRate
+
+
+def block_of(blocks: tuple[Block, ...], tensor: str) -> Block:
+    """The block that holds the tensor of that name.
+
+    Raises:
+        KeyError: No block holds it.
+    """
+    for block in blocks:
+        if tensor in block.tensors:
+            return block
+    raise KeyError(tensor)
+
+
+def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> int:
+    """The number of primitives, read off the first per-primitive tensor."""
+    for block in blocks:
+        if block.per_primitive:
+            return int(parameters[block.tensors[0]].shape[0])
+    return 0

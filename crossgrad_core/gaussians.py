@@ -1,0 +1,82 @@
+"""What every backbone decodes to and every rasterizer takes and returns."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from torch import Tensor
+
+Response = Literal["plain", "antialiased", "analytic"]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N coloured 3-D Gaussians in the local frame of the scene.
+
+    Colour is either `colors` (RGB as drawn) or spherical harmonics `sh_dc`, `sh_rest` evaluated at
+    `sh_degree`; exactly one of the two is given.
+
+    Attributes:
+        means: [N, 3] centres, local units.
+        quats: [N, 4] rotations wxyz, not necessarily normalised.
+        scales: [N, 3] standard deviations, local units, positive.
+        opacities: [N] in [0, 1].
+        colors: [N, 3] RGB.
+        sh_dc: [N, 1, 3] band 0 coefficients.
+        sh_rest: [N, B - 1, 3] higher bands (B = 4, 9 or 16), None at degree 0.
+        sh_degree: Active degree, 0 to 3.
+        response: How a Gaussian fills a pixel.
+        dilation: Added to both diagonal entries of the 2-D covariance, px^2; None takes the
+            rasterizer's own.
+        origin: [N] int64, the primitive of each Gaussian; None where Gaussian i is primitive i.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor | None = None
+    sh_dc: Tensor | None = None
+    sh_rest: Tensor | None = None
+    sh_degree: int = 0
+    response: Response = "plain"
+    dilation: float | None = None
+    origin: Tensor | None = None
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+
+@dataclass
+class Screen:
+    """Per-Gaussian screen statistics of one render.
+
+    The gradient fields are None until the render's backward pass has run.
+
+    Attributes:
+        radii: [N] int32, pixels; 0 where the Gaussian touches no pixel.
+        pixels: [N] int32, pixels in which the Gaussian was blended; None unless asked for.
+        mean_gradient: [N, 2] gradient of the loss by the projected mean, per pixel unit.
+        abs_gradient: [N, 2] the same with absolute values summed over pixels; None unless asked.
+    """
+
+    radii: Tensor
+    pixels: Tensor | None = None
+    mean_gradient: Tensor | None = None
+    abs_gradient: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Render:
+    """One rendered view.
+
+    Attributes:
+        image: [H, W, 3] linear blend over the background, not clamped.
+        alpha: [H, W] accumulated opacity, 1 - transmittance.
+        depth: [H, W] sum of weight times camera depth (not divided by alpha), or None.
+        screen: Statistics for density control.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    screen: Screen
+    depth: Tensor | None = field(default=None)

@@ -1,0 +1,45 @@
+"""The sampler slot: which views are rendered in a step."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+from crossgrad_core.component import Component, Selection, ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext, Sampled
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.state import PluginState
+
+STATE = "sampler"
+
+
+class Sampler(Component):
+    """Chooses the K training views of a step, given its state and the last step's record.
+
+    Attributes:
+        views: For which K the sampler has a meaning.
+        default_views: K where the user names none.
+        default_grouping: Name of the grouping it needs unless the user names another; None where
+            it needs no groups.
+    """
+
+    slot: ClassVar[str] = "samplers"
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 1
+    default_grouping: ClassVar[str | None] = None
+
+    @abstractmethod
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        """The views of this step and the new state. Random numbers come from `context.rng`."""
+
+    @hookimpl
+    def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
+        """Answers the seam with this sampler's draw."""
+        draw, state = self.sample(context, context.state(STATE))
+        return Sampled(draw, states={STATE: state})
+
+    @hookimpl
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Refuses numbers of views for which the sampler means nothing."""
+        if self.views.admits(selection.views_per_step):
+            return []
+        name = selection.names["sampler"]
+        return [f"sampler {name} needs {self.views}; K = {selection.views_per_step} was asked for"]

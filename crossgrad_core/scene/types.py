@@ -1,0 +1,144 @@
+"""The data types of a scene."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        fx: Focal length in pixels; likewise `fy`.
+        fy: See `fx`.
+        cx: Principal point in pixels from the left (top for `cy`) image border.
+        cy: See `cx`.
+        world_to_camera: [4, 4] float64 on the CPU, rigid, local frame to camera frame.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: Tensor
+
+    @cached_property
+    def center(self) -> Tensor:
+        """[3] float64, the camera centre in the local frame."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @cached_property
+    def matrix(self) -> Tensor:
+        """[3, 3] float64, the calibration matrix K."""
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera for an image resampled to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+
+class Photo(Protocol):
+    """A photo that is decoded when it is asked for."""
+
+    def image(self) -> Tensor:
+        """[H, W, 3] uint8, RGB, in the size of the view's camera."""
+        ...
+
+    def mask(self) -> Tensor | None:
+        """[H, W] bool, True where the pixel counts; None where every pixel counts."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera with its photo, its unique name (path below the image folder) and its regime.
+
+    Attributes:
+        name: Path relative to the image folder with forward slashes.
+        camera: The camera, in the size of the photo as trained.
+        photo: The decoded-on-demand photo.
+        regime: Label under which results are reported.
+        seen: [S] int64 indices of the SfM points that this view observed; may be empty.
+    """
+
+    name: str
+    camera: Camera
+    photo: Photo
+    regime: str
+    seen: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x_local = (x_input - offset) * scale, in float64; the rotation is the identity.
+
+    Attributes:
+        offset: [3] float64, input frame.
+        scale: Local units per input unit.
+    """
+
+    offset: NDArray[np.float64]
+    scale: float
+
+    def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the input frame in the local frame."""
+        return (points - self.offset) * self.scale
+
+    def to_input(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the local frame in the input frame."""
+        return points / self.scale + self.offset
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything a run knows about a place.
+
+    Attributes:
+        name: Short name, used for the output folder.
+        views: All views, sorted by name.
+        train: Positions in `views` that are trained on.
+        test: Positions in `views` that are held out.
+        points: [P, 3] float64 SfM points, local frame.
+        point_colors: [P, 3] uint8 RGB.
+        similarity: Maps the local frame back to the input frame.
+        notes: What was done to the input and why (undistorted, resized, images left out ...).
+    """
+
+    name: str
+    views: tuple[View, ...]
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+    points: NDArray[np.float64]
+    point_colors: NDArray[np.uint8]
+    similarity: Similarity
+    notes: tuple[str, ...] = ()
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The training views, in the order that samplers index."""
+        return tuple(self.views[i] for i in self.train)
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """The held-out views."""
+        return tuple(self.views[i] for i in self.test)

@@ -1,0 +1,83 @@
+"""When things happen, in optimizer steps (1-based: the first step is step 1)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+ScheduleMode = Literal["scaled", "absolute"]
+
+#: The length that every published figure is written for (3DGS).
+REFERENCE_STEPS = 30_000
+#: Shorter runs have no opacity reset: they could not recover from one.
+SHORTEST_RUN_WITH_RESET = 10_000
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """All schedule lengths of one run, in optimizer steps.
+
+    Attributes:
+        total: Length of the run.
+        lr_steps: Length of the log-linear learning-rate decay.
+        sh_interval: The SH degree grows by one every so many steps.
+        densify_from: Density control edits after this step ...
+        densify_until: ... and before this one.
+        densify_every: Interval of edits.
+        reset_every: Interval of opacity resets; None where there are none.
+        anchors_from: Anchor growing starts after this step.
+    """
+
+    total: int
+    lr_steps: int
+    sh_interval: int
+    densify_from: int
+    densify_until: int
+    densify_every: int
+    reset_every: int | None
+    anchors_from: int
+
+    @classmethod
+    def for_run(cls, total: int, mode: ScheduleMode = "scaled") -> "Schedule":
+        """The schedule of a run of `total` steps.
+
+        `scaled` stretches the published 30,000-step schedule with floors; `absolute` keeps the
+        published numbers whatever the length.
+        """
+        if mode == "absolute":
+            return cls(total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500)
+        return cls(
+            total=total,
+            lr_steps=total,
+            sh_interval=max(100, total // 30),
+            densify_from=total // 60,
+            densify_until=total // 2,
+            densify_every=max(50, total // 300),
+            reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
+            anchors_from=total // 20,
+        )
+
+    def sh_degree(self, step: int, maximum: int = 3) -> int:
+        """Active spherical-harmonics degree at a step."""
+        return min(maximum, step // self.sh_interval)
+
+    def densifies(self, step: int) -> bool:
+        """Whether density control edits the primitives after this step."""
+        inside = self.densify_from < step < self.densify_until
+        return inside and step % self.densify_every == 0
+
+    def collects(self, step: int) -> bool:
+        """Whether densification statistics of this step are still needed."""
+        return step < self.densify_until
+
+    def resets(self, step: int) -> bool:
+        """Whether opacities are reset after this step."""
+        every = self.reset_every
+        return every is not None and step < self.densify_until and step % every == 0
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What a backbone may know about the moment it decodes in."""
+
+    step: int
+    training: bool
+    schedule: Schedule

@@ -1,0 +1,46 @@
+"""State of plugins: values that are handed in, returned, checkpointed and carried through edits."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+
+
+@dataclass(frozen=True)
+class PluginState:
+    """What one plugin remembers between steps.
+
+    Attributes:
+        values: Plain numbers, strings, lists and dictionaries (must survive JSON).
+        tensors: Tensors of any shape.
+        per_primitive: Tensors whose first dimension is the number of primitives; topology edits
+            gather their rows along with the parameters (rows of new primitives start at zero).
+    """
+
+    values: Mapping[str, Json] = field(default_factory=dict)
+    tensors: Mapping[str, Tensor] = field(default_factory=dict)
+    per_primitive: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def gathered(self, source: Tensor, fresh: Tensor) -> "PluginState":
+        """The state after a topology edit.
+
+        Args:
+            source: [M] int64, for each new primitive the old one whose row it takes over.
+            fresh: [M] bool, primitives whose rows start at zero.
+        """
+        rows = {name: carried(old, source, fresh) for name, old in self.per_primitive.items()}
+        return PluginState(self.values, self.tensors, rows)
+
+
+def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
+    """Rows of `old` at `source` [M], with the rows marked in `fresh` [M] set to zero."""
+    new = old[source]
+    new[fresh] = torch.zeros((), dtype=old.dtype, device=old.device)
+    return new
+
+
+EMPTY_STATE = PluginState()

@@ -1,0 +1,1 @@
+"""Gradient operators that ship with crossgrad."""

@@ -1,0 +1,1 @@
+"""Samplers, groupings, densifiers, rasterizers, readers and observers that ship with crossgrad."""
