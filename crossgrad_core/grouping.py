@@ -2,30 +2,70 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crossgrad_core.component import Component
 from crossgrad_core.scene.types import Scene, View
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """What a grouping answers.
+
+    Attributes:
+        labels: One label per view, in the order in which the views were given.
+        notes: What the user should know about the rule as fitted (its threshold, a fall-back ...).
+    """
+
+    labels: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+class GradientProbe(Protocol):
+    """Gradients of a model with frozen parameters, seen through their dot products only."""
+
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """[B] name of each Gramian's block."""
+        ...
+
+    def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
+        """[B, V, V] float64 Gramians of the gradients of V training views, given by position."""
+        ...
 
 
 class Grouping(Component):
     """Labels views; the rule is fitted on the training cameras and then applied to all.
 
     Attributes:
-        labels: Every label the rule can give, near first.
+        labels: Every label the rule can give, near first; empty where the user's input names them.
+        needs_probe: Whether the rule looks at gradients; it then refuses to label without a probe.
     """
 
     slot: ClassVar[str] = "groupings"
     labels: ClassVar[tuple[str, ...]] = ("near", "far")
+    needs_probe: ClassVar[bool] = False
 
     @abstractmethod
     def label(
-        self, scene: Scene, views: Sequence[View], rng: np.random.Generator
-    ) -> tuple[str, ...]:
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
         """One label per view of `views`, by the rule fitted on `scene.train_views`.
 
+        Args:
+            scene: The scene.
+            views: The views to be labelled.
+            rng: The only source of random numbers.
+            probe: Gradients of the training views, for rules that need them.
+
         Raises:
-            UserError: The rule leaves a group empty, with what to do.
+            UserError: The rule leaves a group without training views, with what to do.
         """

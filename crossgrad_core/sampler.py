@@ -15,8 +15,8 @@ class Sampler(Component):
     """Chooses the K training views of a step, given its state and the last step's record.
 
     Attributes:
-        views: For which K the sampler has a meaning.
-        default_views: K where the user names none.
+        views: For which K the sampler has a meaning, unless its options say otherwise.
+        default_views: K where the user names none, unless its options say otherwise.
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no groups.
     """
@@ -25,6 +25,16 @@ class Sampler(Component):
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 1
     default_grouping: ClassVar[str | None] = None
+
+    @property
+    def view_counts(self) -> ViewCounts:
+        """For which K the sampler has a meaning with its options as they are."""
+        return self.views
+
+    @property
+    def usual_views(self) -> int:
+        """K where the user names none."""
+        return self.default_views
 
     @abstractmethod
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
@@ -39,7 +49,7 @@ class Sampler(Component):
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """Refuses numbers of views for which the sampler means nothing."""
-        if self.views.admits(selection.views_per_step):
+        if self.view_counts.admits(selection.views_per_step):
             return []
-        name = selection.names["sampler"]
-        return [f"sampler {name} needs {self.views}; K = {selection.views_per_step} was asked for"]
+        name, views = selection.names["sampler"], selection.views_per_step
+        return [f"sampler {name} needs {self.view_counts}; K = {views} was asked for"]

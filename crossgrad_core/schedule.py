@@ -23,6 +23,7 @@ class Schedule:
         densify_until: ... and before this one.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None where there are none.
+        prune_large_from: Gaussians that are large in the world are pruned after this step.
         anchors_from: Anchor growing starts after this step.
     """
 
@@ -33,6 +34,7 @@ class Schedule:
     densify_until: int
     densify_every: int
     reset_every: int | None
+    prune_large_from: int
     anchors_from: int
 
     @classmethod
@@ -43,7 +45,7 @@ class Schedule:
         published numbers whatever the length.
         """
         if mode == "absolute":
-            return cls(total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500)
+            return cls(total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 3000, 1500)
         return cls(
             total=total,
             lr_steps=total,
@@ -52,6 +54,7 @@ class Schedule:
             densify_until=total // 2,
             densify_every=max(50, total // 300),
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
+            prune_large_from=total // 10,
             anchors_from=total // 20,
         )
 

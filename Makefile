@@ -1,0 +1,35 @@
+# `make demo` and `make test` need nothing but Python 3.11+ and a package index.
+PYTHON ?= python3
+VENV ?= .venv
+TEST_VENV ?= .venv-test
+BIN = $(VENV)/bin
+PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo install test lint bench clean
+
+demo: install  ## Train the bundled real scene for two minutes and print the results
+	$(BIN)/crossgrad run
+
+install: $(VENV)/.installed  ## Environment with an editable install
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install $(PIP_FLAGS) --editable .
+	touch $@
+
+test:  ## Build the wheel, install it into a fresh environment, run all tests against it
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh
+
+lint: install  ## ruff and mypy
+	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: install  ## The figures of docs/benchmarks.md (needs the case files named there)
+	$(BIN)/python benchmarks/loss.py
+	$(BIN)/python benchmarks/adam.py
+	$(BIN)/python benchmarks/operators.py
+
+clean:  ## Remove environments and caches; keeps runs/
+	rm -rf $(VENV) $(TEST_VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,145 @@
+"""Vanilla 3DGS: one explicit Gaussian per primitive (Kerbl et al. 2023)."""
+
+from collections.abc import Mapping
+from math import log
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.scene.types import Camera, Scene
+from crossgrad_core.schedule import Phase
+from crossgrad_core.spherical import COEFFICIENTS, SH_C0
+from crossgrad_core.splats import nearest_neighbour_scales
+
+#: Opacity of a new Gaussian.
+INITIAL_OPACITY = 0.1
+
+
+class Vanilla(Backbone):
+    """The 3DGS representation with its published learning rates.
+
+    Blocks: means [N, 3]; scales [N, 3] (log); quats [N, 4] wxyz; opacities [N] (logit);
+    f_dc [N, 1, 3]; f_rest [N, 15, 3]. Source: 3DGS, methods of section 5.
+    """
+
+    sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")
+    lr_means: float = Field(1.6e-4, gt=0, description="initial, per scene extent")
+    lr_means_final: float = Field(1.6e-6, gt=0, description="final, per scene extent")
+    lr_scales: float = Field(5e-3, ge=0)
+    lr_quats: float = Field(1e-3, ge=0)
+    lr_opacities: float = Field(0.05, ge=0)
+    lr_f_dc: float = Field(2.5e-3, ge=0)
+    lr_f_rest: float = Field(2.5e-3 / 20, ge=0)
+
+    @override
+    def blocks(self) -> tuple[Block, ...]:
+        rows = (
+            Block("means", ("means",), True, "geometry", self._means_lr()),
+            Block("scales", ("scales",), True, "geometry", LearningRate(self.lr_scales)),
+            Block("quats", ("quats",), True, "geometry", LearningRate(self.lr_quats)),
+            Block("opacities", ("opacities",), True, "appearance", LearningRate(self.lr_opacities)),
+            Block("f_dc", ("f_dc",), True, "appearance", LearningRate(self.lr_f_dc)),
+        )
+        if self.sh_degree == 0:
+            return rows
+        rest = Block("f_rest", ("f_rest",), True, "appearance", LearningRate(self.lr_f_rest))
+        return (*rows, rest)
+
+    def _means_lr(self) -> LearningRate:
+        return LearningRate(self.lr_means, self.lr_means_final)
+
+    @override
+    def fitted_to(self, scene: Scene) -> tuple["Vanilla", tuple[str, ...]]:
+        """Leaves out spherical-harmonics bands that the number of views cannot support.
+
+        A Gaussian is seen from at most as many directions as there are training views; a band
+        pays only where there are at least as many views as coefficients.
+        """
+        if "sh_degree" in self.model_fields_set:
+            return self, ()
+        views = len(scene.train)
+        degree = max(d for d in range(4) if COEFFICIENTS[d] <= max(views, 1))
+        if degree == self.sh_degree:
+            return self, ()
+        note = (
+            f"spherical harmonics limited to degree {degree}: {views} training views give fewer "
+            f"directions than degree {degree + 1} has coefficients ({COEFFICIENTS[degree + 1]}); "
+            "--set backbone.sh_degree=3 forces all bands"
+        )
+        return self.model_copy(update={"sh_degree": degree}), (note,)
+
+    @override
+    def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
+        count = scene.points.shape[0]
+        means = torch.from_numpy(scene.points).float()
+        scales = torch.from_numpy(nearest_neighbour_scales(scene.points)).float()
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1.0
+        rgb = torch.from_numpy(scene.point_colors).float() / 255.0
+        opacity = log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
+        tensors = {
+            "means": means,
+            "scales": scales.log()[:, None].repeat(1, 3),
+            "quats": quats,
+            "opacities": torch.full((count,), opacity),
+            "f_dc": ((rgb - 0.5) / SH_C0)[:, None, :],
+        }
+        return self._with_rest(tensors, count)
+
+    @override
+    def adopt(self, gaussians: Gaussians) -> Parameters:
+        if gaussians.sh_dc is None:
+            raise ValueError("only spherical-harmonics Gaussians can be adopted")
+        opacities = gaussians.opacities.clamp(1e-6, 1.0 - 1e-6)
+        tensors = {
+            "means": gaussians.means.clone(),
+            "scales": gaussians.scales.log(),
+            "quats": gaussians.quats.clone(),
+            "opacities": torch.logit(opacities),
+            "f_dc": gaussians.sh_dc.clone(),
+        }
+        return self._with_rest(tensors, len(gaussians), gaussians.sh_rest)
+
+    def _with_rest(
+        self, tensors: Parameters, count: int, given: Tensor | None = None
+    ) -> Parameters:
+        if self.sh_degree > 0:
+            rest = torch.zeros(count, COEFFICIENTS[self.sh_degree] - 1, 3)
+            if given is not None:
+                bands = min(rest.shape[1], given.shape[1])
+                rest[:, :bands] = given[:, :bands]
+            tensors["f_rest"] = rest
+        return {name: tensor.requires_grad_() for name, tensor in tensors.items()}
+
+    @override
+    def decode(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Gaussians:
+        degree = phase.schedule.sh_degree(phase.step, self.sh_degree)
+        return Gaussians(
+            means=parameters["means"],
+            quats=parameters["quats"],
+            scales=torch.exp(parameters["scales"]),
+            opacities=torch.sigmoid(parameters["opacities"]),
+            sh_dc=parameters["f_dc"],
+            sh_rest=parameters["f_rest"] if degree > 0 else None,
+            sh_degree=degree,
+        )
+
+    @override
+    def bake(
+        self, parameters: Mapping[str, Tensor], phase: Phase, camera: Camera | None = None
+    ) -> Gaussians:
+        return Gaussians(
+            means=parameters["means"].detach(),
+            quats=parameters["quats"].detach(),
+            scales=torch.exp(parameters["scales"].detach()),
+            opacities=torch.sigmoid(parameters["opacities"].detach()),
+            sh_dc=parameters["f_dc"].detach(),
+            sh_rest=parameters["f_rest"].detach() if "f_rest" in parameters else None,
+            sh_degree=self.sh_degree,
+        )

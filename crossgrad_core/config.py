@@ -1,0 +1,91 @@
+"""The fully resolved configuration of a run: one schema for command line, file and results."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.schedule import ScheduleMode
+
+
+class ComponentChoice(BaseModel):
+    """A component by name with its options; the options are validated by the component itself."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    name: str
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options as given."""
+        return dict(self.model_extra or {})
+
+
+class RunConfig(BaseModel):
+    """Everything that determines a run.
+
+    `None` means "decided at the start of the run": `run` writes the decision into config.yaml.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path | None = Field(
+        None, description="scene folder; the bundled one where none is given"
+    )
+    out: Path | None = Field(None, description="output folder")
+
+    backbone: ComponentChoice = ComponentChoice(name="vanilla")
+    sampler: ComponentChoice = ComponentChoice(name="random")
+    grouping: ComponentChoice | None = None
+    operator: ComponentChoice | tuple[ComponentChoice, ...] = ComponentChoice(name="sum")
+    densifier: ComponentChoice | None = None
+    rasterizer: ComponentChoice = ComponentChoice(name="auto")
+    reader: ComponentChoice = ComponentChoice(name="auto")
+    observers: tuple[ComponentChoice, ...] = ()
+
+    views: int | None = Field(None, ge=1, description="views per step, K; default: the sampler's")
+    steps: int | None = Field(None, ge=1, description="optimizer steps")
+    seconds: float | None = Field(
+        None, gt=0, description="training seconds; the number of steps is fixed from a timed probe"
+    )
+    seed: int = Field(0, ge=0, description="seed of every random number of the run")
+    schedule: ScheduleMode = "scaled"
+    preset: Literal["default", "inria"] = "default"
+    backward: Literal["separate", "joint"] = "separate"
+    device: str = "cpu"
+    threads: int | None = Field(None, ge=1, description="CPU threads; default: all there are")
+    reading: SceneOptions = SceneOptions()
+    ssim_weight: float = Field(0.2, ge=0, le=1, description="share of 1 - SSIM in the loss")
+    background: str = Field("black", description="black, white, random, or r,g,b in [0, 1]")
+    max_gaussians: int | None = Field(None, ge=1, description="density control stops growing here")
+    eval_every: int | None = Field(None, ge=1, description="steps between evaluations")
+    save_every: int | None = Field(None, ge=1, description="steps between checkpoints")
+    stop_after: int | None = Field(None, ge=1, description="stop, resumable, after this step")
+    max_dropped: int = Field(
+        100, ge=1, description="stop after so many blocks were dropped as non-finite"
+    )
+
+    @field_validator("operator", mode="before")
+    @classmethod
+    def _chain(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("background")
+    @classmethod
+    def _background(cls, value: str) -> str:
+        if value in {"black", "white", "random"}:
+            return value
+        parts = value.split(",")
+        try:
+            inside = len(parts) == 3 and all(0.0 <= float(part) <= 1.0 for part in parts)
+        except ValueError:
+            inside = False
+        if not inside:
+            raise ValueError("must be black, white, random, or three numbers r,g,b in [0, 1]")
+        return value
+
+    @property
+    def operators(self) -> tuple[ComponentChoice, ...]:
+        """The links of the operator chain; one for a single operator."""
+        return self.operator if isinstance(self.operator, tuple) else (self.operator,)

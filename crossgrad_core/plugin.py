@@ -1,0 +1,101 @@
+"""The public interface for authors of plugins: everything that a plugin needs, from one place.
+
+Names that are listed here keep their meaning within a minor version; see docs/plugins.md.
+"""
+
+from pydantic import Field
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.blocks import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.component import Component, Selection, ViewCounts
+from crossgrad_core.contexts import (
+    AfterStepContext,
+    AggregateContext,
+    Aggregated,
+    Densified,
+    DensifyContext,
+    Draw,
+    EvaluationReport,
+    RegularizeContext,
+    Regularized,
+    RunInfo,
+    SampleContext,
+    Sampled,
+    StepContext,
+    StepRecord,
+    ViewRecord,
+)
+from crossgrad_core.densifier import Densifier
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
+from crossgrad_core.gradients import ViewGradients
+from crossgrad_core.grouping import Grouping
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.observer import Observer
+from crossgrad_core.operator import Granularity, Operator, OperatorContext
+from crossgrad_core.rasterizer import Rasterizer
+from crossgrad_core.reader import Reader
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.scene.types import Camera, Photo, Scene, Similarity, View
+from crossgrad_core.schedule import Phase, Schedule
+from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows
+
+__all__ = [
+    "EMPTY_STATE",
+    "NO_EDIT",
+    "AfterStepContext",
+    "AggregateContext",
+    "Aggregated",
+    "Backbone",
+    "Block",
+    "BlockKind",
+    "Camera",
+    "Component",
+    "Densified",
+    "Densifier",
+    "DensifyContext",
+    "Draw",
+    "Edit",
+    "EvaluationReport",
+    "Field",
+    "Gaussians",
+    "Granularity",
+    "Grouping",
+    "IncompatibleSelectionError",
+    "LearningRate",
+    "NoEdit",
+    "Observer",
+    "Operator",
+    "OperatorContext",
+    "Parameters",
+    "Phase",
+    "Photo",
+    "PluginState",
+    "Rasterizer",
+    "Reader",
+    "RegularizeContext",
+    "Regularized",
+    "Render",
+    "Response",
+    "Rows",
+    "RunInfo",
+    "SampleContext",
+    "Sampled",
+    "Sampler",
+    "Scene",
+    "SceneOptions",
+    "Schedule",
+    "Screen",
+    "Selection",
+    "Similarity",
+    "StepContext",
+    "StepRecord",
+    "UserError",
+    "View",
+    "ViewCounts",
+    "ViewGradients",
+    "ViewRecord",
+    "hookimpl",
+]

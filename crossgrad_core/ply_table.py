@@ -1,0 +1,196 @@
+"""The vertices of a PLY file as named columns: ascii or binary, any property order and type."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.files import size_text
+
+#: PLY type name -> numpy type without byte order.
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER_LINE = 65_536
+_MOST_HEADER_LINES = 10_000
+
+
+@dataclass(frozen=True)
+class Element:
+    """A kind of record of a PLY file; `fields` is None where it has list properties."""
+
+    name: str
+    count: int
+    fields: tuple[tuple[str, str], ...] | None
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a PLY header says; `byte_order` is None for ascii files."""
+
+    byte_order: str | None
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """Property name -> [N] column in the file's own type, and the comments of the header."""
+
+    columns: Mapping[str, NDArray[np.generic]]
+    comments: tuple[str, ...]
+
+
+def read_vertices(path: Path) -> Vertices:
+    """Reads the element `vertex` of a PLY file.
+
+    Raises:
+        UserError: The file is missing, is not a PLY file, has no vertices or ends too early.
+    """
+    if not path.is_file():
+        raise UserError("no such PLY file", where=path)
+    with path.open("rb") as file:
+        header = _read_header(file, path)
+        before: list[Element] = []
+        for element in header.elements:
+            if element.name == "vertex":
+                read = _read_ascii if header.byte_order is None else _read_binary
+                return Vertices(read(file, path, header, element, before), header.comments)
+            before.append(element)
+    raise UserError("PLY file without vertices", where=path, expected="an element called vertex")
+
+
+def _malformed(path: Path, found: str) -> UserError:
+    return UserError("not a readable PLY file", where=path, found=found)
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    if file.readline(8).strip() != b"ply":
+        raise UserError("not a PLY file", where=path, expected="a first line that says ply")
+    lines = _header_lines(file, path)
+    comments = [line.removeprefix("comment").strip() for line in lines if _keyword(line, "comment")]
+    formats = [line.split()[1:2] for line in lines if _keyword(line, "format")]
+    if len(formats) != 1 or not formats[0] or formats[0][0] not in _FORMATS:
+        raise _malformed(path, f"a header whose format is none of {', '.join(_FORMATS)}")
+    return Header(_FORMATS[formats[0][0]], _elements(lines, path), tuple(comments))
+
+
+def _keyword(line: str, *words: str) -> bool:
+    return line.partition(" ")[0] in words
+
+
+def _elements(lines: list[str], path: Path) -> tuple[Element, ...]:
+    elements: list[Element] = []
+    for line in lines:
+        match line.split():
+            case ["element", name, count] if count.isdigit():
+                elements.append(Element(name, int(count), ()))
+            case ["property", *words] if elements:
+                elements[-1] = _with_property(elements[-1], words, path)
+            case [("format" | "comment" | "obj_info"), *_] | []:
+                pass
+            case _:
+                raise _malformed(path, f"the header line {line!r}")
+    return tuple(elements)
+
+
+def _header_lines(file: BinaryIO, path: Path) -> list[str]:
+    lines: list[str] = []
+    for _ in range(_MOST_HEADER_LINES):
+        raw = file.readline(_LONGEST_HEADER_LINE)
+        line = raw.decode("utf-8", errors="replace").strip()
+        if line == "end_header":
+            return lines
+        if not raw.endswith(b"\n"):
+            break
+        lines.append(line)
+    raise _malformed(path, "a header that does not end")
+
+
+def _with_property(element: Element, words: list[str], path: Path) -> Element:
+    if words[:1] == ["list"]:
+        return Element(element.name, element.count, None)
+    if len(words) != 2 or words[0] not in _TYPES:  # noqa: PLR2004 - a type and a name
+        raise _malformed(path, f"the property {' '.join(words)!r}")
+    if element.fields is None:
+        return element
+    if words[1] in dict(element.fields):
+        raise _malformed(path, f"two properties called {words[1]!r}")
+    fields = (*element.fields, (words[1], _TYPES[words[0]]))
+    return Element(element.name, element.count, fields)
+
+
+def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
+    if element.fields is None:
+        raise UserError(
+            "PLY file with lists where vertices are expected",
+            where=path,
+            found=f"list properties in the element {element.name}",
+            todo="export the Gaussians without faces",
+        )
+    return np.dtype([(name, f"{header.byte_order}{kind}") for name, kind in element.fields])
+
+
+def _truncated(path: Path, expected: str, found: str) -> UserError:
+    return UserError(
+        "PLY file ends too early",
+        where=path,
+        expected=expected,
+        found=found,
+        todo="copy or export the file again",
+    )
+
+
+def _read_binary(
+    file: BinaryIO, path: Path, header: Header, vertex: Element, before: list[Element]
+) -> dict[str, NDArray[np.generic]]:
+    skip = sum(item.count * _dtype(item, header, path).itemsize for item in before)
+    dtype = _dtype(vertex, header, path)
+    start = file.tell() + skip
+    needed, there = vertex.count * dtype.itemsize, path.stat().st_size - start
+    if there < needed:
+        found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
+        expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
+        raise _truncated(path, expected, found)
+    file.seek(start)
+    rows = np.fromfile(file, dtype=dtype, count=vertex.count)
+    return {name: rows[name] for name in dtype.names or ()}
+
+
+def _read_ascii(
+    file: BinaryIO, path: Path, header: Header, vertex: Element, before: list[Element]
+) -> dict[str, NDArray[np.generic]]:
+    if vertex.fields is None:
+        _dtype(vertex, header, path)
+    names = [name for name, _ in vertex.fields or ()]
+    skip = sum(item.count for item in before)
+    lines = list(islice(file, skip, skip + vertex.count))
+    if len(lines) < vertex.count:
+        raise _truncated(path, f"{vertex.count:,} lines of vertices", f"{len(lines):,}")
+    try:
+        table = np.array([line.split() for line in lines], dtype=np.float64)
+        table = table.reshape(vertex.count, len(names))
+    except ValueError as error:
+        raise _malformed(path, f"a vertex line that is not {len(names)} numbers") from error
+    return {name: table[:, i] for i, name in enumerate(names)}

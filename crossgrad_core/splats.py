@@ -1,0 +1,41 @@
+"""Small geometry that several backbones and densifiers share."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+#: Floor of the mean squared neighbour distance (3DGS), in squared local units.
+SQUARED_DISTANCE_FLOOR = 1e-7
+
+
+def nearest_neighbour_scales(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Isotropic initial scale of each point (3DGS, section 5.1).
+
+    Args:
+        points: [P, 3].
+
+    Returns:
+        [P] sqrt of the mean of the squared distances to the 3 nearest other points, floored so
+        that duplicates get a size too; with fewer than 4 points those that there are.
+    """
+    from scipy.spatial import cKDTree
+
+    count = points.shape[0]
+    neighbours = min(3, count - 1)
+    if neighbours < 1:
+        return np.full(count, 0.01)
+    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    squared = np.mean(distances[:, 1:] ** 2, axis=1)
+    return np.asarray(np.sqrt(np.maximum(squared, SQUARED_DISTANCE_FLOOR)))
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] rotations of quaternions wxyz [N, 4], normalised first."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)

@@ -1,0 +1,1 @@
+"""Helpers for tests: contract checks for every slot, and tiny scenes."""

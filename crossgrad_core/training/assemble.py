@@ -1,0 +1,245 @@
+"""From a configuration to a Setup: load, fit to the scene, object, or say what was left out."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.component import Component, Selection
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.densifier import Densifier
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.grouping import Grouping
+from crossgrad_core.manager import make_manager
+from crossgrad_core.operator import Operator
+from crossgrad_core.rasterizer import Rasterizer
+from crossgrad_core.reader import Reader
+from crossgrad_core.registry import build, entries
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.scene.types import Scene
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.setup import Setup
+
+#: Length of a run that asks for neither steps nor seconds (3DGS).
+DEFAULT_STEPS = 30_000
+
+
+def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
+    """The scene and the name of the reader that read it.
+
+    Raises:
+        UserError: No reader accepts the folder, or the one that does cannot read it.
+    """
+    names = [config.reader.name] if config.reader.name != "auto" else list(entries("readers"))
+    for name in names:
+        reader = cast("Reader", build("readers", name, config.reader.options))
+        if config.reader.name != "auto" or reader.accepts(path):
+            return reader.read(path, config.reading), name
+    # No reader recognises it: the first one explains what it misses.
+    reader = cast("Reader", build("readers", "colmap", {}))
+    return reader.read(path, config.reading), "colmap"
+
+
+def choose_device(name: str) -> torch.device:
+    """The torch device of that name.
+
+    Raises:
+        UserError: There is no such device on this machine.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UserError(
+            f"there is no device {name!r}",
+            where="--device",
+            expected="cpu, cuda or cuda:N",
+            todo="leave --device out to run on the CPU",
+        ) from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(
+            "CUDA was asked for, but torch sees no CUDA device",
+            where="--device",
+            found=f"torch {torch.__version__}",
+            todo="use --device cpu, or install a CUDA build of torch",
+        )
+    if device.type not in {"cpu", "cuda"}:
+        raise UserError(
+            f"device type {device.type!r} is not supported",
+            where="--device",
+            expected="cpu or cuda",
+            todo="use --device cpu",
+        )
+    return device
+
+
+def choose_rasterizer(choice: ComponentChoice, device: torch.device) -> tuple[str, str]:
+    """The name of the rasterizer and why it was chosen."""
+    if choice.name != "auto":
+        return choice.name, f"rasterizer {choice.name}: asked for"
+    if device.type == "cpu":
+        return "numba", "rasterizer numba: the fast one on a CPU"
+    return "torch", "rasterizer torch: the only one here that runs on CUDA (a slow reference)"
+
+
+def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
+    """Loads and checks everything that the configuration names.
+
+    Raises:
+        UserError: A name or option is wrong, or the components cannot work together.
+    """
+    _require_points(config, scene)
+    device = choose_device(config.device)
+    notes: list[str] = list(scene.notes)
+    sampler = cast("Sampler", _built("samplers", config.sampler))
+    operator, operator_name = _operator(config)
+    backbone = cast("Backbone", _built("backbones", config.backbone))
+    backbone, left_out = backbone.fitted_to(scene)
+    notes += left_out
+    densifier_choice = config.densifier or ComponentChoice(name=backbone.default_densifier)
+    densifier = cast("Densifier", _built("densifiers", densifier_choice))
+    rasterizer_name, why = choose_rasterizer(config.rasterizer, device)
+    notes.append(why)
+    rasterizer = cast(
+        "Rasterizer",
+        build("rasterizers", rasterizer_name, _rasterizer_options(config, scene)),
+    )
+    views = config.views or sampler.default_views
+    grouping_choice = _grouping_choice(config, sampler, notes)
+    components: dict[str, Component] = {
+        "backbone": backbone,
+        "sampler": sampler,
+        "operator": operator,
+        "densifier": densifier,
+        "rasterizer": rasterizer,
+    }
+    names = {
+        "backbone": config.backbone.name,
+        "sampler": config.sampler.name,
+        "operator": operator_name,
+        "densifier": densifier_choice.name,
+        "rasterizer": rasterizer_name,
+        "reader": reader,
+    }
+    if grouping_choice is not None:
+        components["grouping"] = _built("groupings", grouping_choice)
+        names["grouping"] = grouping_choice.name
+    selection = Selection(components, names, views, device.type)
+    observers = {choice.name: _built("observers", choice) for choice in config.observers}
+    plugins = _plugins(components, observers)
+    manager = make_manager(plugins)
+    _object(config, selection, manager.hook.crossgrad_objections(selection=selection))
+    groups = _groups(config, scene, components.get("grouping"), notes)
+    notes += _linear_note(operator, operator_name, plugins)
+    return Setup(
+        config=config,
+        scene=scene,
+        selection=selection,
+        densifier=densifier,
+        manager=manager,
+        plugins=plugins,
+        groups=groups,
+        schedule=Schedule.for_run(config.steps or DEFAULT_STEPS, config.schedule),
+        device=device,
+        notes=tuple(notes),
+    )
+
+
+def _require_points(config: RunConfig, scene: Scene) -> None:
+    if scene.points.shape[0] == 0 and config.reading.init == "points":
+        raise UserError(
+            "the scene has no SfM points to start from",
+            where=scene.name,
+            todo="use --init random, or --init FILE.ply",
+        )
+
+
+def _built(slot: str, choice: ComponentChoice) -> Component:
+    return build(slot, choice.name, choice.options)
+
+
+def _operator(config: RunConfig) -> tuple[Operator, str]:
+    links = config.operators
+    if len(links) == 1:
+        return cast("Operator", _built("operators", links[0])), links[0].name
+    built = tuple(_built("operators", link) for link in links)
+    chain = build("operators", "chain", {"links": built})
+    return cast("Operator", chain), "+".join(link.name for link in links)
+
+
+def _rasterizer_options(config: RunConfig, scene: Scene) -> dict[str, Any]:
+    options = dict(config.rasterizer.options)
+    if config.preset == "inria":
+        # The published near plane is 0.2 units of the input frame.
+        options.setdefault("near", 0.2 * scene.similarity.scale)
+    return options
+
+
+def _grouping_choice(
+    config: RunConfig, sampler: Sampler, notes: list[str]
+) -> ComponentChoice | None:
+    if config.grouping is not None:
+        return config.grouping
+    if sampler.default_grouping is not None:
+        return ComponentChoice(name=sampler.default_grouping)
+    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
+    return None
+
+
+def _groups(
+    config: RunConfig, scene: Scene, grouping: Component | None, notes: list[str]
+) -> tuple[str, ...] | None:
+    if grouping is None:
+        return None
+    rng = make_streams(config.seed)["grouping"]
+    labelling = cast("Grouping", grouping).label(scene, scene.train_views, rng)
+    notes += labelling.notes
+    counts = {label: labelling.labels.count(label) for label in dict.fromkeys(labelling.labels)}
+    listed = ", ".join(f"{label} {count}" for label, count in counts.items())
+    notes.append(f"groups of training views: {listed}")
+    return labelling.labels
+
+
+def _plugins(
+    components: Mapping[str, Component], observers: Mapping[str, Component]
+) -> dict[str, object]:
+    plugins: dict[str, object] = {**components}
+    for name, observer in observers.items():
+        plugins[f"observer:{name}"] = observer
+    return plugins
+
+
+def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -> None:
+    reasons = [reason for answer in answers for reason in answer]
+    device, rasterizer = selection.device, selection.rasterizer
+    if device not in rasterizer.devices:
+        reasons.append(
+            f"rasterizer {selection.names['rasterizer']} does not run on device {device}"
+        )
+    if config.backward == "joint" and selection.operator.separate:
+        reasons.append(
+            f"--backward joint makes one gradient of all views, but operator "
+            f"{selection.names['operator']} needs them apart"
+        )
+    if reasons:
+        raise IncompatibleSelectionError(
+            "these components cannot work together",
+            found="; ".join(sorted(set(reasons))),
+            todo="choose another combination (crossgrad plugins show NAME tells what each needs)",
+        )
+
+
+def _linear_note(
+    operator: Operator, name: str, plugins: Mapping[str, object]
+) -> list[str]:
+    if operator.separate:
+        return []
+    watchers = [
+        plugin for plugin, it in plugins.items() if getattr(it, "needs_separate_gradients", False)
+    ]
+    if watchers:
+        return [f"gradients of single views kept apart for {', '.join(watchers)} (same bits)"]
+    return [f"no separate gradients: operator {name} is linear, the backward passes accumulate"]
+

@@ -1,0 +1,51 @@
+"""Applying a topology edit to everything that counts primitives."""
+
+from torch import Tensor
+
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import (
+    Edit,
+    NoEdit,
+    apply_to_moment,
+    apply_to_parameters,
+    gather_indices,
+)
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+
+def apply_edit(setup: Setup, state: TrainState, edit: Edit | NoEdit) -> bool:
+    """Edits parameters, moments and plugin states together.
+
+    Returns:
+        Whether the set of primitives changed.
+    """
+    if isinstance(edit, NoEdit):
+        return False
+    before = state.primitives(setup)
+    for block in setup.blocks:
+        if block.per_primitive:
+            for name in block.tensors:
+                for moments in (state.adam.exp_avg, state.adam.exp_avg_sq):
+                    if name in moments:
+                        moments[name] = apply_to_moment(edit, name, moments[name])
+    state.parameters = apply_to_parameters(edit, setup.blocks, state.parameters)
+    if edit.source is None:
+        return False
+    source, fresh = gather_indices(edit, before, edit.source.device)
+    state.states = {
+        name: _gathered(name, old, source, fresh, before) for name, old in state.states.items()
+    }
+    phase = setup.phase(state.step, training=True)
+    state.parameters = setup.backbone.prepare(state.parameters, setup.scene, phase)
+    return True
+
+
+def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: int) -> PluginState:
+    for key, tensor in old.per_primitive.items():
+        if tensor.shape[0] != rows:
+            raise RuntimeError(
+                f"per-primitive state {key!r} of {name} has {tensor.shape[0]} rows "
+                f"for {rows} primitives"
+            )
+    return old.gathered(source, fresh)

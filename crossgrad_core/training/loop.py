@@ -1,0 +1,143 @@
+"""The loop around the step: evaluation, checkpoints, interruption, rewinding."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from types import FrameType
+from typing import Literal, Protocol
+
+import torch
+
+from crossgrad_core.contexts import StepRecord
+from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_core.training.step import take_step
+
+Status = Literal["finished", "stopped"]
+
+#: Steps between copies of the last good state.
+SNAPSHOT_EVERY = 100
+
+
+class Sink(Protocol):
+    """Where a run's results go."""
+
+    def evaluate(self, setup: Setup, state: TrainState) -> None:
+        """Evaluates and records a row."""
+        ...
+
+    def save(self, setup: Setup, state: TrainState) -> None:
+        """Writes a checkpoint."""
+        ...
+
+
+@dataclass
+class Stopper:
+    """Turns the first interrupt into a request to stop after the step; the second one is final."""
+
+    requested: bool = field(default=False)
+
+    @contextmanager
+    def installed(self) -> Iterator["Stopper"]:
+        """Handles SIGINT and SIGTERM inside the block; does nothing outside the main thread."""
+        try:
+            before = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # Signals can be handled in the main thread only.
+            yield self
+            return
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Status:
+    """Runs the remaining steps of the schedule.
+
+    Raises:
+        TrainingFailedError: Something was not finite twice; names step, views and block.
+    """
+    total = setup.schedule.total
+    last = min(total, setup.config.stop_after or total)
+    snapshot = Snapshot.of(state)
+    while state.step < last and not stopper.requested:
+        try:
+            record = timed_step(setup, state)
+            if state.step % SNAPSHOT_EVERY == 0:
+                check_parameters(state, record)
+                snapshot = Snapshot.of(state)
+            check_dropped(setup, state, record)
+        except NonFiniteError as error:
+            _rewind(setup, state, snapshot, error)
+            continue
+        setup.hook.crossgrad_step_end(record=record)
+        _tell_held_back(setup, record)
+        _record(setup, state, sink)
+    if state.last is not None:
+        check_parameters(state, state.last)
+    return "finished" if state.step >= total else "stopped"
+
+
+def timed_step(setup: Setup, state: TrainState) -> StepRecord:
+    """One step on the training clock; decoding photos is counted as loading."""
+    start, loaded = perf_counter(), state.clock.load
+    record = take_step(setup, state)
+    if setup.device.type == "cuda":
+        torch.cuda.synchronize(setup.device)
+    state.clock.train += perf_counter() - start - (state.clock.load - loaded)
+    state.last = replace(record, train_seconds=state.clock.train)
+    return state.last
+
+
+def check_parameters(state: TrainState, record: StepRecord) -> None:
+    """Raises NonFiniteError where a parameter is NaN or infinite."""
+    for name, tensor in state.parameters.items():
+        if not bool(torch.isfinite(tensor.detach()).all()):
+            raise NonFiniteError(state.step, record.names, f"block {name}")
+
+
+def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
+    """Stops a run that had to drop too many non-finite gradients."""
+    if state.counters.dropped >= setup.config.max_dropped:
+        raise TrainingFailedError(
+            f"{state.counters.dropped} blocks of single views were dropped because their gradient "
+            f"was not finite, the last in step {state.step} (views {', '.join(record.names)})"
+        )
+
+
+def _rewind(setup: Setup, state: TrainState, snapshot: Snapshot, error: NonFiniteError) -> None:
+    if state.rewinds > 0:
+        raise TrainingFailedError(f"{error}, after one rewind") from error
+    snapshot.restore(state, setup.config.seed)
+    setup.hook.crossgrad_message(
+        text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
+    )
+
+
+def _tell_held_back(setup: Setup, record: StepRecord) -> None:
+    held_back = record.counts.get("held_back", 0)
+    if held_back > 0:
+        setup.hook.crossgrad_message(
+            text=f"step {record.step}: growth held back by {held_back} primitives "
+            "(--max-gaussians or the memory guard)"
+        )
+
+
+def _record(setup: Setup, state: TrainState, sink: Sink) -> None:
+    total, step = setup.schedule.total, state.step
+    eval_every = setup.config.eval_every or max(1, total // 10)
+    save_every = setup.config.save_every or max(1, total // 5)
+    if step % eval_every == 0 and step < total:
+        sink.evaluate(setup, state)
+    if step % save_every == 0 and step < total:
+        sink.save(setup, state)
+

@@ -1,0 +1,126 @@
+"""What a run is made of once its configuration is resolved; training changes nothing here."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pluggy
+import torch
+from numpy.typing import NDArray
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.blocks import Block
+from crossgrad_core.component import Selection
+from crossgrad_core.config import RunConfig
+from crossgrad_core.densifier import Densifier
+from crossgrad_core.operator import Operator
+from crossgrad_core.rasterizer import Rasterizer
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.schedule import Phase, Schedule
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """The resolved run.
+
+    Attributes:
+        config: The configuration with every decision filled in.
+        scene: The scene.
+        selection: The chosen components.
+        densifier: The chosen densifier (also in the selection).
+        manager: This run's plugin manager.
+        plugins: Every registered plugin by name.
+        groups: Label of each training view, or None.
+        schedule: The schedule.
+        device: Where tensors live.
+        notes: What was chosen or left out, and why.
+    """
+
+    config: RunConfig
+    scene: Scene
+    selection: Selection
+    densifier: Densifier
+    manager: pluggy.PluginManager
+    plugins: Mapping[str, object]
+    groups: tuple[str, ...] | None
+    schedule: Schedule
+    device: torch.device
+    notes: tuple[str, ...]
+
+    @property
+    def backbone(self) -> Backbone:
+        """The backbone."""
+        return self.selection.backbone
+
+    @property
+    def sampler(self) -> Sampler:
+        """The sampler."""
+        return self.selection.sampler
+
+    @property
+    def operator(self) -> Operator:
+        """The operator."""
+        return self.selection.operator
+
+    @property
+    def rasterizer(self) -> Rasterizer:
+        """The rasterizer."""
+        return self.selection.rasterizer
+
+    @cached_property
+    def hook(self) -> pluggy.HookRelay:
+        """The hook caller of this run."""
+        return self.manager.hook
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """The backbone's blocks."""
+        return self.backbone.blocks()
+
+    @cached_property
+    def train_views(self) -> tuple[View, ...]:
+        """The training views, in the order that samplers index."""
+        return self.scene.train_views
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """[N, 3] camera centres of the training views, local frame."""
+        return np.stack([view.camera.center.numpy() for view in self.train_views])
+
+    @cached_property
+    def distances(self) -> NDArray[np.float64]:
+        """[N] distance of each training camera from their mean, local units."""
+        return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
+
+    @cached_property
+    def separate(self) -> bool:
+        """Whether the views' gradients are kept apart."""
+        return self.operator.separate or any(
+            getattr(plugin, "needs_separate_gradients", False) for plugin in self.plugins.values()
+        )
+
+    @cached_property
+    def joint(self) -> bool:
+        """Whether one backward pass runs through the sum of the views' losses."""
+        return self.config.backward == "joint"
+
+    @cached_property
+    def densify_first(self) -> bool:
+        """Whether density control comes before the optimizer (the published order)."""
+        return self.config.preset == "inria"
+
+    @cached_property
+    def regularizes(self) -> bool:
+        """Whether any plugin adds loss terms."""
+        return bool(self.hook.crossgrad_regularize.get_hookimpls())
+
+    @cached_property
+    def acts_after_step(self) -> bool:
+        """Whether any plugin acts after the step."""
+        return bool(self.hook.crossgrad_after_step.get_hookimpls())
+
+    def phase(self, step: int, *, training: bool) -> Phase:
+        """The phase that a backbone decodes in."""
+        return Phase(step, training, self.schedule)

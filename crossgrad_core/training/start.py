@@ -1,0 +1,94 @@
+"""The first state of a run, compiling what it needs, and how many steps fit into a budget."""
+
+from dataclasses import replace
+from math import ceil
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from crossgrad_core.blocks import Parameters
+from crossgrad_core.optimizer.adam import AdamState
+from crossgrad_core.scene.types import Scene
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+#: Random initial points where a scene has none (`--init random`).
+RANDOM_POINTS = 20_000
+#: Steps that the probe of a time budget takes at least.
+PROBE_STEPS = 12
+#: Mean cost of a step over a run in units of one at its start: density control adds primitives.
+#: Measured with benchmarks/budget.py.
+GROWTH_COST = 1.35
+
+
+def first_state(setup: Setup) -> TrainState:
+    """The state before the first step."""
+    rngs = make_streams(setup.config.seed)
+    parameters = initial_parameters(setup, rngs["create"])
+    parameters = {
+        name: tensor.detach().to(setup.device).requires_grad_(tensor.requires_grad)
+        for name, tensor in parameters.items()
+    }
+    parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
+    return TrainState(parameters=parameters, adam=AdamState.zeros(parameters), rngs=rngs)
+
+
+def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
+    """Parameters from the SfM points, from random points, or from a PLY of Gaussians."""
+    init = setup.config.reading.init
+    if init == "points":
+        return setup.backbone.create(setup.scene, rng)
+    if init == "random":
+        return setup.backbone.create(with_random_points(setup.scene, rng), rng)
+    from crossgrad_core.ply import read_ply
+
+    cloud = read_ply(Path(init), setup.scene.similarity)
+    return setup.backbone.adopt(cloud.to_gaussians())
+
+
+def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
+    """The scene with grey points uniform in a cube of three extents around the cameras."""
+    points = rng.uniform(-1.5, 1.5, (RANDOM_POINTS, 3))
+    colors = np.full((RANDOM_POINTS, 3), 127, dtype=np.uint8)
+    return replace(scene, points=points, point_colors=colors)
+
+
+def warm_up(setup: Setup) -> float:
+    """Compiles every kernel that the run will need, on a throw-away state; seconds it took."""
+    start = perf_counter()
+    degrees = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
+    for step in degrees:
+        if step < setup.schedule.total:
+            state = first_state(setup)
+            state.step = step
+            timed_step(setup, state)
+    return perf_counter() - start
+
+
+def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
+    """How many steps fit into `seconds` of training, and on what evidence.
+
+    Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
+    """
+    far = replace(setup, schedule=Schedule.for_run(10**9))
+    state = first_state(far)
+    timed_step(far, state)
+    state.clock.train = 0.0
+    steps = 0
+    while steps < PROBE_STEPS or (state.clock.train < 0.01 * seconds and steps < 500):
+        timed_step(far, state)
+        steps += 1
+    each = state.clock.train / steps
+    grows = setup.selection.names["densifier"] != "none"
+    cost = each * (GROWTH_COST if grows else 1.0)
+    total = max(1, ceil(seconds / cost))
+    note = (
+        f"{total} steps for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms each, "
+        f"expected to cost {cost / each:.2f} times that on average"
+    )
+    return total, note
+

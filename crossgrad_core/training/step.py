@@ -1,0 +1,201 @@
+"""One optimizer step: sample, render, aggregate, optimize, densify."""
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from crossgrad_core.blocks import LearningRate
+from crossgrad_core.contexts import (
+    AfterStepContext,
+    AggregateContext,
+    Aggregated,
+    Densified,
+    DensifyContext,
+    Draw,
+    SampleContext,
+    Sampled,
+    StepRecord,
+)
+from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.gradients import ViewGradients
+from crossgrad_core.manager import call_seam
+from crossgrad_core.optimizer.adam import adam_step
+from crossgrad_core.topology import Edit, NoEdit
+from crossgrad_core.training.edits import apply_edit
+from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.memory import room_for_primitives
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import (
+    Gradients,
+    Rendered,
+    add_regularization,
+    joined,
+    render_views,
+)
+
+
+def take_step(setup: Setup, state: TrainState) -> StepRecord:
+    """Advances `state` by one step.
+
+    Raises:
+        NonFiniteError: A loss or gradient is not finite; `state` is then not usable any more.
+    """
+    state.step += 1
+    draw = _sample(setup, state)
+    rendered = render_views(setup, state, draw)
+    aggregated = _aggregate(setup, state, draw, rendered)
+    if setup.regularizes:
+        add_regularization(setup, state, rendered.regular)
+    gradients = joined(aggregated.gradients, rendered.regular)
+    _check_finite(state, rendered, gradients)
+    counts = _finish(setup, state, rendered, gradients)
+    record = StepRecord(
+        step=state.step,
+        views=draw.views,
+        names=tuple(record.view.name for record in rendered.records),
+        labels=draw.labels,
+        losses=tuple(record.loss for record in rendered.records),
+        primitives=state.primitives(setup),
+        counts={**aggregated.counts, **counts},
+        train_seconds=state.clock.train,
+    )
+    state.last = record
+    return record
+
+
+def _sample(setup: Setup, state: TrainState) -> Draw:
+    context = SampleContext(
+        **_common(setup, state, "sampler"),
+        views_per_step=setup.selection.views_per_step,
+        groups=setup.groups,
+        centers=setup.centers,
+        last=state.last,
+    )
+    answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
+    state.commit(answer.states)
+    return answer.draw
+
+
+def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) -> Aggregated:
+    context = AggregateContext(
+        **_common(setup, state, "operator"),
+        gradients=_view_gradients(setup, rendered),
+        losses=np.array([record.loss for record in rendered.records]),
+        labels=draw.labels,
+        distances=setup.distances[list(draw.views)],
+        reference_distance=float(np.median(setup.distances)),
+        blocks=setup.blocks,
+    )
+    answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
+    state.commit(answer.states)
+    state.counters.dropped += answer.counts.get("dropped", 0)
+    return answer
+
+
+def _view_gradients(setup: Setup, rendered: Rendered) -> ViewGradients:
+    if rendered.per_view is not None:
+        return DenseViewGradients(rendered.per_view, setup.blocks)
+    accumulated = rendered.accumulated
+    if accumulated is None:
+        raise RuntimeError("a step without gradients")
+    return AccumulatedGradients(accumulated, setup.blocks, len(rendered.records))
+
+
+def _finish(
+    setup: Setup, state: TrainState, rendered: Rendered, gradients: Gradients
+) -> Mapping[str, int]:
+    """Optimizer, density control and `after_step` in the order of the preset."""
+    if not setup.densify_first:
+        _optimize(setup, state, gradients)
+        edit, edited = _densify(setup, state, rendered)
+    else:
+        edit, edited = _densify(setup, state, rendered)
+        # In the published order an edit replaces tensors, whose gradients are then gone.
+        gone = set(gradients) if edited else set(edit.values if isinstance(edit, Edit) else ())
+        if state.step < setup.schedule.total:
+            _optimize(setup, state, {n: g for n, g in gradients.items() if n not in gone})
+    if setup.acts_after_step:
+        _after_step(setup, state, edited=edited)
+    return edit.counts if isinstance(edit, Edit) else {}
+
+
+def _optimize(setup: Setup, state: TrainState, gradients: Gradients) -> None:
+    progress = state.step / setup.schedule.lr_steps
+    rates = {name: block.lr.at(progress) for block in setup.blocks for name in block.tensors}
+    adam_step(state.parameters, gradients, state.adam, rates)
+
+
+def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit | NoEdit, bool]:
+    context = DensifyContext(
+        **_common(setup, state, "densifier"),
+        parameters=state.parameters,
+        backbone=setup.backbone,
+        views=rendered.records,
+        means_lr=_means_lr(setup, state.step),
+        room=_room(setup, state) if setup.schedule.densifies(state.step) else 0,
+    )
+    answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
+    state.commit(answer.states)
+    return answer.edit, apply_edit(setup, state, answer.edit)
+
+
+def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
+    context = AfterStepContext(
+        **_common(setup, state, "after_step"),
+        parameters=state.parameters,
+        backbone=setup.backbone,
+        means_lr=_means_lr(setup, state.step),
+        edited=edited,
+    )
+    for answer in setup.hook.crossgrad_after_step(context=context):
+        state.commit(answer.states)
+        apply_edit(setup, state, answer.edit)
+
+
+def _common(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
+    return {
+        "step": state.step,
+        "schedule": setup.schedule,
+        "scene": setup.scene,
+        "states": state.states,
+        "rng": state.rngs[stream],
+    }
+
+
+def _means_lr(setup: Setup, step: int) -> float:
+    rates = {block.name: block.lr for block in setup.blocks}
+    rate = rates.get("means", LearningRate(0.0))
+    return rate.at(step / setup.schedule.lr_steps)
+
+
+def _room(setup: Setup, state: TrainState) -> int:
+    """How many primitives may be added now."""
+    primitives = state.primitives(setup)
+    per_primitive = sum(
+        state.parameters[name][:1].numel() * state.parameters[name].element_size()
+        for block in setup.blocks
+        if block.per_primitive
+        for name in block.tensors
+    )
+    rooms = []
+    if setup.config.max_gaussians is not None:
+        rooms.append(max(0, setup.config.max_gaussians - primitives))
+    memory = room_for_primitives(setup.device, per_primitive)
+    if memory is not None:
+        rooms.append(memory)
+    return min(rooms, default=sys.maxsize)
+
+
+def _check_finite(state: TrainState, rendered: Rendered, gradients: Gradients) -> None:
+    for name, gradient in gradients.items():
+        # A finite sum proves that all are finite up to cancelling infinities, which give NaN;
+        # only an overflow of the sum itself needs the second, slower look.
+        if gradient is None or bool(torch.isfinite(gradient.sum())):
+            continue
+        if not bool(torch.isfinite(gradient).all()):
+            views = tuple(record.view.name for record in rendered.records)
+            raise NonFiniteError(state.step, views, f"the gradient of block {name}")

@@ -1,0 +1,211 @@
+"""Rendering the K views of a step and running their backward passes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contexts import Draw, RegularizeContext, ViewRecord
+from crossgrad_core.gaussians import Gaussians, Render
+from crossgrad_core.photometric import photometric_loss
+from crossgrad_core.scene.types import View
+from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+#: Tensor name -> gradient or None.
+Gradients = dict[str, Tensor | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """The views of one step after their backward passes.
+
+    Attributes:
+        records: One record per view.
+        per_view: The gradients view by view, where they are kept apart.
+        accumulated: Their sum, where they are not.
+        regular: Gradients of regularisation terms of the views, to join after aggregation.
+    """
+
+    records: tuple[ViewRecord, ...]
+    per_view: tuple[Gradients, ...] | None
+    accumulated: Gradients | None
+    regular: Gradients
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """A view with its graph still alive."""
+
+    record: ViewRecord
+    gaussians: Gaussians
+    render: Render
+    loss: Tensor
+
+
+def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
+    """Renders the views of `draw` and gathers their gradients.
+
+    Raises:
+        NonFiniteError: A loss is not finite.
+    """
+    regular: Gradients = {}
+    if setup.joint:
+        return _render_jointly(setup, state, draw, regular)
+    records, per_view = [], []
+    _clear(state.parameters)
+    for slot in range(len(draw.views)):
+        drawn = _draw_view(setup, state, draw, slot)
+        _regularize_view(setup, state, drawn, regular)
+        _backward(drawn.loss)
+        records.append(drawn.record)
+        if setup.separate:
+            per_view.append(_take(state.parameters))
+    state.counters.backward_passes += len(records)
+    if setup.separate:
+        return Rendered(tuple(records), tuple(per_view), None, regular)
+    return Rendered(tuple(records), None, _take(state.parameters), regular)
+
+
+def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradients) -> Rendered:
+    """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
+    _clear(state.parameters)
+    drawn = [_draw_view(setup, state, draw, slot) for slot in range(len(draw.views))]
+    for view in drawn:
+        _regularize_view(setup, state, view, regular)
+    _backward(torch.stack([view.loss for view in drawn]).sum())
+    state.counters.backward_passes += 1
+    records = tuple(view.record for view in drawn)
+    return Rendered(records, None, _take(state.parameters), regular)
+
+
+def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn:
+    index = draw.views[slot]
+    view = setup.train_views[index]
+    target, mask = photo_of(setup, state, view)
+    background = background_of(setup, state)
+    gaussians = setup.backbone.decode(
+        state.parameters, view.camera, setup.phase(state.step, training=True)
+    )
+    render = setup.rasterizer.render(gaussians, view.camera, background, setup.densifier.needs)
+    loss = photometric_loss(render.image, target, mask, setup.config.ssim_weight)
+    state.counters.views += 1
+    value = float(loss.detach())
+    if value != value or value in (float("inf"), float("-inf")):  # noqa: PLR0124
+        raise NonFiniteError(state.step, (view.name,), "the photometric loss")
+    record = ViewRecord(
+        index=index,
+        view=view,
+        label=draw.labels[slot] if draw.labels is not None else None,
+        loss=value,
+        gaussians=detached(gaussians),
+        screen=render.screen,
+        background=background,
+    )
+    return _Drawn(record, gaussians, render, loss)
+
+
+def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tensor | None]:
+    """The decoded photo and mask of a view on the run's device; decoding counts as loading."""
+    start = perf_counter()
+    image, mask = view.photo.image(), view.photo.mask()
+    image = image.to(setup.device)
+    mask = None if mask is None else mask.to(setup.device)
+    state.clock.load += perf_counter() - start
+    return image, mask
+
+
+def background_of(setup: Setup, state: TrainState) -> Tensor:
+    """[3] RGB that the next view is drawn over."""
+    name = setup.config.background
+    fixed = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if name == "random":
+        rgb = tuple(state.rngs["background"].random(3).tolist())
+    elif name in fixed:
+        rgb = fixed[name]
+    else:
+        rgb = tuple(float(part) for part in name.split(","))
+    return torch.tensor(rgb, dtype=torch.float32, device=setup.device)
+
+
+def detached(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians without their graph."""
+    names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+    tensors = {name: getattr(gaussians, name) for name in names}
+    return replace(gaussians, **{name: t.detach() for name, t in tensors.items() if t is not None})
+
+
+def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Gradients) -> None:
+    if setup.regularizes:
+        add_regularization(setup, state, into, drawn.gaussians, drawn.record.view)
+
+
+def add_regularization(
+    setup: Setup,
+    state: TrainState,
+    into: Gradients,
+    gaussians: Gaussians | None = None,
+    view: View | None = None,
+) -> None:
+    """Adds the gradients of all regularisation terms, of one view or (None) of the step."""
+    context = RegularizeContext(
+        step=state.step,
+        schedule=setup.schedule,
+        scene=setup.scene,
+        states=state.states,
+        rng=state.rngs["regularize"],
+        parameters=state.parameters,
+        backbone=setup.backbone,
+        gaussians=gaussians,
+        view=view,
+    )
+    for answer in setup.hook.crossgrad_regularize(context=context):
+        state.commit(answer.states)
+        _add(into, _gradients_of(answer.loss, state.parameters, keep=gaussians is not None))
+
+
+def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool) -> Gradients:
+    wanted = {name: t for name, t in parameters.items() if t.requires_grad}
+    if not loss.requires_grad:
+        return {}
+    found = torch.autograd.grad(loss, list(wanted.values()), retain_graph=keep, allow_unused=True)
+    return dict(zip(wanted, found, strict=True))
+
+
+def _add(into: Gradients, more: Mapping[str, Tensor | None]) -> None:
+    for name, gradient in more.items():
+        if gradient is not None:
+            have = into.get(name)
+            into[name] = gradient if have is None else have + gradient
+
+
+def joined(gradients: Mapping[str, Tensor | None], regular: Gradients) -> Gradients:
+    """The aggregated gradients with those of the regularisation terms added."""
+    result = dict(gradients)
+    _add(result, regular)
+    return result
+
+
+def _backward(loss: Tensor) -> None:
+    # A view that draws nothing has a constant image: its gradients are absent, not an error.
+    if loss.requires_grad:
+        loss.backward()  # type: ignore[no-untyped-call]
+
+
+def _clear(parameters: Mapping[str, Tensor]) -> None:
+    for tensor in parameters.values():
+        tensor.grad = None
+
+
+def _take(parameters: Mapping[str, Tensor]) -> Gradients:
+    taken = {name: tensor.grad for name, tensor in parameters.items()}
+    _clear(parameters)
+    return taken
+
+
+def mean_loss(records: Sequence[ViewRecord]) -> float:
+    """Mean photometric loss over the views of a step."""
+    return sum(record.loss for record in records) / len(records)

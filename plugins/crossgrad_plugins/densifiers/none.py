@@ -1,0 +1,18 @@
+"""No density control: the set of primitives stays as it is."""
+
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.densifier import Densifier
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import NO_EDIT, Edit, NoEdit
+
+
+class NoDensification(Densifier):
+    """Never edits; needs no statistics."""
+
+    @override
+    def densify(
+        self, context: DensifyContext, state: PluginState
+    ) -> tuple[Edit | NoEdit, PluginState]:
+        return NO_EDIT, state

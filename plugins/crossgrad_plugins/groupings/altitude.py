@@ -1,0 +1,61 @@
+"""Low and high cameras."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.cameras import altitudes, upward
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import (
+    FAR,
+    NEAR,
+    halves,
+    require_groups,
+    require_training_views,
+)
+from crossgrad_plugins.groupings.thresholds import gap_threshold, otsu_threshold
+
+
+class Altitude(Grouping):
+    """near: cameras below a height; far: those above it.
+
+    Source: the paper, altitude thresholds; the choice of the axis and of the cut is ours.
+    """
+
+    up: Literal["auto", "cameras", "pca"] | tuple[float, float, float] = Field(
+        "auto",
+        description="the upward axis: x, y, z in the scene's frame; cameras: mean of the cameras' "
+        "up axes; pca: axis of least variance of the positions; auto: cameras where they agree",
+    )
+    cut: Literal["median", "otsu", "gap"] = Field(
+        "median", description="median height, Otsu's threshold, or the widest gap"
+    )
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "altitude")
+        axis, source = upward(scene, self.up)
+        train = altitudes(scene, scene.train_views, axis)
+        threshold = self._threshold(train)
+        require_groups("altitude", halves(train, threshold), (NEAR, FAR), "height")
+        note = (
+            f"grouping altitude: near up to {threshold:.4g} local units above the mean camera; "
+            f"up is {np.array2string(axis, precision=3)} ({source})"
+        )
+        return Labelling(halves(altitudes(scene, views, axis), threshold), (note,))
+
+    def _threshold(self, heights: NDArray[np.float64]) -> float:
+        if self.cut == "median":
+            return float(np.median(heights))
+        return otsu_threshold(heights) if self.cut == "otsu" else gap_threshold(heights)

@@ -1,0 +1,36 @@
+"""Anchors: the nearest and the farthest cameras, and the rest between them."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR
+from crossgrad_plugins.groupings.thirds import label_by_shares
+
+
+class Anchors(Grouping):
+    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: the others.
+
+    The middle may be empty in a scene of very few cameras; near and far may not.
+
+    Source: the paper, operator variants.
+    """
+
+    labels: ClassVar[tuple[str, ...]] = (NEAR, MIDDLE, FAR)
+
+    share: float = Field(0.3, gt=0.0, le=0.5, description="share of the cameras on either side")
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        return label_by_shares(scene, views, "anchors", self.share, (NEAR, FAR))

@@ -1,0 +1,39 @@
+"""The paper's default split: distance from the mean camera, at its median."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from typing_extensions import override
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.cameras import radial_distances
+from crossgrad_plugins.groupings.split import (
+    FAR,
+    NEAR,
+    halves,
+    require_groups,
+    require_training_views,
+)
+
+
+class Radial(Grouping):
+    """near where the distance from the mean training camera is at most its median, else far.
+
+    Source: the paper, median radial split.
+    """
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "radial")
+        train = radial_distances(scene, scene.train_views)
+        threshold = float(np.median(train))
+        require_groups("radial", halves(train, threshold), (NEAR, FAR), "distance from their mean")
+        note = f"grouping radial: near up to {threshold:.4g} local units from the mean camera"
+        return Labelling(halves(radial_distances(scene, views), threshold), (note,))

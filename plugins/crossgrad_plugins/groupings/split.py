@@ -1,0 +1,57 @@
+"""Labels from a threshold, and the check that every group has training views."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.types import Scene
+
+NEAR, MIDDLE, FAR = "near", "middle", "far"
+
+
+def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
+    """`near` where a value [V] is at most the threshold, else `far`."""
+    return tuple(NEAR if value <= threshold else FAR for value in values)
+
+
+def require_training_views(scene: Scene, grouping: str) -> None:
+    """Refuses a scene without training views.
+
+    Raises:
+        UserError: Nothing to fit the rule on.
+    """
+    if not scene.train:
+        raise UserError(
+            f"grouping {grouping} has no training views to be fitted on",
+            where=scene.name,
+            todo="check the split: --set scene.split=none trains on all images",
+        )
+
+
+def require_groups(
+    grouping: str, train_labels: Sequence[str], labels: Sequence[str], quantity: str
+) -> None:
+    """Refuses a rule that leaves a group without training views.
+
+    Args:
+        grouping: Name of the grouping.
+        train_labels: Labels of the training views.
+        labels: Every label that the rule can give.
+        quantity: What the rule looked at, for the message.
+
+    Raises:
+        UserError: A group is empty.
+    """
+    counts = {label: list(train_labels).count(label) for label in labels}
+    if all(counts.values()):
+        return
+    raise UserError(
+        f"grouping {grouping} leaves a group without training views",
+        where="grouping",
+        expected=f"training views that differ in {quantity}",
+        found=", ".join(f"{label}: {count}" for label, count in counts.items()),
+        todo="choose another grouping (lists takes folders or your own lists), "
+        "or a sampler that needs none (epoch, random)",
+    )

@@ -1,0 +1,31 @@
+"""Thirds of the distance from the mean camera."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR
+from crossgrad_plugins.groupings.thirds import label_by_shares
+
+
+class Terciles(Grouping):
+    """near, middle and far: the thirds of the distance from the mean training camera.
+
+    Source: the paper, 3-way groups.
+    """
+
+    labels: ClassVar[tuple[str, ...]] = (NEAR, MIDDLE, FAR)
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        return label_by_shares(scene, views, "terciles", 1.0 / 3.0, self.labels)

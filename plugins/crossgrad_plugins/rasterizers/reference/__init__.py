@@ -1,0 +1,1 @@
+"""The readable rasterizer, in parts: project, shape, bin into tiles, composite, record."""

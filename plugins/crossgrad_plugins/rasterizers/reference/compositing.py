@@ -1,0 +1,98 @@
+"""Front-to-back compositing, tile by tile, as dense [pixels, Gaussians] tensors."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding
+from torch.utils.checkpoint import checkpoint
+
+from crossgrad_core.gaussians import Response
+from crossgrad_core.rasterizer import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
+from crossgrad_plugins.rasterizers.reference.responses import Shape, coverage
+from crossgrad_plugins.rasterizers.reference.statistics import offsets
+from crossgrad_plugins.rasterizers.reference.tiles import TILE, TileLists
+
+#: Channels that are composited: RGB, depth, and ones for the accumulated opacity.
+CHANNELS = 5
+
+#: Up to so many (pixel, Gaussian) entries the backward pass finds all intermediates in memory
+#: (about 0.4 GB in float64); beyond, each tile is drawn a second time when its gradient is due.
+REMEMBERED_ENTRIES = 2**21
+
+
+def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) -> Tensor:
+    """[N, 7 + S] one row per Gaussian, as `composite` reads it."""
+    columns = (means, shapes.opacities[:, None], colors, depths[:, None], shapes.parameters)
+    return torch.cat(columns, -1)
+
+
+def composite_tiles(
+    table: Tensor, lists: TileLists, size: tuple[int, int], response: Response, max_alpha: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blends all tiles of an image.
+
+    Args:
+        table: [V, 9 + S] the probe's two columns and those of `splat_table`, front to back.
+        lists: The rows of each tile.
+        size: Width and height of the image, pixels.
+        response: How a Gaussian fills a pixel.
+        max_alpha: Cap of alpha.
+
+    Returns:
+        `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as of `composite`.
+    """
+    # An embedding's backward adds in a fixed order on every device; that of indexing need not.
+    tiles = torch.split(embedding(lists.rows, table), lists.sizes)
+    again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
+    images, touched, blended = [], [], []
+    for rows, centers in zip(tiles, _tile_centers(size, table), strict=True):
+        arguments = (rows, centers.flatten(0, 1), response, max_alpha)
+        if again:
+            result = checkpoint(composite, *arguments, use_reentrant=False)
+        else:
+            result = composite(*arguments)
+        images.append(result[0].view(*centers.shape[:2], CHANNELS))
+        touched.append(result[1])
+        blended.append(result[2])
+    across = -(-size[0] // TILE)
+    bands = [torch.cat(images[i : i + across], 1) for i in range(0, len(images), across)]
+    counts = torch.stack([torch.cat(touched).long(), torch.cat(blended)], -1)
+    totals = counts.new_zeros(len(table), 2).index_add_(0, lists.rows, counts)
+    return torch.cat(bands), totals[:, 0] > 0, totals[:, 1]
+
+
+def _tile_centers(size: tuple[int, int], like: Tensor) -> list[Tensor]:
+    """[h, w, 2] pixel centres of each tile, row-major; smaller tiles at the far borders."""
+    columns, rows = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in size)
+    grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)  # [H, W, 2]
+    return [tile for band in torch.split(grid, TILE) for tile in torch.split(band, TILE, 1)]
+
+
+def composite(
+    table: Tensor, centers: Tensor, response: Response, max_alpha: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blends the Gaussians of one tile over its pixels.
+
+    Args:
+        table: [G, 9 + S] the probe's two columns and those of `splat_table`, front to back.
+        centers: [P, 2] pixel centres.
+        response: How a Gaussian fills a pixel.
+        max_alpha: Cap of alpha; what is capped has no gradient.
+
+    Returns:
+        `channels` [P, 5]: RGB, depth and accumulated opacity, without background; `touched` [G]
+        bool: whether the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
+        number of pixels in which it was blended.
+    """
+    columns = [2, 2, 1, 4, table.shape[1] - 9]
+    probe, means, opacities, colors_depths, parameters = torch.split(table, columns, -1)
+    dx, dy = offsets(means, probe, centers)
+    alpha = (opacities.T * coverage(dx, dy, parameters, response)).clamp(max=max_alpha)
+    touching = alpha >= ALPHA_THRESHOLD
+    alpha = torch.where(touching, alpha, 0.0)
+    after = (1 - alpha).cumprod(-1)  # transmittance behind each Gaussian, if nothing stops
+    before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
+    # Transmittance only falls, so this also stops everything behind the first that stops.
+    blended = touching & (after >= TRANSMITTANCE_STOP)
+    weights = torch.where(blended, alpha * before, 0.0)
+    features = torch.cat([colors_depths, torch.ones_like(opacities)], -1)
+    return weights @ features, touching.any(0), blended.sum(0)

@@ -1,0 +1,56 @@
+"""Colour from real spherical harmonics up to degree 3."""
+
+from math import pi, sqrt
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.gaussians import Gaussians
+
+
+def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
+    """[N, 3] RGB as seen from `center` [3].
+
+    RGB is returned as given. Spherical harmonics become max(0, 0.5 + sum of bands); bands above the
+    active degree are left out, and what is clamped at 0 has no gradient.
+    """
+    if gaussians.colors is not None:
+        return gaussians.colors
+    if gaussians.sh_dc is None:
+        raise ValueError("Gaussians need `colors` or `sh_dc`; found neither")
+    coefficients = gaussians.sh_dc
+    if gaussians.sh_rest is not None:
+        active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]
+        coefficients = torch.cat([coefficients, active], 1)
+    offsets = gaussians.means - center
+    basis = harmonics(offsets / offsets.norm(dim=-1, keepdim=True), gaussians.sh_degree)
+    return (0.5 + (basis[:, :, None] * coefficients).sum(1)).clamp(min=0.0)
+
+
+def harmonics(directions: Tensor, degree: int) -> Tensor:
+    """[N, (degree + 1)^2] basis functions at unit vectors [N, 3].
+
+    Order and signs are those of the field's PLY files: per band l the orders m = -l..l, with the
+    Condon-Shortley phase.
+    """
+    x, y, z = directions.unbind(-1)
+    bands = [torch.full_like(x, sqrt(1 / (4 * pi)))]
+    if degree >= 1:
+        c = sqrt(3 / (4 * pi))
+        bands += [-c * y, c * z, -c * x]
+    if degree >= 2:  # noqa: PLR2004
+        c = sqrt(15 / (4 * pi))
+        zonal = sqrt(5 / (16 * pi)) * (2 * z * z - x * x - y * y)
+        bands += [c * x * y, -c * y * z, zonal, -c * x * z, c / 2 * (x * x - y * y)]
+    if degree >= 3:  # noqa: PLR2004
+        c1, c2, c3 = sqrt(21 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(35 / (32 * pi))
+        bands += [
+            -c3 * y * (3 * x * x - y * y),
+            c2 * x * y * z,
+            -c1 * y * (4 * z * z - x * x - y * y),
+            sqrt(7 / (16 * pi)) * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -c1 * x * (4 * z * z - x * x - y * y),
+            c2 / 2 * z * (x * x - y * y),
+            -c3 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(bands, -1)

@@ -1,0 +1,91 @@
+"""The readable rasterizer: plain PyTorch, any device, float32 or float64, gradients by autograd."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.gaussians import Gaussians, Render, Screen
+from crossgrad_core.rasterizer import ALPHA_THRESHOLD, Rasterizer
+from crossgrad_core.scene.types import Camera
+from crossgrad_plugins.rasterizers.reference.compositing import composite_tiles, splat_table
+from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
+from crossgrad_plugins.rasterizers.reference.projection import Projection, project
+from crossgrad_plugins.rasterizers.reference.responses import Shape, shape
+from crossgrad_plugins.rasterizers.reference.statistics import Recorder, recorded
+from crossgrad_plugins.rasterizers.reference.tiles import tile_boxes, tile_lists
+
+
+class TorchRasterizer(Rasterizer):
+    """Draws Gaussians by the common rule set in the type of their means.
+
+    It is the oracle that the fast rasterizers are tested against: short rather than quick.
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+    devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
+
+    @override
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        size = (camera.width, camera.height)
+        with torch.no_grad():
+            index, boxes = self._drawn(gaussians, camera)
+        # Whatever is not drawn never enters the graph, so that it cannot pass on a NaN.
+        drawn = _rows(gaussians, index)
+        projection, shapes, colors = self._splats(drawn, camera)
+        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))
+        table = splat_table(projection.means, projection.depths, colors, shapes)
+        recorder = Recorder(screen, index, len(gaussians), "abs_gradient" in outputs)
+        table, probe = recorded(table, recorder)
+        lists = tile_lists(boxes, size)
+        channels, touched, blended = composite_tiles(
+            torch.cat([probe, table], -1), lists, size, gaussians.response, self.max_alpha
+        )
+        radii = shapes.radii.detach().ceil().clamp(min=1)
+        screen.radii[index] = torch.where(touched, radii, 0.0).int()
+        if "pixels" in outputs:
+            screen.pixels = torch.zeros_like(screen.radii)
+            screen.pixels[index] = blended.int()
+        colors, depth, alpha = torch.split(channels, [3, 1, 1], -1)
+        return Render(
+            image=colors + (1 - alpha) * background.to(channels),
+            alpha=alpha.squeeze(-1),
+            screen=screen,
+            depth=depth.squeeze(-1) if "depth" in outputs else None,
+        )
+
+    def _splats(self, gaussians: Gaussians, camera: Camera) -> tuple[Projection, Shape, Tensor]:
+        projection = project(gaussians.means, gaussians.quats, gaussians.scales, camera)
+        dilation = self.dilation if gaussians.dilation is None else gaussians.dilation
+        shapes = shape(projection, gaussians.opacities, dilation, gaussians.response)
+        return projection, shapes, view_colors(gaussians, camera.center.to(gaussians.means))
+
+    def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+        """The Gaussians to draw, front to back, and their tile boxes [V, 4]."""
+        projection, shapes, colors = self._splats(gaussians, camera)
+        table = splat_table(projection.means, projection.depths, colors, shapes)
+        drawn = table.isfinite().all(-1) & shapes.reach.isfinite().all(-1)
+        drawn &= (projection.depths > self.near) & (shapes.peaks >= ALPHA_THRESHOLD)
+        drawn &= gaussians.opacities >= ALPHA_THRESHOLD
+        index = drawn.nonzero().squeeze(-1)
+        index = index[projection.depths[index].argsort(stable=True)]
+        size = (camera.width, camera.height)
+        boxes = tile_boxes(projection.means[index], shapes.reach[index], size)
+        seen = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+        return index[seen], boxes[seen]
+
+
+def _rows(gaussians: Gaussians, index: Tensor) -> Gaussians:
+    """The Gaussians at `index` [V]."""
+    names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+    tensors = {name: getattr(gaussians, name) for name in names}
+    rows = {name: tensor[index] for name, tensor in tensors.items() if tensor is not None}
+    return replace(gaussians, origin=None, **rows)

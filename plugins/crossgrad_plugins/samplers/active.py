@@ -1,0 +1,88 @@
+"""Active pairs: a view and a partner of another group whose loss differs most."""
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import ClassVar, cast
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext, StepRecord
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.state import Json, PluginState
+from crossgrad_plugins.samplers.draws import training_views
+from crossgrad_plugins.samplers.groups import drawn, groups_of
+
+_SMALLEST_TEMPERATURE = 1e-8
+
+
+class Active(Sampler):
+    """A uniform view, and a view of the other group by disparity of their running losses.
+
+    The partner is drawn among the `top` views of the other group with the largest
+    |loss - loss of the first view|, by a softmax whose temperature is the standard deviation of
+    these differences. Losses are running means per view. Views that were never rendered have none:
+    they are drawn first, in either place.
+
+    Source: the paper, active loss-disparity pairing; top, temperature and decay are ours, for the
+    paper names no figures.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(2, 2)
+    default_views: ClassVar[int] = 2
+    default_grouping: ClassVar[str | None] = "radial"
+
+    top: int = Field(8, ge=1, description="how many partners are candidates; all of a smaller group")
+    decay: float = Field(0.9, ge=0.0, lt=1.0, description="decay of a view's running loss")
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        losses = self._running_losses(context.last, state)
+        groups = groups_of(context, "active", 2)
+        views = training_views(context)
+        first = _uniform(_never_rendered(views, losses) or views, context.rng)
+        others = next(pool for pool in groups.values() if first not in pool)
+        second = self._partner(first, others, losses, context.rng)
+        values: dict[str, Json] = {"losses": cast("dict[str, Json]", losses)}
+        return drawn((first, second), context), PluginState(values)
+
+    def _running_losses(self, last: StepRecord | None, state: PluginState) -> dict[str, float]:
+        """View (as text, for JSON) -> running loss, the last step included."""
+        losses = dict(cast("Mapping[str, float]", state.values.get("losses", {})))
+        if last is None:
+            return losses
+        for view, loss in zip(last.views, last.losses, strict=True):
+            if isfinite(loss):
+                old = losses.get(str(view), loss)
+                losses[str(view)] = self.decay * old + (1.0 - self.decay) * loss
+        return losses
+
+    def _partner(
+        self,
+        first: int,
+        others: Sequence[int],
+        losses: Mapping[str, float],
+        rng: np.random.Generator,
+    ) -> int:
+        """The second view: never rendered ones first, then by disparity."""
+        fresh = _never_rendered(others, losses)
+        if fresh or str(first) not in losses:
+            return _uniform(fresh or others, rng)
+        scores = np.abs(np.array([losses[str(view)] for view in others]) - losses[str(first)])
+        # A stable sort, so that equal scores keep the order of the views.
+        best = np.argsort(-scores, kind="stable")[: self.top]
+        temperature = max(float(scores[best].std()), _SMALLEST_TEMPERATURE)
+        logits = (scores[best] - scores[best].max()) / temperature
+        weights = np.exp(logits)
+        return others[int(rng.choice(best, p=weights / weights.sum()))]
+
+
+def _never_rendered(pool: Sequence[int], losses: Mapping[str, float]) -> list[int]:
+    """The views of the pool without a running loss."""
+    return [view for view in pool if str(view) not in losses]
+
+
+def _uniform(pool: Sequence[int], rng: np.random.Generator) -> int:
+    return int(pool[int(rng.integers(len(pool)))])

@@ -1,0 +1,30 @@
+"""Equal numbers of views from every group."""
+
+from collections.abc import Mapping, Sequence
+
+from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.state import PluginState
+from crossgrad_plugins.samplers.draws import Deck, Order, draw
+
+
+def balanced_draw(
+    groups: Mapping[str, Sequence[int]], context: SampleContext, state: PluginState, order: Order
+) -> tuple[Draw, PluginState]:
+    """K / len(groups) views of every group, the groups taking turns within the step.
+
+    Args:
+        groups: Label -> positions of its training views, in the order of the turns.
+        context: The step.
+        state: What this function returned last; holds one deck per label under order `epoch`.
+        order: How views are drawn within a group.
+    """
+    share = context.views_per_step // len(groups)
+    values = dict(state.values)
+    columns = []
+    for label, pool in groups.items():
+        column, deck = draw(pool, share, order, Deck.from_json(values.get(label)), context.rng)
+        columns.append(column)
+        if order == "epoch":
+            values[label] = deck.to_json()
+    views = tuple(view for row in zip(*columns, strict=True) for view in row)
+    return Draw(views, tuple(groups) * share), PluginState(values)

@@ -1,0 +1,105 @@
+"""How samplers draw from a pool of views: iid, distinct or epoch by epoch."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+
+from crossgrad_core.contexts import SampleContext
+from crossgrad_core.errors import UserError
+from crossgrad_core.state import Json
+
+Order = Literal["iid", "distinct", "epoch"]
+
+
+@dataclass(frozen=True)
+class Deck:
+    """An epoch under way: a pool in the order of this epoch and how far it has been dealt.
+
+    Attributes:
+        order: The pool in the order of this epoch.
+        dealt: How many of `order` have been drawn.
+    """
+
+    order: Sequence[int] = ()
+    dealt: int = 0
+
+    def deal(self, count: int, renew: Callable[[], Sequence[int]]) -> tuple[list[int], "Deck"]:
+        """Draws the next `count` views; every view comes once per epoch.
+
+        Where the epoch ends within a draw the next one begins with views that this draw does not
+        hold yet, so that no draw holds a view twice.
+
+        Args:
+            count: At most the size of the pool.
+            renew: Gives the order of a new epoch.
+        """
+        drawn = list(self.order[self.dealt : self.dealt + count])
+        missing = count - len(drawn)
+        if missing == 0:
+            return drawn, Deck(self.order, self.dealt + count)
+        order, held = renew(), set(drawn)
+        fresh = [view for view in order if view not in held][:missing]
+        taken = set(fresh)
+        rest = [view for view in order if view not in taken]
+        return drawn + fresh, Deck(fresh + rest, missing)
+
+    def to_json(self) -> dict[str, Json]:
+        """The deck as plain data; the order is shared, not copied, for nobody ever changes it."""
+        return {"order": cast("list[Json]", self.order), "dealt": self.dealt}
+
+    @staticmethod
+    def from_json(data: Json) -> "Deck":
+        """The deck that `to_json` wrote; a new one for None."""
+        if data is None:
+            return Deck()
+        values = cast("dict[str, Json]", data)
+        return Deck(cast("list[int]", values["order"]), cast("int", values["dealt"]))
+
+
+def draw(
+    pool: Sequence[int], count: int, order: Order, deck: Deck, rng: np.random.Generator
+) -> tuple[list[int], Deck]:
+    """`count` members of `pool`, and the deck of epochs afterwards.
+
+    Raises:
+        UserError: The pool holds fewer members than a draw without repetition needs.
+    """
+    if order == "iid":
+        return [int(pool[i]) for i in rng.integers(len(pool), size=count)], deck
+    require_enough(len(pool), count)
+    if order == "distinct":
+        chosen = rng.choice(len(pool), size=count, replace=False)
+        return [int(pool[i]) for i in chosen], deck
+    return deck.deal(count, lambda: [int(view) for view in rng.permutation(pool)])
+
+
+def require_enough(available: int, count: int) -> None:
+    """Refuses a draw of more different views than there are.
+
+    Raises:
+        UserError: `count` is larger than `available`.
+    """
+    if count > available:
+        raise UserError(
+            f"a step needs {count} different views of {available} training views",
+            where="sampler",
+            expected=f"at most {available} views per step from this group of training views",
+            todo="lower --views-per-step, or choose sampler random, which may repeat a view",
+        )
+
+
+def training_views(context: SampleContext) -> range:
+    """Positions of all training views.
+
+    Raises:
+        UserError: There are none.
+    """
+    if len(context.centers) == 0:
+        raise UserError(
+            "the scene has no training views",
+            where=context.scene.name,
+            todo="check the split: --set scene.split=none trains on all images",
+        )
+    return range(len(context.centers))

@@ -1,0 +1,69 @@
+"""Farthest-point order of the camera poses."""
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.state import PluginState
+from crossgrad_plugins.samplers.draws import Deck, require_enough, training_views
+from crossgrad_plugins.samplers.groups import drawn
+
+
+class FarthestPoint(Sampler):
+    """Every training view once per epoch, each as far in pose space as possible from those before.
+
+    An epoch starts at a uniform view; a step takes the next K views of the order. Pose space joins
+    the camera centre, in units of the root mean square distance from the mean centre, and the unit
+    viewing direction times `direction_weight`; distances in it are Euclidean. (Steps that each
+    began anew would render the outermost cameras far more often than the others.)
+
+    Source: farthest-point sampling, Eldar et al. 1997; the pose space is ours.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 2
+
+    direction_weight: float = Field(
+        1.0, ge=0.0, description="weight of the viewing direction against the position"
+    )
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        views = training_views(context)
+        require_enough(len(views), context.views_per_step)
+        deck = Deck.from_json(state.values.get("deck"))
+
+        def renew() -> list[int]:
+            start = int(context.rng.integers(len(views)))
+            return farthest_point_order(self._poses(context), start)
+
+        chosen, deck = deck.deal(context.views_per_step, renew)
+        return drawn(chosen, context), PluginState({"deck": deck.to_json()})
+
+    def _poses(self, context: SampleContext) -> NDArray[np.float64]:
+        """[N, 6] the training cameras in pose space."""
+        centers = context.centers - context.centers.mean(axis=0)
+        radius = float(np.sqrt((centers**2).sum(axis=1).mean()))
+        rows = [view.camera.world_to_camera[2, :3].numpy() for view in context.scene.train_views]
+        directions = np.stack(rows).astype(np.float64)
+        # Cameras at one place differ in direction only.
+        scaled = centers / radius if radius > 0.0 else np.zeros_like(centers)
+        return np.concatenate([scaled, self.direction_weight * directions], axis=1)
+
+
+def farthest_point_order(points: NDArray[np.float64], start: int) -> list[int]:
+    """All points [N, D] from `start` on, each the farthest from those before it; ties by index."""
+    order = [start]
+    nearest = np.full(len(points), np.inf)
+    for _ in range(len(points) - 1):
+        last = points[order[-1]]
+        nearest = np.minimum(nearest, ((points - last) ** 2).sum(axis=1))
+        nearest[order[-1]] = -1.0
+        order.append(int(nearest.argmax()))
+    return order

@@ -1,0 +1,62 @@
+"""Far and near views in a ratio that changes once: 2:1, then 1:1."""
+
+from typing import ClassVar, cast
+
+from pydantic import Field, PositiveInt
+from typing_extensions import override
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.state import Json, PluginState
+from crossgrad_plugins.samplers.draws import Deck, draw
+from crossgrad_plugins.samplers.groups import drawn, groups_of
+
+
+class Horizon(Sampler):
+    """Views by turns: a far ones, then b near ones, and so on; each group in epochs of its own.
+
+    The turns go on across steps, so that the ratio is exact for every K.
+
+    Source: Horizon-GS draws aerial : street = 2 : 1 in its coarse stage (60,000 of 100,000 steps)
+    and 1 : 1 in its fine stage.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 1
+    default_grouping: ClassVar[str | None] = "radial"
+
+    coarse: tuple[PositiveInt, PositiveInt] = Field(
+        (2, 1), description="far : near in the first stage"
+    )
+    fine: tuple[PositiveInt, PositiveInt] = Field(
+        (1, 1), description="far : near in the second stage"
+    )
+    coarse_share: float = Field(
+        0.6, ge=0.0, le=1.0, description="share of the run that the first stage takes"
+    )
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        near, far = groups_of(context, "horizon", 2).items()
+        coarse = context.step <= self.coarse_share * context.schedule.total
+        far_turns, near_turns = self.coarse if coarse else self.fine
+        turns = [far] * far_turns + [near] * near_turns
+        start = _turn(state, coarse)
+        decks = dict(cast("dict[str, Json]", state.values.get("decks", {})))
+        views = []
+        for k in range(context.views_per_step):
+            label, pool = turns[(start + k) % len(turns)]
+            (view,), deck = draw(pool, 1, "epoch", Deck.from_json(decks.get(label)), context.rng)
+            views.append(view)
+            decks[label] = deck.to_json()
+        turn = (start + context.views_per_step) % len(turns)
+        values: dict[str, Json] = {"coarse": coarse, "turn": turn, "decks": decks}
+        return drawn(views, context), PluginState(values)
+
+
+def _turn(state: PluginState, coarse: bool) -> int:
+    """Whose turn it is: the place within the cycle of the stage, 0 where the stage begins."""
+    if state.values.get("coarse") != coarse:
+        return 0
+    return cast("int", state.values["turn"])

@@ -1,0 +1,32 @@
+"""Random views: `r2view` of the paper at K = 2."""
+
+from typing import ClassVar
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.state import PluginState
+from crossgrad_plugins.samplers.draws import Deck, Order, draw, training_views
+from crossgrad_plugins.samplers.groups import drawn
+
+
+class Random(Sampler):
+    """K uniform training views, independent of each other and of the steps before.
+
+    Source: the paper, `r2view`; its Proposition 2 assumes independent draws, hence the default.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 2
+
+    distinct: bool = Field(False, description="draw K different views, not K independent ones")
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        order: Order = "distinct" if self.distinct else "iid"
+        pool = training_views(context)
+        views, _ = draw(pool, context.views_per_step, order, Deck(), context.rng)
+        return drawn(views, context), state

@@ -1,0 +1,52 @@
+"""The control of near-far: the same balanced pair over groups that mean nothing."""
+
+from typing import ClassVar, cast
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.errors import UserError
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.state import Json, PluginState
+from crossgrad_plugins.samplers.balanced import balanced_draw
+from crossgrad_plugins.samplers.draws import Order, training_views
+
+HALVES = ("first", "second")
+
+
+class RandomSplit(Sampler):
+    """K/2 views of each of two random halves of the training views, drawn once at the first step.
+
+    Any grouping of the run is ignored; the labels of the draw are `first` and `second`.
+
+    Source: the paper announces this control and shows no figures.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
+    default_views: ClassVar[int] = 2
+
+    order: Order = Field(
+        "iid",
+        description="draws within a half: iid; distinct: no view twice in a step; "
+        "epoch: every view once before any comes again",
+    )
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        views = training_views(context)
+        if len(views) < len(HALVES):
+            raise UserError(
+                "sampler random-split needs two training views",
+                where="sampler",
+                found=str(len(views)),
+                todo="choose --sampler epoch",
+            )
+        if "split" not in state.values:
+            shuffled = [int(view) for view in context.rng.permutation(len(views))]
+            state = PluginState({**state.values, "split": cast("list[Json]", shuffled)})
+        shuffled = cast("list[int]", state.values["split"])
+        middle = (len(shuffled) + 1) // 2
+        groups = {HALVES[0]: shuffled[:middle], HALVES[1]: shuffled[middle:]}
+        return balanced_draw(groups, context, state, self.order)
