@@ -106,7 +106,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         "Rasterizer",
         build("rasterizers", rasterizer_name, _rasterizer_options(config, scene)),
     )
-    views = config.views or sampler.default_views
+    views = config.views or sampler.usual_views
     grouping_choice = _grouping_choice(config, sampler, notes)
     components: dict[str, Component] = {
         "backbone": backbone,

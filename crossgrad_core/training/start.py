@@ -46,7 +46,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
         return setup.backbone.create(with_random_points(setup.scene, rng), rng)
     from crossgrad_core.ply import read_ply
 
-    cloud = read_ply(Path(init), setup.scene.similarity)
+    cloud = read_ply(Path(init)).to_local(setup.scene.similarity)
     return setup.backbone.adopt(cloud.to_gaussians())
 
 

@@ -9,7 +9,7 @@ from crossgrad_core.blocks import Parameters, primitives_of
 from crossgrad_core.contexts import StepRecord
 from crossgrad_core.optimizer.adam import AdamState
 from crossgrad_core.state import PluginState
-from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
+from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 
 
@@ -96,5 +96,3 @@ class Snapshot:
         state.rewinds += 1
         state.rngs = make_streams(seed, state.rewinds)
 
-
-__all__ = ["Clock", "Counters", "Snapshot", "TrainState", "restored_streams", "stream_states"]

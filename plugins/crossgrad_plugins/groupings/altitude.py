@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.cameras import altitudes, upward
 from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.poses import altitudes, upward
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,

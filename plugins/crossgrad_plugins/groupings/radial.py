@@ -6,8 +6,8 @@ import numpy as np
 from typing_extensions import override
 
 from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.poses import radial_distances
 from crossgrad_core.scene.types import Scene, View
-from crossgrad_core.cameras import radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -55,3 +55,9 @@ def require_groups(
         todo="choose another grouping (lists takes folders or your own lists), "
         "or a sampler that needs none (epoch, random)",
     )
+
+
+def smaller_mean_first(sides: NDArray[np.int64], distances: NDArray[np.float64]) -> int:
+    """Which of the sides 0 and 1 [V] has the smaller mean distance; 0 where one is empty."""
+    means = [float(distances[sides == side].mean()) for side in (0, 1) if (sides == side).any()]
+    return int(np.argmin(means)) if len(means) == 2 else 0  # noqa: PLR2004 - both sides

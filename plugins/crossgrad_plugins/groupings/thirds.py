@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.grouping import Labelling
+from crossgrad_core.scene.poses import radial_distances
 from crossgrad_core.scene.types import Scene, View
-from crossgrad_core.cameras import radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     MIDDLE,
@@ -20,7 +20,7 @@ from crossgrad_plugins.groupings.split import (
 def label_by_shares(
     scene: Scene, views: Sequence[View], grouping: str, share: float, needed: Sequence[str]
 ) -> Labelling:
-    """near up to quantile `share` of the radial distance, far beyond quantile 1 - share.
+    """Near up to quantile `share` of the radial distance, far beyond quantile 1 - share.
 
     Args:
         scene: The scene.

@@ -34,7 +34,9 @@ class Active(Sampler):
     default_views: ClassVar[int] = 2
     default_grouping: ClassVar[str | None] = "radial"
 
-    top: int = Field(8, ge=1, description="how many partners are candidates; all of a smaller group")
+    top: int = Field(
+        8, ge=1, description="how many partners are candidates; all of a smaller group"
+    )
     decay: float = Field(0.9, ge=0.0, lt=1.0, description="decay of a view's running loss")
 
     @override

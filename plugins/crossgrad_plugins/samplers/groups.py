@@ -12,9 +12,7 @@ def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
     return _members(context.groups or ())
 
 
-def groups_of(
-    context: SampleContext, sampler: str, expected: int
-) -> Mapping[str, tuple[int, ...]]:
+def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[str, tuple[int, ...]]:
     """The same, where a sampler needs a certain number of groups.
 
     Args:

@@ -5,7 +5,7 @@ of pixel centres from the mean into a coverage, so that alpha = min(max_alpha, o
 """
 
 from dataclasses import dataclass
-from math import pi
+from math import pi, sqrt
 
 import torch
 from torch import Tensor
@@ -148,5 +148,5 @@ def _window_reach(sigma: Tensor, log_contrast: Tensor) -> Tensor:
     t = (offset - 0.5) / sigma; the cubic y(t) = log_contrast has this one real root.
     """
     p = LINEAR / (3 * CUBIC)
-    t = 2 * p**0.5 * torch.sinh(torch.asinh(log_contrast / (2 * CUBIC * p**1.5)) / 3)
+    t = 2 * sqrt(p) * torch.sinh(torch.asinh(log_contrast / (2 * CUBIC * p * sqrt(p))) / 3)
     return 0.5 + sigma * t

@@ -29,9 +29,7 @@ def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]
     return np.asarray(np.linalg.norm(centers_of(views) - middle, axis=1))
 
 
-def altitudes(
-    scene: Scene, views: Sequence[View], up: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V] height of each camera along the unit axis `up` [3] over the mean training camera."""
     middle = centers_of(scene.train_views).mean(axis=0)
     return np.asarray((centers_of(views) - middle) @ up)

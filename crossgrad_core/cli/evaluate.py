@@ -1,0 +1,24 @@
+"""`crossgrad eval`: figures of a run's held-out views."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def evaluate(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
+    ],
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
+    ] = None,
+) -> None:
+    """Evaluate the held-out views of a run again and print the figures."""
+    from crossgrad_core import app
+
+    app.evaluate(run, device=device, threads=threads)

@@ -1,0 +1,66 @@
+"""The command `crossgrad`."""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from crossgrad_core import __version__
+from crossgrad_core.cli import evaluate, export, plugins, render, run
+from crossgrad_core.cli.grouped import GroupedCommand
+from crossgrad_core.errors import UserError
+
+#: Exit status after bad input.
+BAD_INPUT = 2
+
+app = typer.Typer(
+    name="crossgrad",
+    help="Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts.",
+    epilog="Example: crossgrad run SCENE --sampler near-far --operator symmetric",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"crossgrad {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def crossgrad(
+    context: typer.Context,
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+app.command("run", cls=GroupedCommand)(run.run)
+app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
+app.command("render", cls=GroupedCommand)(render.render)
+app.command("export", cls=GroupedCommand)(export.export)
+app.add_typer(plugins.app, name="plugins")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line; bad input ends in one message and exit status 2.
+
+    Args:
+        arguments: What the user typed after `crossgrad`; `sys.argv[1:]` by default.
+    """
+    try:
+        app(args=arguments, prog_name="crossgrad")
+    except UserError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(BAD_INPUT)

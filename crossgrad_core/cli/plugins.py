@@ -1,0 +1,105 @@
+"""`crossgrad plugins`: what is installed, which options it has, whether it keeps the contract."""
+
+from typing import Annotated
+
+import typer
+
+from crossgrad_core import registry
+from crossgrad_core.cli.grouped import GroupedCommand
+from crossgrad_core.errors import UserError
+from crossgrad_core.slots import GROUPS
+from crossgrad_core.wording import did_you_mean, listed, sentences
+
+app = typer.Typer(
+    help="List, explain and check plugins.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+SlotOption = Annotated[
+    str | None,
+    typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(GROUPS)}."),
+]
+
+
+@app.callback(invoke_without_command=True)
+def plugins(context: typer.Context) -> None:
+    """List, explain and check plugins. Without a command: list."""
+    if context.invoked_subcommand is None:
+        list_plugins(None)
+
+
+@app.command("list", cls=GroupedCommand)
+def list_plugins(slot: SlotOption = None) -> None:
+    """Show the installed plugins by slot."""
+    for each in _slots(slot):
+        typer.echo(each)
+        typer.echo("\n".join(_rows(registry.offers(each))) or "  none installed")
+    typer.echo("\n`crossgrad plugins show NAME` explains one of them.")
+
+
+@app.command("show", cls=GroupedCommand)
+def show(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a plugin.")],
+    slot: SlotOption = None,
+) -> None:
+    """Explain a plugin: purpose, options, origin."""
+    from crossgrad_core.cli.describe import describe
+
+    found = [entry for each in _slots(slot) for entry in registry.offers(each)]
+    chosen = [entry for entry in found if entry.name == name]
+    if not chosen:
+        raise UserError(
+            f"there is no plugin named {name!r}",
+            todo=sentences(
+                did_you_mean(name, [entry.name for entry in found]),
+                "`crossgrad plugins list` shows them all",
+            ),
+        )
+    typer.echo("\n\n".join(describe(entry) for entry in chosen))
+
+
+@app.command("check", cls=GroupedCommand)
+def check(
+    package: Annotated[
+        str,
+        typer.Argument(
+            metavar="PACKAGE", help="An installed package: its name for pip, or its import name."
+        ),
+    ],
+) -> None:
+    """Run the contract checks of a package's plugins.
+
+    Every plugin of the package is loaded and checked as its slot demands.
+    Exit status: 0 where all of them pass, 1 where one fails.
+    """
+    from crossgrad_core.cli.check import check_package
+
+    report, passed = check_package(package)
+    typer.echo(report)
+    if not passed:
+        raise typer.Exit(1)
+
+
+def _slots(slot: str | None) -> tuple[str, ...]:
+    if slot is None:
+        return tuple(GROUPS)
+    plural = slot if slot in GROUPS else f"{slot}s"
+    if plural not in GROUPS:
+        raise UserError(
+            f"there is no slot named {slot!r}",
+            expected=f"one of {listed(GROUPS)}",
+            todo=did_you_mean(slot, GROUPS),
+        )
+    return (plural,)
+
+
+def _rows(offers: tuple[registry.Entry, ...]) -> list[str]:
+    names = [entry.name for entry in offers]
+    width = max((len(name) for name in names), default=0)
+    rows = []
+    for entry in offers:
+        twice = "  offered twice: runs that ask for it are refused"
+        note = twice if names.count(entry.name) > 1 else ""
+        rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
+    return rows

@@ -1,0 +1,35 @@
+"""`crossgrad render`: pictures of a run's views."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Split(StrEnum):
+    """Which views are drawn."""
+
+    TEST = "test"
+    TRAIN = "train"
+    ALL = "all"
+
+
+def render(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
+    ],
+    split: Annotated[Split, typer.Option(help="Which views are drawn.")] = Split.TEST,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+    ] = None,
+) -> None:
+    """Draw the views of a run as PNG files."""
+    from crossgrad_core import app
+
+    app.render(run, split=split.value, out=out, device=device)

@@ -1,0 +1,241 @@
+"""Settings of a run from a file, from options and from `--set`, in this order of precedence.
+
+The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`, which validates
+it: unknown keys and values out of bounds are found there.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import yaml
+
+from crossgrad_core.cli.yaml_values import read_yaml
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.slots import GROUPS
+from crossgrad_core.wording import listed, singular
+
+Settings: TypeAlias = dict[str, Any]
+
+OBSERVERS: Final = "observers"
+#: Settings that name one component (or a chain of operators) and hold its options.
+CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
+#: Options of the command line whose setting has another name.
+_PLACES: Final[dict[str, tuple[str, ...]]] = {
+    "observe": (OBSERVERS,),
+    "max_size": ("reading", "max_size"),
+    "split": ("reading", "split"),
+    "test_every": ("reading", "test_every"),
+    "init": ("reading", "init"),
+}
+
+
+def merged(
+    config: Path | None, options: Mapping[str, object], assignments: Sequence[str]
+) -> Settings:
+    """The settings that a user asked for.
+
+    Args:
+        config: YAML file, or None.
+        options: Option name -> value; None and empty lists where the user did not give it.
+        assignments: `KEY=VALUE` texts, values in YAML.
+
+    Raises:
+        UserError: The file cannot be read, or an assignment makes no sense.
+    """
+    settings = _normalized(_from_file(config)) if config is not None else {}
+    for name, value in options.items():
+        if value is not None and value != []:
+            _assign(settings, _PLACES.get(name, (name,)), _plain(value))
+    # Names first: choosing another component drops the options of the one it replaces.
+    for path, value in sorted(map(_parsed, assignments), key=lambda each: not _is_name(each[0])):
+        _assign(settings, path, value)
+    return {key: _with_default_name(key, value) for key, value in settings.items()}
+
+
+def _from_file(path: Path) -> Settings:
+    try:
+        found = read_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            "the configuration file cannot be read", where=path, found=str(error)
+        ) from error
+    except yaml.YAMLError as error:
+        raise UserError(
+            "the configuration file is not valid YAML",
+            where=path,
+            found=" ".join(str(error).split()),
+        ) from error
+    if found is None:
+        return {}
+    if not isinstance(found, dict):
+        raise UserError(
+            "the configuration file holds no settings",
+            where=path,
+            expected="lines such as `steps: 3000`",
+            found=f"a {type(found).__name__}",
+        )
+    return {str(key): value for key, value in found.items()}
+
+
+def _with_default_name(key: str, value: object) -> object:
+    """A choice of options alone is meant for the component that a run takes by default."""
+    if key not in CHOICES or not isinstance(value, dict) or "name" in value:
+        return value
+    default = RunConfig.model_fields[key].default
+    return {"name": default.name if isinstance(default, ComponentChoice) else "auto", **value}
+
+
+def _normalized(settings: Settings) -> Settings:
+    """The settings with every choice of components in its long form."""
+    return {key: _long_form(key, value) for key, value in settings.items()}
+
+
+def _long_form(key: str, value: object) -> object:
+    if key in CHOICES and value is not None:
+        return _choice(value)
+    if key == OBSERVERS and value is not None:
+        return [_named(each) for each in _items(value)]
+    return value
+
+
+def _choice(value: object) -> object:
+    """`a` -> one choice, `a+b` or a list -> a list of choices."""
+    chain = isinstance(value, list | tuple) or (isinstance(value, str) and "+" in value)
+    return [_named(each) for each in _items(value)] if chain else _named(value)
+
+
+def _items(value: object) -> Iterable[object]:
+    """The parts of a chain or list; a mapping name -> options counts as a list, too."""
+    match value:
+        case str():
+            return value.split("+")
+        case list() | tuple():
+            return value
+        case dict() if "name" not in value:
+            return [{"name": name, **(options or {})} for name, options in value.items()]
+        case _:
+            return [value]
+
+
+def _named(value: object) -> object:
+    """A choice `{"name": ..., option: ...}`; what is no choice is left for the validation."""
+    return {"name": value.strip()} if isinstance(value, str) else value
+
+
+def _plain(value: object) -> object:
+    return str(value) if isinstance(value, Path) else value
+
+
+def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:
+    key, equals, text = assignment.partition("=")
+    path = tuple(part.strip() for part in key.split("."))
+    if not equals or not all(path):
+        raise UserError(
+            "--set does not say which setting has which value",
+            expected="KEY=VALUE, for example --set operator.c=0.4",
+            found=repr(assignment),
+        )
+    try:
+        return path, read_yaml(text)
+    except yaml.YAMLError as error:
+        raise UserError(
+            f"the value of --set {key} is not valid YAML",
+            expected="a number, a word, or a quoted text",
+            found=repr(text),
+            todo="put quotes around texts with special characters",
+        ) from error
+
+
+def _is_name(path: tuple[str, ...]) -> bool:
+    return len(path) == 1 or path[-1] == "name"
+
+
+def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
+    """Puts a value in its place; a newly chosen component keeps none of the old one's options."""
+    key, *rest = path
+    if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str):
+        settings[key] = _renamed(settings.get(key), _choice(value))
+    elif key == OBSERVERS and not rest and value is not None:
+        settings[key] = _extended(_links(settings.get(key)), _links(_long_form(key, value)))
+    elif not rest:
+        settings[key] = _long_form(key, value)
+    else:
+        if key == OBSERVERS and settings.get(key) is None:
+            settings[key] = []
+        _holder(settings, path)[path[-1]] = value
+
+
+def _links(value: object) -> list[Settings]:
+    """The choices in a setting: of one component, of a chain, of observers."""
+    return [
+        each for each in (value if isinstance(value, list) else [value]) if isinstance(each, dict)
+    ]
+
+
+def _renamed(old: object, new: object) -> object:
+    """The new choice; a link that was chosen before under the same name keeps its options."""
+    renamed = [_with_options(_links(old), each) for each in _links(new)]
+    return renamed if isinstance(new, list) else renamed[0]
+
+
+def _with_options(old: list[Settings], new: Settings) -> Settings:
+    """Options without a name belong to whatever is chosen later, so they are kept as well."""
+    for link in old:
+        if link.get("name", new["name"]) == new["name"]:
+            return {**link, **new}
+    return new
+
+
+def _extended(old: list[Settings], new: list[Settings]) -> list[Settings]:
+    have = [each.get("name") for each in old]
+    return [*old, *(each for each in new if each.get("name") not in have)]
+
+
+def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
+    """The dictionary that holds the last part of a path; made where there is none yet."""
+    place: object = settings
+    for depth in range(len(path) - 1):
+        place = _inner(place, path, depth)
+    match place:
+        case dict():
+            return place
+        case list():
+            raise _whose(place, path)
+        case _:
+            raise _no_options(path, len(path) - 1)
+
+
+def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
+    """What `path[depth]` names inside a place."""
+    part = path[depth]
+    match place:
+        case dict():
+            if place.get(part) is None:
+                place[part] = {}
+            return place[part]
+        case list():
+            for link in _links(place):
+                if link.get("name") == part:
+                    return link
+            raise _whose(place, path)
+        case _:
+            raise _no_options(path, depth)
+
+
+def _no_options(path: tuple[str, ...], depth: int) -> UserError:
+    return UserError(
+        f"{'.'.join(path[:depth])} is a plain setting without options of its own",
+        where=f"--set {'.'.join(path)}",
+    )
+
+
+def _whose(links: list[object], path: tuple[str, ...]) -> UserError:
+    names = [str(link.get("name")) for link in _links(links)]
+    return UserError(
+        f"{path[0]} is a list; the option must say whose it is",
+        where=f"--set {'.'.join(path)}",
+        expected=listed(f"{path[0]}.{name}.{path[-1]}" for name in names),
+        todo="--observe NAME adds an observer" if path[0] == OBSERVERS else "",
+    )

@@ -1,0 +1,1 @@
+"""Compiled kernels over gradients of all views."""

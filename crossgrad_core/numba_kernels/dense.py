@@ -1,0 +1,248 @@
+"""One pass over the float32 gradients of K views: Gramians, weighted sums, overlaps.
+
+Tensors are handed over by address: `addresses` [T, K] int64 holds the place of the first element of
+view k's gradient of tensor t, 0 where the view does not touch the tensor; `sizes` [T] counts
+elements. The work is cut into chunks of `CHUNK` elements whatever the number of threads, and
+partial sums are added in the order of the chunks: same input, same bits.
+"""
+
+import numpy as np
+from numba import carray, njit, prange
+from numpy.typing import NDArray
+
+from crossgrad_core.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
+from crossgrad_core.numba_kernels.pointers import float32_pointer
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+#: Elements of one chunk, 16 kB per view.
+CHUNK = 4096
+
+
+@njit(cache=True)
+def chunk_table(sizes: Ints) -> Ints:
+    """[C, 2] tensor and first element of each chunk."""
+    total = 0
+    for size in sizes:
+        total += (size + CHUNK - 1) // CHUNK
+    table = np.empty((total, 2), np.int64)
+    c = 0
+    for t in range(sizes.size):
+        for start in range(0, sizes[t], CHUNK):
+            table[c, 0] = t
+            table[c, 1] = start
+            c += 1
+    return table
+
+
+@njit(cache=True, inline="always")
+def _row(address: int, start: int, length: int) -> NDArray[np.float32]:
+    return carray(float32_pointer(address + 4 * start), (length,))
+
+
+@njit(cache=True)
+def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
+    """Gramian of more than four rows, in tiles of two by two; the chunk stays in cache."""
+    tile = np.empty((2, 2))
+    for i in range(0, count, 2):
+        i1 = min(i + 1, count - 1)
+        a, b = _row(rows[i], start, length), _row(rows[i1], start, length)
+        dots_2(a, b, tile)
+        out[i, i], out[i1, i1] = tile[0, 0], tile[1, 1]
+        if i1 > i:
+            out[i, i1] = tile[0, 1]
+        for j in range(i + 2, count, 2):
+            j1 = min(j + 1, count - 1)
+            dots_2x2(a, b, _row(rows[j], start, length), _row(rows[j1], start, length), tile)
+            out[i, j], out[i1, j] = tile[0, 0], tile[1, 0]
+            out[i, j1], out[i1, j1] = tile[0, 1], tile[1, 1]
+
+
+@njit(cache=True)
+def _chunk_gramian(
+    addresses: Ints, start: int, length: int, compact: Floats, out: Floats
+) -> None:
+    """Upper triangle of one chunk's Gramian; rows of absent views stay as they are (zero)."""
+    views = addresses.size
+    rows = np.empty(views, np.int64)
+    places = np.empty(views, np.int64)
+    count = 0
+    for k in range(views):
+        if addresses[k] != 0:
+            rows[count] = addresses[k]
+            places[count] = k
+            count += 1
+    if count == 0:
+        return
+    a = _row(rows[0], start, length)
+    if count == 1:
+        dots_1(a, compact)
+    elif count == 2:
+        dots_2(a, _row(rows[1], start, length), compact)
+    elif count == 3:
+        dots_3(a, _row(rows[1], start, length), _row(rows[2], start, length), compact)
+    elif count == 4:
+        b, c = _row(rows[1], start, length), _row(rows[2], start, length)
+        dots_4(a, b, c, _row(rows[3], start, length), compact)
+    else:
+        _many_dots(rows, count, start, length, compact)
+    for i in range(count):
+        for j in range(i, count):
+            out[places[i], places[j]] = compact[i, j]
+
+
+@njit(cache=True, parallel=True)
+def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+    """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
+    tensors, views = addresses.shape
+    chunks = table.shape[0]
+    partial = np.zeros((chunks, views, views))
+    for c in prange(chunks):
+        t, start = table[c, 0], table[c, 1]
+        length = min(CHUNK, sizes[t] - start)
+        compact = np.empty((views, views))
+        _chunk_gramian(addresses[t], start, length, compact, partial[c])
+    return _summed(partial, table, tensors)
+
+
+@njit(cache=True)
+def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
+    """Adds the chunks' Gramians with Neumaier's compensation, and mirrors the upper triangle."""
+    views = partial.shape[1]
+    total = np.zeros((tensors, views, views))
+    lost = np.zeros((tensors, views, views))
+    for c in range(partial.shape[0]):
+        t = table[c, 0]
+        for i in range(views):
+            for j in range(i, views):
+                old, x = total[t, i, j], partial[c, i, j]
+                new = old + x
+                larger, smaller = (old, x) if abs(old) >= abs(x) else (x, old)
+                lost[t, i, j] += (larger - new) + smaller
+                total[t, i, j] = new
+    for t in range(tensors):
+        for i in range(views):
+            for j in range(i, views):
+                total[t, i, j] += lost[t, i, j]
+                total[t, j, i] = total[t, i, j]
+    return total
+
+
+@njit(cache=True)
+def _weighted(rows: Ints, weights: Floats, count: int, start: int, out: NDArray[np.float32]) -> None:
+    """out = sum of weights times rows, in float64, rounded once.
+
+    Whatever the ratio of the norms, neither weights nor products overflow or underflow there.
+    """
+    n = out.size
+    if count == 0:
+        out[:] = 0.0
+    elif count == 1:
+        a, u = _row(rows[0], start, n), weights[0]
+        for i in range(n):
+            out[i] = np.float32(u * np.float64(a[i]))
+    elif count == 2:
+        a, u = _row(rows[0], start, n), weights[0]
+        b, v = _row(rows[1], start, n), weights[1]
+        for i in range(n):
+            out[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
+    elif count == 3:
+        a, u = _row(rows[0], start, n), weights[0]
+        b, v = _row(rows[1], start, n), weights[1]
+        c, w = _row(rows[2], start, n), weights[2]
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            out[i] = np.float32(x + w * np.float64(c[i]))
+    else:
+        wide = np.empty(n)
+        a, u = _row(rows[0], start, n), weights[0]
+        b, v = _row(rows[1], start, n), weights[1]
+        c, w = _row(rows[2], start, n), weights[2]
+        d, z = _row(rows[3], start, n), weights[3]
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            wide[i] = (x + w * np.float64(c[i])) + z * np.float64(d[i])
+        for k in range(4, count):
+            e, s = _row(rows[k], start, n), weights[k]
+            for i in range(n):
+                wide[i] += s * np.float64(e[i])
+        for i in range(n):
+            out[i] = np.float32(wide[i])
+
+
+@njit(cache=True)
+def _plain(rows: Ints, count: int, start: int, out: NDArray[np.float32]) -> None:
+    """out = rows added in order in float32: the bits of accumulation."""
+    n = out.size
+    if count == 0:
+        out[:] = 0.0
+        return
+    a = _row(rows[0], start, n)
+    if count == 1:
+        for i in range(n):
+            out[i] = a[i]
+    elif count == 2:
+        b = _row(rows[1], start, n)
+        for i in range(n):
+            out[i] = a[i] + b[i]
+    elif count == 3:
+        b, c = _row(rows[1], start, n), _row(rows[2], start, n)
+        for i in range(n):
+            out[i] = (a[i] + b[i]) + c[i]
+    else:
+        b, c, d = _row(rows[1], start, n), _row(rows[2], start, n), _row(rows[3], start, n)
+        narrow = np.empty(n, np.float32)
+        for i in range(n):
+            narrow[i] = ((a[i] + b[i]) + c[i]) + d[i]
+        for k in range(4, count):
+            e = _row(rows[k], start, n)
+            for i in range(n):
+                narrow[i] += e[i]
+        for i in range(n):
+            out[i] = narrow[i]
+
+
+@njit(cache=True, parallel=True)
+def combine(
+    addresses: Ints, weights: Floats, plain: NDArray[np.bool_], out: Ints, sizes: Ints, table: Ints
+) -> None:
+    """Writes the weighted sums of all tensors, in one pass over all views.
+
+    Args:
+        addresses: [T, K]; 0 leaves the view out.
+        weights: [T, K].
+        plain: [T] whether to add the rows in float32 in the order of the views instead.
+        out: [T] addresses of the results; one may be that of a view (element-wise, so safe).
+        sizes: [T].
+        table: From `chunk_table`.
+    """
+    views = addresses.shape[1]
+    for chunk in prange(table.shape[0]):
+        t, start = table[chunk, 0], table[chunk, 1]
+        length = min(CHUNK, sizes[t] - start)
+        rows = np.empty(views, np.int64)
+        used = np.empty(views)
+        count = 0
+        for k in range(views):
+            if addresses[t, k] != 0:
+                rows[count] = addresses[t, k]
+                used[count] = weights[t, k]
+                count += 1
+        if plain[t]:
+            _plain(rows, count, start, _row(out[t], start, length))
+        else:
+            _weighted(rows, used, count, start, _row(out[t], start, length))
+
+
+@njit(cache=True)
+def overlapping(a: int, b: int, size: int) -> bool:
+    """Whether two tensors share the place of a non-zero element."""
+    x, y = _row(a, 0, size), _row(b, 0, size)
+    for start in range(0, size, CHUNK):
+        shared = 0
+        for i in range(start, min(start + CHUNK, size)):
+            shared |= (x[i] != 0) & (y[i] != 0)
+        if shared:
+            return True
+    return False

@@ -1,0 +1,17 @@
+"""Arrays from addresses, so that one compiled kernel takes any number of tensors."""
+
+from typing import Any
+
+from numba import types
+from numba.extending import intrinsic
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def float32_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ANN401
+    """Inside kernels: int64 address -> pointer to float32, which `numba.carray` makes an array."""
+    signature = types.CPointer(types.float32)(types.int64)
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return signature, codegen

@@ -1,0 +1,37 @@
+"""What a run has cost so far."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Totals:
+    """The cost side of an evaluation.
+
+    Attributes:
+        step: Optimizer steps.
+        views: Rendered training views.
+        backward_passes: Backward passes.
+        train_seconds: Training seconds; compiling, loading, evaluating and reporting excluded.
+        primitives: Number of primitives.
+        peak_memory_mib: Peak memory, MiB.
+        loss: Mean photometric loss of the last step, None before the first.
+    """
+
+    step: int
+    views: int
+    backward_passes: int
+    train_seconds: float
+    primitives: int
+    peak_memory_mib: float
+    loss: float | None
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall-clock seconds of a run by what they were spent on; only `train` counts as training."""
+
+    train: float = 0.0
+    compile: float = 0.0
+    load: float = 0.0
+    evaluate: float = 0.0
+    report: float = 0.0

@@ -1,0 +1,91 @@
+"""Groups of cameras whose gradients agree."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import cKDTree
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.poses import centers_of, radial_distances
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import (
+    FAR,
+    NEAR,
+    require_groups,
+    require_training_views,
+    smaller_mean_first,
+)
+
+
+class ConflictSignature(Grouping):
+    """The two sides of the spectral cut of the cosines between the cameras' gradients.
+
+    Gradients are normalised per block, their cosines averaged over blocks; (1 + cosine) / 2 is the
+    similarity. The side with the smaller mean radial distance is near. A view that was not probed
+    has the label of the nearest probed camera.
+
+    Source: the paper names it without a definition; this one is ours.
+    """
+
+    needs_probe: ClassVar[bool] = True
+
+    cameras: int = Field(
+        96, ge=2, description="probe at most so many training views, evenly spaced by name"
+    )
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "conflict-signature")
+        if probe is None:
+            raise UserError(
+                "grouping conflict-signature needs the gradients of a trained model",
+                where="grouping",
+                todo="write its labels with `crossgrad diagnose SCENE --signature LABELS.csv` and "
+                "use them with --grouping lists --set grouping.file=LABELS.csv",
+            )
+        count = min(self.cameras, len(scene.train))
+        probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
+        sides = spectral_cut(mean_cosines(probe.gramians([int(i) for i in probed])))
+        chosen = [scene.train_views[i] for i in probed]
+        near = smaller_mean_first(sides, radial_distances(scene, chosen))
+        train = [NEAR if side == near else FAR for side in sides]
+        require_groups("conflict-signature", train, (NEAR, FAR), "the directions of gradients")
+        _, nearest = cKDTree(centers_of(chosen)).query(centers_of(views))
+        note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
+        return Labelling(tuple(train[i] for i in nearest), (note,))
+
+
+def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, V] cosines averaged over the blocks of the Gramians [B, V, V].
+
+    A pair with a zero gradient has no cosine in that block; a pair without any has cosine 0.
+    """
+    norms = np.sqrt(np.einsum("bii->bi", gramians))
+    products = norms[:, :, None] * norms[:, None, :]
+    valid = products > 0.0
+    cosines = np.divide(gramians, products, out=np.zeros_like(gramians), where=valid)
+    return np.asarray(np.clip(cosines, -1.0, 1.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1))
+
+
+def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[V] side 0 or 1 by the sign of the second eigenvector of the normalised Laplacian.
+
+    Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
+    """
+    similarity = (1.0 + cosines) / 2.0
+    root = 1.0 / np.sqrt(similarity.sum(axis=1))
+    # The second smallest eigenvalue of I - S is the second largest of S.
+    scaled = root[:, None] * similarity * root[None, :]
+    vector = np.linalg.eigh((scaled + scaled.T) / 2.0)[1][:, -2]
+    return (vector > 0.0).astype(np.int64)

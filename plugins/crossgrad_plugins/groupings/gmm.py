@@ -1,0 +1,132 @@
+"""A two-component Gaussian mixture of log-distances."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.poses import radial_distances
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.radial import Radial
+from crossgrad_plugins.groupings.split import FAR, NEAR, require_training_views
+
+_VARIANCE_FLOOR = 1e-6
+_DISTANCE_FLOOR = 1e-9
+_ITERATIONS = 500
+_TOLERANCE = 1e-10
+
+
+class GaussianMixture(Grouping):
+    """The two components of a mixture fitted to log r; near has the smaller mean.
+
+    Falls back to the median (grouping `radial`), with a note, where the fit is degenerate: a
+    component weighs less than one camera, gets no camera, or a figure is not finite.
+
+    Source: expectation maximisation (Dempster et al. 1977) in one dimension.
+    """
+
+    restarts: int = Field(10, ge=1, description="starting points; the most likely fit is kept")
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "gmm")
+        distances = radial_distances(scene, scene.train_views)
+        floor = _DISTANCE_FLOOR * float(np.median(distances))
+        mixture = _fit(distances, floor, self.restarts, rng)
+        if mixture is None or len(set(mixture.labels(distances, floor))) == 1:
+            median = Radial().label(scene, views, rng)
+            fallback = "grouping gmm: the mixture is degenerate, the median split is used instead"
+            return Labelling(median.labels, (fallback, *median.notes))
+        near, far = np.exp(mixture.means)
+        note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
+        return Labelling(mixture.labels(radial_distances(scene, views), floor), (note,))
+
+
+@dataclass(frozen=True, eq=False)
+class _Mixture:
+    """Weights, means (ascending) and variances, [2] each, and the log-likelihood of the fit."""
+
+    weights: NDArray[np.float64]
+    means: NDArray[np.float64]
+    variances: NDArray[np.float64]
+    likelihood: float
+
+    def labels(self, distances: NDArray[np.float64], floor: float) -> tuple[str, ...]:
+        """The more probable component of each distance [V]."""
+        joint = _log_joint(np.log(np.maximum(distances, floor)), self)
+        return tuple(NEAR if near >= far else FAR for near, far in joint)
+
+
+def _fit(
+    distances: NDArray[np.float64], floor: float, restarts: int, rng: np.random.Generator
+) -> _Mixture | None:
+    """The most likely of several fits; None where none is usable."""
+    if floor <= 0.0:
+        return None
+    logs = np.log(np.maximum(distances, floor))
+    spread = float(logs.var())
+    if spread == 0.0:
+        return None
+    fits = [_expectation_maximisation(logs, spread, rng) for _ in range(restarts)]
+    usable = [fit for fit in fits if _usable(fit, len(logs))]
+    return max(usable, key=lambda fit: fit.likelihood, default=None)
+
+
+def _usable(mixture: _Mixture, cameras: int) -> bool:
+    figures = np.concatenate([mixture.weights, mixture.means, mixture.variances])
+    return bool(np.isfinite(figures).all() and mixture.weights.min() >= 1.0 / cameras)
+
+
+def _expectation_maximisation(
+    logs: NDArray[np.float64], spread: float, rng: np.random.Generator
+) -> _Mixture:
+    """One fit from two random cameras as means."""
+    starts = np.sort(rng.choice(logs, size=2, replace=False))
+    mixture = _Mixture(np.full(2, 0.5), starts, np.full(2, spread), -np.inf)
+    for _ in range(_ITERATIONS):
+        joint = _log_joint(logs, mixture)
+        evidence = np.logaddexp(joint[:, 0], joint[:, 1])
+        likelihood = float(evidence.sum())
+        if likelihood - mixture.likelihood <= _TOLERANCE * len(logs):
+            break
+        shares = np.exp(joint - evidence[:, None])
+        mixture = _maximised(logs, shares, _VARIANCE_FLOOR * spread, likelihood)
+    order = np.argsort(mixture.means)
+    return _Mixture(
+        mixture.weights[order],
+        mixture.means[order],
+        mixture.variances[order],
+        mixture.likelihood,
+    )
+
+
+def _maximised(
+    logs: NDArray[np.float64],
+    shares: NDArray[np.float64],
+    variance_floor: float,
+    likelihood: float,
+) -> _Mixture:
+    """The mixture with the moments of the cameras' shares [N, 2]."""
+    # A component that no camera belongs to keeps finite figures and is refused by its weight.
+    totals = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
+    means = (shares * logs[:, None]).sum(axis=0) / totals
+    squares = (shares * (logs[:, None] - means) ** 2).sum(axis=0) / totals
+    variances = np.maximum(squares, variance_floor)
+    return _Mixture(totals / len(logs), means, variances, likelihood)
+
+
+def _log_joint(logs: NDArray[np.float64], mixture: _Mixture) -> NDArray[np.float64]:
+    """[V, 2] log of weight times density."""
+    squared = (logs[:, None] - mixture.means) ** 2 / mixture.variances
+    constant = np.log(mixture.weights) - 0.5 * np.log(2.0 * np.pi * mixture.variances)
+    return np.asarray(constant - 0.5 * squared)

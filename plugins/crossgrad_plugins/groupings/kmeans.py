@@ -1,0 +1,83 @@
+"""Two clusters of camera positions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.poses import centers_of, radial_distances
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import (
+    FAR,
+    NEAR,
+    require_groups,
+    require_training_views,
+    smaller_mean_first,
+)
+
+_ITERATIONS = 200
+
+
+class KMeans(Grouping):
+    """The two k-means clusters of the camera centres; near has the smaller mean radial distance.
+
+    Source: Lloyd's algorithm with k-means++ seeding (Arthur and Vassilvitskii 2007).
+    """
+
+    restarts: int = Field(10, ge=1, description="seedings; the tightest clustering is kept")
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "kmeans")
+        points = centers_of(scene.train_views)
+        trials = [_lloyd(points, _seeds(points, rng)) for _ in range(self.restarts)]
+        centroids, _ = min(trials, key=lambda trial: trial[1])
+        clusters = _nearest(points, centroids)
+        near = smaller_mean_first(clusters, radial_distances(scene, scene.train_views))
+        train = [NEAR if cluster == near else FAR for cluster in clusters]
+        require_groups("kmeans", train, (NEAR, FAR), "position")
+        labels = [NEAR if c == near else FAR for c in _nearest(centers_of(views), centroids)]
+        note = (
+            f"grouping kmeans: {train.count(NEAR)} near and {train.count(FAR)} far training views"
+        )
+        return Labelling(tuple(labels), (note,))
+
+
+def _nearest(points: NDArray[np.float64], centroids: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[V] index of the nearest of the centroids [2, 3]."""
+    squared = ((points[:, None, :] - centroids[None, :, :]) ** 2).sum(axis=2)
+    return np.asarray(squared.argmin(axis=1))
+
+
+def _seeds(points: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """[2, 3] two of the points: the second with probability by squared distance from the first."""
+    first = points[int(rng.integers(len(points)))]
+    squared = ((points - first) ** 2).sum(axis=1)
+    total = float(squared.sum())
+    weights = squared / total if total > 0.0 else None
+    return np.stack([first, points[int(rng.choice(len(points), p=weights))]])
+
+
+def _lloyd(
+    points: NDArray[np.float64], centroids: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Centroids after convergence and the sum of squared distances from them."""
+    for _ in range(_ITERATIONS):
+        clusters = _nearest(points, centroids)
+        if len(np.unique(clusters)) < len(centroids):
+            break
+        moved = np.stack([points[clusters == c].mean(axis=0) for c in range(len(centroids))])
+        if np.array_equal(moved, centroids):
+            break
+        centroids = moved
+    clusters = _nearest(points, centroids)
+    return centroids, float(((points - centroids[clusters]) ** 2).sum())

@@ -1,0 +1,118 @@
+"""Groups that the user names: folders of images, or lists of views."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_plugins.groupings.split import require_training_views
+
+
+class Lists(Grouping):
+    """Labels by the images' top folder, or by a file of the user.
+
+    Without a file the label of `aerial/0001.jpg` is `aerial`. A file is CSV with two columns, view
+    name and label; a name that ends with a slash covers the folder.
+    """
+
+    labels: ClassVar[tuple[str, ...]] = ()
+
+    file: Path | None = Field(
+        None, description="CSV file: view name (or folder with a slash at the end), label"
+    )
+
+    @override
+    def label(
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        rng: np.random.Generator,
+        probe: GradientProbe | None = None,
+    ) -> Labelling:
+        require_training_views(scene, "lists")
+        if self.file is None:
+            labels = tuple(_folder(view.name) for view in views)
+            train = {_folder(view.name) for view in scene.train_views}
+        else:
+            table = read_labels(self.file)
+            labels = tuple(_listed(view.name, table, self.file) for view in views)
+            train = {_listed(view.name, table, self.file) for view in scene.train_views}
+        _require_two(train, self.file)
+        return Labelling(labels, (f"grouping lists: {', '.join(sorted(train))}",))
+
+
+def read_labels(path: Path) -> dict[str, str]:
+    """View name or folder (ending with a slash) -> label.
+
+    Raises:
+        UserError: The file is missing, a row has not two columns, or a name has two labels.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError("the list of labels cannot be read", where=path, found=str(error)) from None
+    table: dict[str, str] = {}
+    for row in rows:
+        cells = [cell.strip() for cell in row]
+        if len(cells) != 2 or not all(cells):  # noqa: PLR2004 - a name and a label
+            raise UserError(
+                "a row of the list of labels is not a name and a label",
+                where=path,
+                expected="image.jpg,near",
+                found=",".join(row),
+            )
+        name, label = cells
+        if table.setdefault(name, label) != label:
+            raise UserError(
+                "a view has two labels", where=path, found=f"{name}: {table[name]}, {label}"
+            )
+    return table
+
+
+def _folder(name: str) -> str:
+    """The top folder of a view's name, empty where there is none."""
+    return name.split("/", 1)[0] if "/" in name else ""
+
+
+def _listed(name: str, table: Mapping[str, str], path: Path) -> str:
+    """The label of the view, or of the innermost listed folder that holds it."""
+    if name in table:
+        return table[name]
+    parts = name.split("/")
+    for depth in range(len(parts) - 1, 0, -1):
+        folder = "/".join(parts[:depth]) + "/"
+        if folder in table:
+            return table[folder]
+    raise UserError(
+        "a view has no label",
+        where=path,
+        expected="a row for every view, or for a folder that holds it",
+        found=name,
+        todo=f"add the row `{name},LABEL`",
+    )
+
+
+def _require_two(train: set[str], path: Path | None) -> None:
+    if len(train) > 1:
+        return
+    if path is None:
+        raise UserError(
+            "grouping lists finds one folder of training views only",
+            where="grouping",
+            expected="photos in two or more folders below the image folder, or a file",
+            todo="name a CSV file (view name, label): --set grouping.file=labels.csv",
+        )
+    raise UserError(
+        "the list of labels gives all training views one label",
+        where=path,
+        expected="two labels or more",
+        found=", ".join(sorted(train)),
+    )

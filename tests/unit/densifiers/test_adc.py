@@ -1,0 +1,135 @@
+"""Adaptive density control against rules worked out by hand on a few Gaussians."""
+
+from dataclasses import replace
+from math import log
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contexts import DensifyContext, ViewRecord
+from crossgrad_core.gaussians import Gaussians, Screen
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.scene.types import Camera, View
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import NO_EDIT, apply_to_parameters
+from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
+
+SCHEDULE = Schedule.for_run(30_000)
+CAMERA = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.eye(4, dtype=torch.float64))
+
+
+def parameters(scales=(0.005, 0.02, 0.005, 0.02), opacities=(0.5, 0.5, 0.5, 0.5)):
+    n = len(scales)
+    return {
+        "means": torch.arange(3.0 * n).reshape(n, 3).requires_grad_(),
+        "scales": torch.tensor(scales).log()[:, None].repeat(1, 3).requires_grad_(),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1).requires_grad_(),
+        "opacities": torch.logit(torch.tensor(opacities)).requires_grad_(),
+        "f_dc": torch.zeros(n, 1, 3).requires_grad_(),
+        "f_rest": torch.zeros(n, 15, 3).requires_grad_(),
+    }
+
+
+def record(gradient, radii, origin=None):
+    n = len(radii)
+    gaussians = Gaussians(torch.zeros(n, 3), torch.zeros(n, 4), torch.ones(n, 3), torch.ones(n))
+    screen = Screen(torch.tensor(radii, dtype=torch.int32), mean_gradient=torch.tensor(gradient))
+    view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
+    return ViewRecord(
+        0, view, None, 0.1, replace(gaussians, origin=origin), screen, torch.zeros(3)
+    )
+
+
+def context(views, *, step, params=None, room=100, rng=0):
+    return DensifyContext(
+        step=step,
+        schedule=SCHEDULE,
+        scene=None,
+        states={},
+        rng=np.random.default_rng(rng),
+        parameters=params or parameters(),
+        backbone=Vanilla(),
+        views=tuple(views),
+        means_lr=1e-4,
+        room=room,
+    )
+
+
+# Gradient 1e-5 px^-1 in x is 1e-5 * W/2 = 1e-3 in NDC: above the threshold of 2e-4.
+MOVING, STILL = [1e-5, 0.0], [1e-7, 0.0]
+
+
+def test_statistic_is_the_mean_ndc_norm_over_visible_renders():
+    adc = AdaptiveDensityControl()
+    gradient = [[3e-6, 8e-6], [1.0, 1.0]]
+    views = [record(gradient, [1, 0]), record([[0.0, 0.0], [0.0, 0.0]], [1, 0])]
+    params = parameters((0.1, 0.1), (0.5, 0.5))
+    _, state = adc.densify(context(views, step=1, params=params), PluginState())
+    norm = np.hypot(3e-6 * 100, 8e-6 * 50)
+    assert state.per_primitive["gradient"].tolist() == pytest.approx([norm, 0.0])
+    assert state.per_primitive["renders"].tolist() == [2.0, 0.0]
+
+
+def test_statistics_of_decoded_gaussians_go_to_their_primitives():
+    view = record([[1e-5, 0.0]] * 3, [1, 1, 1], origin=torch.tensor([1, 1, 0]))
+    params = parameters((0.1, 0.1), (0.5, 0.5))
+    _, state = AdaptiveDensityControl().densify(context([view], step=1, params=params), PluginState())
+    assert state.per_primitive["renders"].tolist() == [1.0, 2.0]
+
+
+def test_small_ones_are_cloned_large_ones_split_and_statistics_reset():
+    view = record([MOVING, MOVING, STILL, STILL], [1, 1, 1, 1])
+    params = parameters()
+    ctx = context([view], step=600, params=params)
+    edit, state = AdaptiveDensityControl().densify(ctx, PluginState())
+    assert dict(edit.counts) == {"cloned": 1, "split": 1, "pruned": 0}
+    assert edit.source.tolist() == [0, 2, 3, 0, 1, 1]
+    assert edit.fresh.tolist() == [False, False, False, True, True, True]
+    new = apply_to_parameters(edit, Vanilla().blocks(), params)
+    assert torch.equal(new["means"][3], params["means"][0])
+    assert new["scales"][4, 0].item() == pytest.approx(log(0.02 / 1.6))
+    offset = (new["means"][4:] - params["means"][1]).abs()
+    assert 0 < offset.max() < 6 * 0.02
+    assert float(state.per_primitive["renders"].sum()) == 0
+
+
+def test_faint_ones_are_pruned_and_large_ones_only_after_the_first_reset():
+    params = parameters((0.005, 0.2, 0.005, 0.2), (0.001, 0.5, 0.5, 0.5))
+    view = record([STILL] * 4, [1] * 4)
+    early, _ = AdaptiveDensityControl().densify(
+        context([view], step=600, params=params), PluginState()
+    )
+    assert early.source.tolist() == [1, 2, 3]
+    late, _ = AdaptiveDensityControl().densify(
+        context([view], step=3100, params=params), PluginState()
+    )
+    assert late.source.tolist() == [2]
+
+
+def test_no_room_takes_the_strongest_and_says_how_many_were_held_back():
+    view = record([[1e-5, 0], [3e-5, 0], [2e-5, 0], STILL], [1] * 4)
+    ctx = context([view], step=600, params=parameters((0.005,) * 4), room=1)
+    edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
+    assert edit.source.tolist() == [0, 1, 2, 3, 1]
+    assert edit.counts["held_back"] == 2
+
+
+def test_reset_caps_opacity_and_forgets_its_moments():
+    params = parameters(opacities=(0.5, 0.006, 0.5, 0.5))
+    view = record([STILL] * 4, [1] * 4)
+    edit, _ = AdaptiveDensityControl().densify(
+        context([view], step=3000, params=params), PluginState()
+    )
+    opacities = torch.sigmoid(edit.values["opacities"].values)
+    assert opacities.tolist() == pytest.approx([0.01, 0.006, 0.01, 0.01])
+    assert not edit.values["opacities"].keep_moments
+
+
+def test_nothing_happens_between_the_edits_and_after_the_end():
+    adc = AdaptiveDensityControl()
+    view = record([MOVING] * 4, [1] * 4)
+    assert adc.densify(context([view], step=601), PluginState())[0] == NO_EDIT
+    edit, state = adc.densify(context([view], step=15_000), PluginState())
+    assert edit == NO_EDIT and not state.per_primitive

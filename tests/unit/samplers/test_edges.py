@@ -1,0 +1,156 @@
+"""Numbers of views, missing groups, tiny scenes, identical cameras."""
+
+import numpy as np
+import pytest
+
+from crossgrad_core.component import Selection
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
+from crossgrad_plugins.samplers.fps import FarthestPoint, farthest_point_order
+from crossgrad_plugins.samplers.horizon import Horizon
+from crossgrad_plugins.samplers.near_far import NearFar
+
+ADMITTED = {
+    "active": {2},
+    "anchors-30": {2},
+    "epoch": {1, 2, 3, 4, 5, 6},
+    "fps": {1, 2, 3, 4, 5, 6},
+    "horizon": {1, 2, 3, 4, 5, 6},
+    "near-far": {2, 4, 6},
+    "random": {1, 2, 3, 4, 5, 6},
+    "random-split": {2, 4, 6},
+    "three-way": {3},
+}
+NEEDS_GROUPS = ("active", "anchors-30", "horizon", "near-far", "three-way")
+ONE_VIEW = ("epoch", "fps", "random")
+
+
+def scene(cameras):
+    return posed_scene([posed_view((i, 0, 0), f"{i}.png") for i in range(cameras)])
+
+
+def objections(sampler, name, views):
+    selection = Selection({"sampler": sampler}, {"sampler": name}, views, "cpu")
+    return sampler.crossgrad_objections(selection)
+
+
+@pytest.mark.parametrize("name", ADMITTED)
+def test_other_numbers_of_views_are_refused_with_the_reason(name):
+    sampler = build("samplers", name, {})
+    for views in range(1, 7):
+        refused = objections(sampler, name, views)
+        assert (not refused) == (views in ADMITTED[name])
+        assert all(f"K = {views}" in reason and name in reason for reason in refused)
+
+
+@pytest.mark.parametrize("name", ADMITTED)
+def test_the_usual_number_of_views_is_admitted(name):
+    sampler = build("samplers", name, {})
+    assert sampler.view_counts.admits(sampler.usual_views)
+
+
+def test_alternating_takes_one_view_only():
+    sampler = NearFar(alternating=True)
+    assert sampler.usual_views == 1
+    assert not objections(sampler, "near-far", 1)
+    assert objections(sampler, "near-far", 2)
+
+
+def test_alternating_begins_near():
+    run = SamplerRun(NearFar(alternating=True), scene(4), ("near", "near", "far", "far"))
+    assert [draw.labels for draw in run.draws(3)] == [("near",), ("far",), ("near",)]
+
+
+def test_a_pair_is_near_first_and_further_pairs_follow():
+    run = SamplerRun(NearFar(), scene(4), ("far", "near", "far", "near"), 4)
+    assert run.draw().labels == ("near", "far", "near", "far")
+
+
+def test_other_labels_take_turns_in_alphabetical_order():
+    run = SamplerRun(NearFar(), scene(4), ("street", "aerial", "street", "aerial"))
+    draw = run.draw()
+    assert draw.labels == ("aerial", "street")
+    assert draw.views[0] % 2 == 1
+
+
+@pytest.mark.parametrize("name", NEEDS_GROUPS)
+@pytest.mark.parametrize("groups", [None, ("near",) * 4, ("a", "b", "c", "d")])
+def test_missing_groups_are_a_user_error(name, groups):
+    sampler = build("samplers", name, {})
+    with pytest.raises(UserError, match="--grouping"):
+        SamplerRun(sampler, scene(4), groups).draw()
+
+
+@pytest.mark.parametrize("name", ["epoch", "fps"])
+def test_more_different_views_than_there_are_is_a_user_error(name):
+    with pytest.raises(UserError, match="3 different views of 2"):
+        SamplerRun(build("samplers", name, {}), scene(2), views_per_step=3).draw()
+
+
+@pytest.mark.parametrize("order", ["distinct", "epoch"])
+def test_a_group_too_small_for_different_views_is_a_user_error(order):
+    run = SamplerRun(NearFar(order=order), scene(4), ("near", "far", "far", "far"), 4)
+    with pytest.raises(UserError, match="2 different views of 1"):
+        run.draw()
+
+
+@pytest.mark.parametrize("name", ADMITTED)
+def test_a_scene_without_training_views_is_a_user_error(name):
+    sampler = build("samplers", name, {})
+    with pytest.raises(UserError):
+        SamplerRun(sampler, posed_scene([])).draw()
+
+
+@pytest.mark.parametrize("name", ONE_VIEW)
+def test_one_camera_is_enough_for_one_view(name):
+    run = SamplerRun(build("samplers", name, {}), scene(1), views_per_step=1)
+    assert [draw.views for draw in run.draws(3)] == [(0,)] * 3
+
+
+def test_independent_draws_may_repeat_the_only_camera():
+    run = SamplerRun(build("samplers", "random", {}), scene(1))
+    assert run.draw().views == (0, 0)
+
+
+def test_random_halves_need_two_cameras():
+    with pytest.raises(UserError, match="two training views"):
+        SamplerRun(build("samplers", "random-split", {}), scene(1)).draw()
+
+
+def test_horizon_may_show_a_small_group_twice_in_a_step():
+    run = SamplerRun(Horizon(), scene(3), ("near", "near", "far"), 3)
+    draw = run.draw()
+    assert draw.views[:2] == (2, 2)
+    assert draw.labels == ("far", "far", "near")
+
+
+@pytest.mark.parametrize("name", ["epoch", "random", "fps"])
+def test_labels_are_passed_on_where_there_are_groups(name):
+    run = SamplerRun(build("samplers", name, {}), scene(4), ("a", "b", "c", "d"), 2)
+    for draw in run.draws(5):
+        assert draw.labels == tuple("abcd"[view] for view in draw.views)
+    assert SamplerRun(build("samplers", name, {}), scene(4)).draw().labels is None
+
+
+def test_farthest_points_spread():
+    line = np.array([[0.0], [1.0], [2.0], [3.0], [8.0]])
+    assert farthest_point_order(line, 0) == [0, 4, 3, 1, 2]
+
+
+def test_equally_far_points_come_by_index():
+    assert farthest_point_order(np.zeros((4, 2)), 2) == [2, 0, 1, 3]
+
+
+def test_cameras_at_one_place_differ_by_direction():
+    forwards = [(1, 0, 0), (1, 0.1, 0), (-1, 0, 0), (0, 1, 0)]
+    views = [posed_view((0, 0, 0), f"{i}.png", forward=f) for i, f in enumerate(forwards)]
+    run = SamplerRun(FarthestPoint(), posed_scene(views), views_per_step=4)
+    opposite = {0: 2, 1: 2, 2: 0}
+    for draw in run.draws(20):
+        assert opposite.get(draw.views[0], draw.views[1]) == draw.views[1]
+
+
+def test_every_built_in_sampler_is_covered_here():
+    ours = {n for n, e in entries("samplers").items() if "crossgrad_plugins" in e.value}
+    assert ours == set(ADMITTED)
