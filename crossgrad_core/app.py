@@ -1,1 +1,306 @@
 """What the commands do: run, resume, evaluate, render, export."""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+import yaml
+from pydantic import ValidationError
+
+from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contexts import RunInfo
+from crossgrad_core.errors import UserError
+from crossgrad_core.files import write_atomically
+from crossgrad_core.results.folder import RunName, create_run_folder, expected_bytes
+from crossgrad_core.results.log import RunLog
+from crossgrad_core.results.summary import Status
+from crossgrad_core.results.table import final_table
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.threads import configure_threads
+from crossgrad_core.training.assemble import DEFAULT_STEPS, assemble, read_scene
+from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
+from crossgrad_core.training.failure import TrainingFailedError
+from crossgrad_core.training.loop import Stopper, train
+from crossgrad_core.training.persist import from_checkpoint
+from crossgrad_core.training.resolve import resolved
+from crossgrad_core.training.session import PANELS, Session, export_ply, renderer, totals
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state, initial_bytes, steps_for, warm_up
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.validation import as_user_error
+
+CONFIG = "config.yaml"
+#: Exit code of a run that the user interrupted.
+INTERRUPTED = 130
+FAILED = 1
+
+
+def run(
+    settings: Mapping[str, Any],
+    *,
+    resume: Path | None = None,
+    dry_run: bool = False,
+    verbosity: int = 0,
+) -> int:
+    """Trains, evaluates and exports.
+
+    Args:
+        settings: What the user set, in the shape of `RunConfig`.
+        resume: Folder of a stopped run to continue.
+        dry_run: Check everything, print the resolved settings, train nothing.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+
+    Returns:
+        The exit code: 0, 130 where the user interrupted the run, 1 where training failed.
+
+    Raises:
+        UserError: The input is bad; nothing was written.
+    """
+    if resume is not None:
+        return _resume(resume, settings, verbosity)
+    config = with_defaults(parsed(settings))
+    setup, load_seconds = _setup(config, verbosity)
+    if dry_run:
+        _print_dry_run(setup)
+        return 0
+    compile_seconds = warm_up(setup)
+    if config.seconds is not None:
+        setup = _within(setup, config.seconds)
+    state = first_state(setup)
+    state.clock.load, state.clock.compile = load_seconds, compile_seconds
+    folder = _new_folder(setup, state)
+    write_atomically(folder / CONFIG, _as_yaml(resolved(setup)).encode())
+    setup = replace(setup, config=resolved(setup))
+    return _train(setup, state, Session.fresh(folder, setup))
+
+
+def parsed(settings: Mapping[str, Any]) -> RunConfig:
+    """The validated configuration.
+
+    Raises:
+        UserError: A setting does not exist or has a wrong value.
+    """
+    try:
+        return RunConfig.model_validate(settings)
+    except ValidationError as error:
+        raise as_user_error(
+            error, RunConfig, subject="a run", todo="crossgrad run --help lists every setting"
+        ) from error
+
+
+def with_defaults(config: RunConfig) -> RunConfig:
+    """The configuration with scene and length filled in."""
+    if config.steps is not None and config.seconds is not None:
+        raise UserError(
+            "a run has either a number of steps or of seconds",
+            where="--steps, --seconds",
+            found=f"{config.steps} steps and {config.seconds:g} seconds",
+            todo="leave one of them out",
+        )
+    if config.scene is None:
+        config = config.model_copy(update={"scene": bundled_scene()})
+        if config.steps is None and config.seconds is None:
+            config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
+    elif config.steps is None and config.seconds is None:
+        config = config.model_copy(update={"steps": DEFAULT_STEPS})
+    return config
+
+
+def _setup(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
+    """The assembled run and the seconds that reading the scene took."""
+    configure_threads(config.threads)
+    start = perf_counter()
+    scene, reader = read_scene(config, cast("Path", config.scene))
+    seconds = perf_counter() - start
+    level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
+    if not any(choice.name == "progress" for choice in config.observers):
+        progress = ComponentChoice.model_validate({"name": "progress", "level": level})
+        config = config.model_copy(update={"observers": (*config.observers, progress)})
+    return assemble(config, scene, reader), seconds
+
+
+def _within(setup: Setup, seconds: float) -> Setup:
+    """The setup with the length that fits into `seconds` of training."""
+    steps, note = steps_for(setup, seconds)
+    config = setup.config.model_copy(update={"steps": steps, "seconds": None})
+    schedule = Schedule.for_run(steps, config.schedule)
+    return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
+
+
+def _new_folder(setup: Setup, state: TrainState) -> Path:
+    names = setup.selection.names
+    name = RunName(
+        setup.scene.name,
+        names["backbone"],
+        names["sampler"],
+        names["operator"],
+        datetime.now().astimezone(),
+    )
+    needed = expected_bytes(state.primitives(setup), 2)
+    return create_run_folder(name, setup.config.out, needed=needed)
+
+
+def _train(setup: Setup, state: TrainState, session: Session) -> int:
+    """Trains from `state` on and finishes the run's folder whatever happens."""
+    log = RunLog(session.folder)
+    setup.manager.register(log, name="log")
+    hook = setup.hook
+    info = RunInfo(
+        folder=session.folder,
+        scene=setup.scene,
+        config=setup.config.model_dump(mode="json"),
+        schedule=setup.schedule,
+        blocks=setup.blocks,
+        notes=setup.notes,
+    )
+    hook.crossgrad_run_start(run=info)
+    stopper = Stopper()
+    status: Status
+    with stopper.installed():
+        try:
+            status = train(setup, state, session, stopper)
+            error = None
+            session.save(setup, state)
+        except TrainingFailedError as failure:
+            status, error = "failed", str(failure)
+        session.evaluate(setup, state, panels=PANELS)
+        session.finish(setup, state, status, error)
+    hook.crossgrad_run_end(status=status)
+    table = final_table(session.result, totals(setup, state))
+    log.write(table)
+    print(table)  # noqa: T201 - the result of the command
+    print(f"results in {session.folder}")  # noqa: T201
+    return _exit_code(status, error, stopper, session.folder)
+
+
+def _exit_code(status: Status, error: str | None, stopper: Stopper, folder: Path) -> int:
+    if status == "failed":
+        print(f"training failed: {error}", file=sys.stderr)  # noqa: T201
+        return FAILED
+    if status == "stopped":
+        print(f"continue with: crossgrad run --resume {folder}", file=sys.stderr)  # noqa: T201
+    return INTERRUPTED if stopper.requested else 0
+
+
+def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
+    setup, state = opened(folder, settings, verbosity)
+    if state.step >= setup.schedule.total:
+        raise UserError(
+            "the run is finished",
+            where=folder,
+            found=f"all {setup.schedule.total} steps done",
+            todo="start a new run; --init point_cloud.ply starts from its Gaussians",
+        )
+    state.clock.compile += warm_up(setup)
+    return _train(setup, state, Session.resumed(folder, setup, state.step))
+
+
+def opened(
+    folder: Path, settings: Mapping[str, Any], verbosity: int = 0
+) -> tuple[Setup, TrainState]:
+    """A run's setup and its newest state.
+
+    Args:
+        folder: The run's folder.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, or a setting would change the training.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise UserError(
+            "this is not the folder of a run",
+            where=folder,
+            expected=f"a folder with {CONFIG}",
+            todo="name the folder that `crossgrad run` printed",
+        )
+    checkpoint = load(latest(folder))
+    frozen = sorted(set(settings) - {"device", "threads", "stop_after"})
+    if frozen:
+        raise UserError(
+            "a resumed run keeps its settings",
+            where=", ".join(f"--{name.replace('_', '-')}" for name in frozen),
+            todo="leave them out, or start a new run",
+        )
+    stored = yaml.safe_load(path.read_text(encoding="utf-8"))
+    stored.pop("stop_after", None)
+    config = parsed({**stored, **settings})
+    setup, seconds = _setup(config, verbosity)
+    state = from_checkpoint(setup, checkpoint)
+    state.clock.load += seconds
+    return setup, state
+
+
+def evaluate(folder: Path, *, device: str | None = None, threads: int | None = None) -> None:
+    """Evaluates the held-out views of a run again; prints the table and renews per_view.csv.
+
+    Raises:
+        UserError: It is no run, or it has no checkpoint.
+    """
+    from crossgrad_core.evaluation import evaluate as measured
+    from crossgrad_core.results.per_view import write_per_view
+
+    setup, state = opened(folder, _machine(device, threads), -1)
+    result = measured(setup.scene.test_views, renderer(setup, state))
+    write_per_view(folder, result)
+    print(final_table(result, totals(setup, state)))  # noqa: T201
+
+
+def render(folder: Path, *, split: str, out: Path | None, device: str | None = None) -> None:
+    """Draws photo | render | error of the views of a run.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, or the split is empty.
+    """
+    from crossgrad_core.evaluation import evaluate as measured
+    from crossgrad_core.results.panels import PanelWriter
+
+    setup, state = opened(folder, _machine(device, None), -1)
+    scene = setup.scene
+    views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+    if not views:
+        raise UserError("there are no views to render", where=f"--split {split}")
+    writer = PanelWriter.of(folder, state.step, views, len(views))
+    if out is not None:
+        writer = replace(writer, folder=out)
+    measured(views, renderer(setup, state), on_view=writer.write)
+    print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
+
+
+def export(folder: Path, *, file_format: str, out: Path | None) -> None:
+    """Writes the trained scene to a file that viewers open.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, or the file exists.
+    """
+    path = out or folder / f"point_cloud.{file_format}"
+    if out is not None and out.exists():
+        raise UserError("the file exists", where=out, todo="choose another --out, or remove it")
+    setup, state = opened(folder, {}, -1)
+    for note in export_ply(setup, state, path):
+        print(note)  # noqa: T201
+    print(f"{state.primitives(setup):,} Gaussians in {path}")  # noqa: T201
+
+
+def _machine(device: str | None, threads: int | None) -> dict[str, Any]:
+    given = {"device": device, "threads": threads}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _print_dry_run(setup: Setup) -> None:
+    print(_as_yaml(resolved(setup)), end="")  # noqa: T201
+    for note in setup.notes:
+        print(f"# {note}")  # noqa: T201
+    memory = initial_bytes(setup) / 2**20
+    print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
+
+
+def _as_yaml(config: RunConfig) -> str:
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)

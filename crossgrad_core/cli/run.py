@@ -261,6 +261,14 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
             rich_help_panel=_RESULTS,
         ),
     ] = None,
+    stop_after: Annotated[
+        int | None,
+        typer.Option(
+            metavar="STEP",
+            help="Stops after this step with a checkpoint; --resume continues.",
+            rich_help_panel=_RESULTS,
+        ),
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -296,4 +304,5 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
 
     from crossgrad_core import app
 
-    app.run(settings, resume=resume, dry_run=dry_run, verbosity=int(verbose) - int(quiet))
+    code = app.run(settings, resume=resume, dry_run=dry_run, verbosity=int(verbose) - int(quiet))
+    raise typer.Exit(code)

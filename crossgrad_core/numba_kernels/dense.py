@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 #: Elements of one chunk, 16 kB per view.
 CHUNK = 4096
+#: Elements of a chunk that a weighted sum works on at a time.
+PIECE = 1024
 
 
 @njit(cache=True)
@@ -37,7 +39,8 @@ def chunk_table(sizes: Ints) -> Ints:
 
 
 @njit(cache=True, inline="always")
-def _row(address: int, start: int, length: int) -> NDArray[np.float32]:
+def row(address: int, start: int, length: int) -> NDArray[np.float32]:
+    """Inside kernels: the `length` elements from element `start` of the tensor at `address`."""
     return carray(float32_pointer(address + 4 * start), (length,))
 
 
@@ -47,14 +50,14 @@ def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> 
     tile = np.empty((2, 2))
     for i in range(0, count, 2):
         i1 = min(i + 1, count - 1)
-        a, b = _row(rows[i], start, length), _row(rows[i1], start, length)
+        a, b = row(rows[i], start, length), row(rows[i1], start, length)
         dots_2(a, b, tile)
         out[i, i], out[i1, i1] = tile[0, 0], tile[1, 1]
         if i1 > i:
             out[i, i1] = tile[0, 1]
         for j in range(i + 2, count, 2):
             j1 = min(j + 1, count - 1)
-            dots_2x2(a, b, _row(rows[j], start, length), _row(rows[j1], start, length), tile)
+            dots_2x2(a, b, row(rows[j], start, length), row(rows[j1], start, length), tile)
             out[i, j], out[i1, j] = tile[0, 0], tile[1, 0]
             out[i, j1], out[i1, j1] = tile[0, 1], tile[1, 1]
 
@@ -75,16 +78,16 @@ def _chunk_gramian(
             count += 1
     if count == 0:
         return
-    a = _row(rows[0], start, length)
+    a = row(rows[0], start, length)
     if count == 1:
         dots_1(a, compact)
     elif count == 2:
-        dots_2(a, _row(rows[1], start, length), compact)
+        dots_2(a, row(rows[1], start, length), compact)
     elif count == 3:
-        dots_3(a, _row(rows[1], start, length), _row(rows[2], start, length), compact)
+        dots_3(a, row(rows[1], start, length), row(rows[2], start, length), compact)
     elif count == 4:
-        b, c = _row(rows[1], start, length), _row(rows[2], start, length)
-        dots_4(a, b, c, _row(rows[3], start, length), compact)
+        b, c = row(rows[1], start, length), row(rows[2], start, length)
+        dots_4(a, b, c, row(rows[3], start, length), compact)
     else:
         _many_dots(rows, count, start, length, compact)
     for i in range(count):
@@ -130,77 +133,43 @@ def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
 
 
 @njit(cache=True)
-def _weighted(rows: Ints, weights: Floats, count: int, start: int, out: NDArray[np.float32]) -> None:
-    """out = sum of weights times rows, in float64, rounded once.
+def _weighted(rows: Ints, weights: Floats, count: int, start: int, wide: Floats) -> None:
+    """wide = sum of weights times rows.
 
-    Whatever the ratio of the norms, neither weights nor products overflow or underflow there.
+    In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
     """
-    n = out.size
-    if count == 0:
-        out[:] = 0.0
-    elif count == 1:
-        a, u = _row(rows[0], start, n), weights[0]
+    n = wide.size
+    if count == 1:
+        a, u = row(rows[0], start, n), weights[0]
         for i in range(n):
-            out[i] = np.float32(u * np.float64(a[i]))
-    elif count == 2:
-        a, u = _row(rows[0], start, n), weights[0]
-        b, v = _row(rows[1], start, n), weights[1]
+            wide[i] = u * np.float64(a[i])
+        return
+    a, u = row(rows[0], start, n), weights[0]
+    b, v = row(rows[1], start, n), weights[1]
+    for i in range(n):
+        wide[i] = u * np.float64(a[i]) + v * np.float64(b[i])
+    for k in range(2, count):
+        c, w = row(rows[k], start, n), weights[k]
         for i in range(n):
-            out[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
-    elif count == 3:
-        a, u = _row(rows[0], start, n), weights[0]
-        b, v = _row(rows[1], start, n), weights[1]
-        c, w = _row(rows[2], start, n), weights[2]
-        for i in range(n):
-            x = u * np.float64(a[i]) + v * np.float64(b[i])
-            out[i] = np.float32(x + w * np.float64(c[i]))
-    else:
-        wide = np.empty(n)
-        a, u = _row(rows[0], start, n), weights[0]
-        b, v = _row(rows[1], start, n), weights[1]
-        c, w = _row(rows[2], start, n), weights[2]
-        d, z = _row(rows[3], start, n), weights[3]
-        for i in range(n):
-            x = u * np.float64(a[i]) + v * np.float64(b[i])
-            wide[i] = (x + w * np.float64(c[i])) + z * np.float64(d[i])
-        for k in range(4, count):
-            e, s = _row(rows[k], start, n), weights[k]
-            for i in range(n):
-                wide[i] += s * np.float64(e[i])
-        for i in range(n):
-            out[i] = np.float32(wide[i])
+            wide[i] += w * np.float64(c[i])
 
 
 @njit(cache=True)
-def _plain(rows: Ints, count: int, start: int, out: NDArray[np.float32]) -> None:
-    """out = rows added in order in float32: the bits of accumulation."""
-    n = out.size
-    if count == 0:
-        out[:] = 0.0
-        return
-    a = _row(rows[0], start, n)
+def _plain(rows: Ints, count: int, start: int, narrow: NDArray[np.float32]) -> None:
+    """narrow = rows added in order in float32: the bits of accumulation."""
+    n = narrow.size
+    a = row(rows[0], start, n)
     if count == 1:
         for i in range(n):
-            out[i] = a[i]
-    elif count == 2:
-        b = _row(rows[1], start, n)
+            narrow[i] = a[i]
+        return
+    b = row(rows[1], start, n)
+    for i in range(n):
+        narrow[i] = a[i] + b[i]
+    for k in range(2, count):
+        c = row(rows[k], start, n)
         for i in range(n):
-            out[i] = a[i] + b[i]
-    elif count == 3:
-        b, c = _row(rows[1], start, n), _row(rows[2], start, n)
-        for i in range(n):
-            out[i] = (a[i] + b[i]) + c[i]
-    else:
-        b, c, d = _row(rows[1], start, n), _row(rows[2], start, n), _row(rows[3], start, n)
-        narrow = np.empty(n, np.float32)
-        for i in range(n):
-            narrow[i] = ((a[i] + b[i]) + c[i]) + d[i]
-        for k in range(4, count):
-            e = _row(rows[k], start, n)
-            for i in range(n):
-                narrow[i] += e[i]
-        for i in range(n):
-            out[i] = narrow[i]
+            narrow[i] += c[i]
 
 
 @njit(cache=True, parallel=True)
@@ -219,26 +188,37 @@ def combine(
     """
     views = addresses.shape[1]
     for chunk in prange(table.shape[0]):
-        t, start = table[chunk, 0], table[chunk, 1]
-        length = min(CHUNK, sizes[t] - start)
+        t, first = table[chunk, 0], table[chunk, 1]
+        end = min(first + CHUNK, sizes[t])
         rows = np.empty(views, np.int64)
         used = np.empty(views)
+        # Results pass through a piece of fast memory, as they may overwrite one of the rows.
+        wide = np.empty(PIECE)
+        narrow = np.empty(PIECE, np.float32)
         count = 0
         for k in range(views):
             if addresses[t, k] != 0:
                 rows[count] = addresses[t, k]
                 used[count] = weights[t, k]
                 count += 1
-        if plain[t]:
-            _plain(rows, count, start, _row(out[t], start, length))
-        else:
-            _weighted(rows, used, count, start, _row(out[t], start, length))
+        for start in range(first, end, PIECE):
+            length = min(PIECE, end - start)
+            result = row(out[t], start, length)
+            if count == 0:
+                result[:] = 0.0
+            elif plain[t]:
+                _plain(rows, count, start, narrow[:length])
+                result[:] = narrow[:length]
+            else:
+                _weighted(rows, used, count, start, wide[:length])
+                for i in range(length):
+                    result[i] = np.float32(wide[i])
 
 
 @njit(cache=True)
 def overlapping(a: int, b: int, size: int) -> bool:
     """Whether two tensors share the place of a non-zero element."""
-    x, y = _row(a, 0, size), _row(b, 0, size)
+    x, y = row(a, 0, size), row(b, 0, size)
     for start in range(0, size, CHUNK):
         shared = 0
         for i in range(start, min(start + CHUNK, size)):

@@ -130,8 +130,7 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
     header, *lines = _lines(path) or [[]]
     try:
         return tuple(
-            {name: _number(cell) for name, cell in zip(header, line, strict=True)}
-            for line in lines
+            {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
         )
     except ValueError as error:
         raise UserError(f"unreadable {FILE}", where=path, found=str(error)) from error

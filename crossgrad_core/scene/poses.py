@@ -32,7 +32,9 @@ def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V] height of each camera along the unit axis `up` [3] over the mean training camera."""
     middle = centers_of(scene.train_views).mean(axis=0)
-    return np.asarray((centers_of(views) - middle) @ up)
+    # Not a matrix product: its rounding depends on the number of rows, and a median cut falls
+    # exactly on one of them.
+    return np.asarray(((centers_of(views) - middle) * up).sum(axis=1))
 
 
 def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:

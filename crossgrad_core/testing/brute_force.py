@@ -26,21 +26,39 @@ _MIP_EPSILON = 1e-6
 class Trace:
     """A render by brute force.
 
+    A *gap* is the relative distance of a compared value from its threshold, the smallest where
+    several values are compared.
+
     Attributes:
         image: [H, W, 3] over a black background.
         alpha: [H, W].
         depth: [H, W] sum of weight times camera depth.
-        touched: [N] bool, alpha >= 1/255 in some pixel.
-        pixels: [N] pixels in which each Gaussian was blended.
-        margins: Per rule, the smallest relative distance of a compared value from its threshold.
+        raw: [N, H, W] alpha before the cap and the threshold.
+        blended: [N, H, W] bool.
+        extents: [N] half-extent of each footprint, pixels.
+        pixel_gaps: [H, W] of what is compared per pixel: alpha, cap and stop.
+        gaussian_gaps: [N] of what is compared per Gaussian: near plane, opacity, order, clamps of
+            the Jacobian and of colours, and the special cases of the response.
     """
 
     image: Array
     alpha: Array
     depth: Array
-    touched: NDArray[np.bool_]
-    pixels: NDArray[np.int64]
-    margins: dict[str, float]
+    raw: Array
+    blended: NDArray[np.bool_]
+    extents: Array
+    pixel_gaps: Array
+    gaussian_gaps: Array
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """[N] alpha >= 1/255 in some pixel."""
+        return np.asarray((self.raw >= ALPHA_THRESHOLD).any((1, 2)))
+
+    @property
+    def pixels(self) -> NDArray[np.int64]:
+        """[N] pixels in which each Gaussian was blended."""
+        return np.asarray(self.blended.sum((1, 2)))
 
 
 def trace(
@@ -51,40 +69,37 @@ def trace(
     near: float = 1e-3,
     dilation: float = 0.3,
 ) -> Trace:
-    """Draws Gaussians over black, pixel arrays at a time.
+    """Draws Gaussians over black, one after the other.
 
     Args:
-        gaussians: N Gaussians.
+        gaussians: N Gaussians, all finite.
         camera: The camera.
         max_alpha: Cap of alpha.
         near: Near plane, local units.
         dilation: Used where the Gaussians bring none.
     """
     scene = _Scene(gaussians, camera, near, dilation)
-    margins = {"alpha": np.inf, "cap": np.inf, "stop": np.inf, **scene.margins()}
-    height, width = camera.height, camera.width
-    image, alpha, depth = np.zeros((height, width, 3)), np.zeros((height, width)), 0.0
-    transmittance = np.ones((height, width))
-    stopped = np.zeros((height, width), bool)
-    touched = np.zeros(len(gaussians), bool)
-    pixels = np.zeros(len(gaussians), np.int64)
+    number, size = len(gaussians), (camera.height, camera.width)
+    image, alpha, depth = np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
+    raw, blended = np.zeros((number, *size)), np.zeros((number, *size), bool)
+    transmittance, stopped = np.ones(size), np.zeros(size, bool)
+    gaps = np.full(size, np.inf)
     for i in np.argsort(scene.local[:, 2], kind="stable"):
-        raw = scene.alphas(int(i))
-        touching = raw >= ALPHA_THRESHOLD
-        capped = np.where(touching, np.minimum(raw, max_alpha), 0.0)
+        raw[i] = scene.alphas(int(i))
+        touching = raw[i] >= ALPHA_THRESHOLD
+        capped = np.where(touching, np.minimum(raw[i], max_alpha), 0.0)
         behind = transmittance * (1 - capped)
+        for values, threshold in ((raw[i], ALPHA_THRESHOLD), (raw[i], max_alpha)):
+            gaps = np.minimum(gaps, np.where(stopped, np.inf, _gaps(values, threshold)))
+        gaps = np.minimum(gaps, np.where(stopped, np.inf, _gaps(behind, TRANSMITTANCE_STOP)))
         stopped |= touching & (behind < TRANSMITTANCE_STOP)
-        weight = np.where(stopped, 0.0, capped * transmittance)
-        margins["alpha"] = min(margins["alpha"], _gap(raw, ALPHA_THRESHOLD))
-        margins["cap"] = min(margins["cap"], _gap(raw, max_alpha))
-        margins["stop"] = min(margins["stop"], _gap(behind, TRANSMITTANCE_STOP))
+        blended[i] = touching & ~stopped
+        weight = np.where(blended[i], capped * transmittance, 0.0)
         image += weight[..., None] * scene.colors[i].clip(0.0)
         alpha += weight
-        depth = depth + weight * scene.local[i, 2]
+        depth += weight * scene.local[i, 2]
         transmittance = np.where(stopped, transmittance, behind)
-        touched[i] = touching.any()
-        pixels[i] = (touching & ~stopped).sum()
-    return Trace(image, alpha, np.broadcast_to(depth, alpha.shape), touched, pixels, margins)
+    return Trace(*(image, alpha, depth, raw, blended), scene.extents(), gaps, scene.gaps())
 
 
 class _Scene:
@@ -122,6 +137,16 @@ class _Scene:
         world = axes @ np.diag(self.scales[i] ** 2) @ axes.T
         return np.asarray(jacobian @ self.rotation @ world @ self.rotation.T @ jacobian.T)
 
+    def mip_factor(self, covariance: Array) -> float:
+        """Factor of the opacity: 1 unless the response is antialiased."""
+        if self.response != "antialiased":
+            return 1.0
+        before = np.linalg.det(covariance)
+        after = np.linalg.det(covariance + self.dilation * np.eye(2))
+        if min(before, after) <= _MIP_EPSILON:
+            return 0.0
+        return sqrt(before / (after + _MIP_EPSILON) + _MIP_EPSILON)
+
     def alphas(self, i: int) -> Array:
         """[H, W] opacity times coverage of Gaussian i, before cap and threshold."""
         nothing = np.zeros(self.centers.shape[:2])
@@ -136,33 +161,42 @@ class _Scene:
         if self.response == "analytic":
             return np.asarray(self.opacities[i] * _window_integral(offset, covariance))
         dilated = covariance + self.dilation * np.eye(2)
-        opacity = self.opacities[i]
-        if self.response == "antialiased":
-            before, after = np.linalg.det(covariance), np.linalg.det(dilated)
-            drawn = min(before, after) > _MIP_EPSILON
-            opacity *= sqrt(before / (after + _MIP_EPSILON) + _MIP_EPSILON) if drawn else 0.0
+        opacity = self.opacities[i] * self.mip_factor(covariance)
         square = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(dilated), offset)
         return np.asarray(opacity * np.exp(-square / 2))
 
-    def margins(self) -> dict[str, float]:
-        """Distances from the thresholds that are met before any pixel."""
-        ahead = self.local[:, 2] > self.near
-        slopes = self.local[ahead, :2] / self.local[ahead, 2:]
-        depths = np.sort(self.local[ahead, 2])
-        gaps = {
-            "near": _gap(self.local[:, 2], self.near),
-            "order": _gap(depths[1:] / depths[:-1], 1.0),
-            "opacity": _gap(self.opacities, ALPHA_THRESHOLD),
-            "slope": min(
-                float(np.abs(slopes - s).min(initial=np.inf)) for s in (self.low, self.high)
-            ),
-            "color": float(np.abs(self.colors).min(initial=np.inf)) if self.harmonic else np.inf,
-        }
-        if self.response != "plain":
-            axes = [np.linalg.eigvalsh(self.covariance(int(i))) for i in np.flatnonzero(ahead)]
-            spread = np.array(axes).reshape(-1, 2)
-            gaps["axes"] = _gap(spread[:, 0] / spread[:, 1], 1.0)
-            gaps["determinant"] = _gap(spread.prod(-1), _MIP_EPSILON)
+    def extents(self) -> Array:
+        """[N] larger half-extent of the ellipse alpha = 1/255, pixels; NaN where there is none."""
+        result = np.full(len(self.local), np.nan)
+        for i in np.flatnonzero(self.local[:, 2] > self.near):
+            covariance = self.covariance(int(i))
+            opacity = self.opacities[i]
+            if self.response != "analytic":
+                opacity *= self.mip_factor(covariance)
+                covariance = covariance + self.dilation * np.eye(2)
+            if opacity >= ALPHA_THRESHOLD:
+                contrast = log(opacity / ALPHA_THRESHOLD)
+                result[i] = sqrt(2 * contrast * max(covariance[0, 0], covariance[1, 1]))
+        return result
+
+    def gaps(self) -> Array:
+        """[N] distances from the thresholds that are met before any pixel."""
+        depths = self.local[:, 2]
+        gaps = np.minimum(_gaps(depths, self.near), _gaps(self.opacities, ALPHA_THRESHOLD))
+        if self.harmonic:
+            gaps = np.minimum(gaps, np.abs(self.colors).min(-1))
+        ahead = np.flatnonzero(depths > self.near)
+        order = ahead[np.argsort(depths[ahead])]
+        # Of two Gaussians at nearly one depth, the farther has the gap.
+        gaps[order[1:]] = np.minimum(gaps[order[1:]], np.diff(depths[order]) / depths[order[1:]])
+        for i in ahead:
+            slopes = self.local[i, :2] / depths[i]
+            bounds = [self.low, self.high]
+            gaps[i] = min(gaps[i], float(np.abs(slopes - bounds).min()))
+            if self.response != "plain":
+                smaller, larger = np.linalg.eigvalsh(self.covariance(int(i)))
+                gaps[i] = min(gaps[i], 1 - smaller / larger)
+                gaps[i] = min(gaps[i], float(_gaps(smaller * larger, _MIP_EPSILON)))
         return gaps
 
 
@@ -220,10 +254,10 @@ def _harmonic(degree: int, order: int, z: Array, azimuth: Array) -> Array:
     return np.asarray(sqrt(scale * (2 if m else 1)) * lpmv(m, degree, z) * wave)
 
 
-def _gap(values: Array, threshold: float) -> float:
-    """Smallest |log(value / threshold)| of positive values: their relative distance from it."""
-    positive = values[values > 0]
-    return float(np.abs(np.log(positive) - log(threshold)).min(initial=np.inf))
+def _gaps(values: Array, threshold: float) -> Array:
+    """|log(value / threshold)| of positive values, else infinity."""
+    positive = np.where(values > 0, values, np.inf)
+    return np.asarray(np.abs(np.log(positive) - log(threshold)))
 
 
 def _numpy(tensor: Tensor) -> Array:

@@ -103,6 +103,7 @@ def smooth_gaussians(  # noqa: PLR0913 - a table of independent switches, all ke
     margin: float = 1e-3,
     sigmas: tuple[float, float] = (0.8, 4.0),
     opacities: tuple[float, float] = (0.1, 0.9),
+    border: float = 0.2,
     sh_degree: int | None = None,
     response: Response = "plain",
 ) -> Gaussians:
@@ -118,6 +119,7 @@ def smooth_gaussians(  # noqa: PLR0913 - a table of independent switches, all ke
         margin: Smallest relative distance from a threshold.
         sigmas: See `random_gaussians`.
         opacities: See `random_gaussians`.
+        border: See `random_gaussians`.
         sh_degree: See `random_gaussians`.
         response: See `random_gaussians`.
     """
@@ -128,6 +130,7 @@ def smooth_gaussians(  # noqa: PLR0913 - a table of independent switches, all ke
             seed=draw,
             sigmas=sigmas,
             opacities=opacities,
+            border=border,
             sh_degree=sh_degree,
             response=response,
         )
@@ -140,4 +143,5 @@ def away_from_thresholds(
     gaussians: Gaussians, camera: Camera, *, margin: float = 1e-3, max_alpha: float = 0.99
 ) -> bool:
     """Whether every compared value is farther than `margin` (relative) from its threshold."""
-    return min(trace(gaussians, camera, max_alpha=max_alpha).margins.values()) > margin
+    result = trace(gaussians, camera, max_alpha=max_alpha)
+    return bool((result.pixel_gaps > margin).all() and (result.gaussian_gaps > margin).all())

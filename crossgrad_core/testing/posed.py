@@ -45,9 +45,7 @@ def posed_view(
     return View(name, camera, _Blank(), "all", np.array(seen, dtype=np.int64))
 
 
-def posed_scene(
-    views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()
-) -> Scene:
+def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()) -> Scene:
     """A scene of these views that trains on all but the positions in `test`."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     train = tuple(i for i in range(len(views)) if i not in set(test))

@@ -231,9 +231,7 @@ def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -
         )
 
 
-def _linear_note(
-    operator: Operator, name: str, plugins: Mapping[str, object]
-) -> list[str]:
+def _linear_note(operator: Operator, name: str, plugins: Mapping[str, object]) -> list[str]:
     if operator.separate:
         return []
     watchers = [
@@ -242,4 +240,3 @@ def _linear_note(
     if watchers:
         return [f"gradients of single views kept apart for {', '.join(watchers)} (same bits)"]
     return [f"no separate gradients: operator {name} is linear, the backward passes accumulate"]
-

@@ -64,7 +64,8 @@ def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Stat
     """Runs the remaining steps of the schedule.
 
     Raises:
-        TrainingFailedError: Something was not finite twice; names step, views and block.
+        TrainingFailedError: Something was not finite twice; names step, views and block. `state`
+            is then the last good one.
     """
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
@@ -72,18 +73,16 @@ def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Stat
     while state.step < last and not stopper.requested:
         try:
             record = timed_step(setup, state)
-            if state.step % SNAPSHOT_EVERY == 0:
+            if state.step % SNAPSHOT_EVERY == 0 or state.step == last or stopper.requested:
                 check_parameters(state, record)
                 snapshot = Snapshot.of(state)
-            check_dropped(setup, state, record)
         except NonFiniteError as error:
             _rewind(setup, state, snapshot, error)
             continue
+        check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)
         _tell_held_back(setup, record)
         _record(setup, state, sink)
-    if state.last is not None:
-        check_parameters(state, state.last)
     return "finished" if state.step >= total else "stopped"
 
 
@@ -115,9 +114,10 @@ def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
 
 
 def _rewind(setup: Setup, state: TrainState, snapshot: Snapshot, error: NonFiniteError) -> None:
-    if state.rewinds > 0:
-        raise TrainingFailedError(f"{error}, after one rewind") from error
+    rewound_before = state.rewinds > 0
     snapshot.restore(state, setup.config.seed)
+    if rewound_before:
+        raise TrainingFailedError(f"{error}, for the second time") from error
     setup.hook.crossgrad_message(
         text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
     )
@@ -140,4 +140,3 @@ def _record(setup: Setup, state: TrainState, sink: Sink) -> None:
         sink.evaluate(setup, state)
     if step % save_every == 0 and step < total:
         sink.save(setup, state)
-

@@ -20,6 +20,8 @@ from crossgrad_core.training.state import TrainState
 RANDOM_POINTS = 20_000
 #: Steps that the probe of a time budget takes at least.
 PROBE_STEPS = 12
+#: ... and the share of the budget that it takes beyond that.
+PROBE_SHARE = 0.01
 #: Mean cost of a step over a run in units of one at its start: density control adds primitives.
 #: Measured with benchmarks/budget.py.
 GROWTH_COST = 1.35
@@ -79,7 +81,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
     timed_step(far, state)
     state.clock.train = 0.0
     steps = 0
-    while steps < PROBE_STEPS or (state.clock.train < 0.01 * seconds and steps < 500):
+    while steps < PROBE_STEPS or (state.clock.train < PROBE_SHARE * seconds):
         timed_step(far, state)
         steps += 1
     each = state.clock.train / steps
@@ -92,3 +94,8 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
     )
     return total, note
 
+
+def initial_bytes(setup: Setup) -> int:
+    """Bytes of the initial parameters with their gradients and moments."""
+    parameters = initial_parameters(setup, make_streams(setup.config.seed)["create"])
+    return 4 * sum(tensor.numel() * tensor.element_size() for tensor in parameters.values())

@@ -95,4 +95,3 @@ class Snapshot:
         state.last = self.last
         state.rewinds += 1
         state.rngs = make_streams(seed, state.rewinds)
-

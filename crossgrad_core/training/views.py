@@ -1,9 +1,11 @@
 """Rendering the K views of a step and running their backward passes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import isfinite
 from time import perf_counter
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -94,7 +96,7 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn
     loss = photometric_loss(render.image, target, mask, setup.config.ssim_weight)
     state.counters.views += 1
     value = float(loss.detach())
-    if value != value or value in (float("inf"), float("-inf")):  # noqa: PLR0124
+    if not isfinite(value):
         raise NonFiniteError(state.step, (view.name,), "the photometric loss")
     record = ViewRecord(
         index=index,
@@ -119,15 +121,18 @@ def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tenso
 
 
 def background_of(setup: Setup, state: TrainState) -> Tensor:
-    """[3] RGB that the next view is drawn over."""
+    """[3] RGB that the next training view is drawn over."""
+    if setup.config.background == "random":
+        rgb = state.rngs["background"].random(3).astype(np.float32)
+        return torch.from_numpy(rgb).to(setup.device)
+    return eval_background(setup)
+
+
+def eval_background(setup: Setup) -> Tensor:
+    """[3] RGB that evaluated views are drawn over: the run's own, black where that is random."""
     name = setup.config.background
-    fixed = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    if name == "random":
-        rgb = tuple(state.rngs["background"].random(3).tolist())
-    elif name in fixed:
-        rgb = fixed[name]
-    else:
-        rgb = tuple(float(part) for part in name.split(","))
+    named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
     return torch.tensor(rgb, dtype=torch.float32, device=setup.device)
 
 
@@ -204,8 +209,3 @@ def _take(parameters: Mapping[str, Tensor]) -> Gradients:
     taken = {name: tensor.grad for name, tensor in parameters.items()}
     _clear(parameters)
     return taken
-
-
-def mean_loss(records: Sequence[ViewRecord]) -> float:
-    """Mean photometric loss over the views of a step."""
-    return sum(record.loss for record in records) / len(records)

@@ -21,6 +21,9 @@ from crossgrad_plugins.groupings.split import (
     smaller_mean_first,
 )
 
+#: Eigenvalues of a cosine matrix that are closer than this are one, split by rounding.
+_SMALLEST_GAP = 1e-9
+
 
 class ConflictSignature(Grouping):
     """The two sides of the spectral cut of the cosines between the cameras' gradients.
@@ -56,7 +59,8 @@ class ConflictSignature(Grouping):
             )
         count = min(self.cameras, len(scene.train))
         probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
-        sides = spectral_cut(mean_cosines(probe.gramians([int(i) for i in probed])))
+        cosines = mean_cosines(probe.gramians([int(i) for i in probed]))
+        sides = spectral_cut(cosines)
         chosen = [scene.train_views[i] for i in probed]
         near = smaller_mean_first(sides, radial_distances(scene, chosen))
         train = [NEAR if side == near else FAR for side in sides]
@@ -81,11 +85,17 @@ def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
 def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     """[V] side 0 or 1 by the sign of the second eigenvector of the normalised Laplacian.
 
+    All on side 0 where no direction is second: one camera, or cameras that are all alike.
+
     Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
     """
     similarity = (1.0 + cosines) / 2.0
     root = 1.0 / np.sqrt(similarity.sum(axis=1))
     # The second smallest eigenvalue of I - S is the second largest of S.
     scaled = root[:, None] * similarity * root[None, :]
-    vector = np.linalg.eigh((scaled + scaled.T) / 2.0)[1][:, -2]
-    return (vector > 0.0).astype(np.int64)
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0)
+    # A further eigenvalue, -1 at the least, stands below the smallest.
+    gaps = np.diff(values, prepend=-2.0)
+    if len(values) == 1 or gaps[-2] <= _SMALLEST_GAP:
+        return np.zeros(len(values), dtype=np.int64)
+    return (vectors[:, -2] > 0.0).astype(np.int64)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 LANES = 8
 
 _FLOAT = ir.FloatType()
+_BYTE = ir.IntType(8)
 _INT = ir.IntType(32)
 _LONG = ir.IntType(64)
 _LANES = ir.VectorType(_FLOAT, LANES)
@@ -44,6 +45,7 @@ class Lanes(Protocol):
     def __ge__(self, other: "Lanes") -> Mask: ...
     def __le__(self, other: "Lanes") -> Mask: ...
     def __lt__(self, other: "Lanes") -> Mask: ...
+    def __gt__(self, other: "Lanes") -> Mask: ...
 
 
 class _LanesType(types.Type):
@@ -90,6 +92,11 @@ def _shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(order)), list(order)))
 
 
+def _splat(builder: Any, scalar: Any) -> Any:
+    single = builder.insert_element(ir.Constant(_LANES, ir.Undefined), scalar, _INT(0))
+    return _shuffle(builder, single, single, [0] * LANES)
+
+
 def _define(sign: Any, operand: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
     """Gives a Python operator its meaning between two vectors."""
 
@@ -111,6 +118,7 @@ _define(operator.truediv, _lanes, _lanes, lambda builder, a, b: builder.fdiv(a, 
 _define(operator.ge, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 _define(operator.le, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
 _define(operator.lt, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
+_define(operator.gt, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
 _define(operator.and_, _mask, _mask, lambda builder, a, b: builder.and_(a, b))
 
 
@@ -119,9 +127,7 @@ def splat(typing_context: Any, value: Any) -> Any:
     """Returns a float32 number in all eight lanes."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (scalar,) = args
-        single = builder.insert_element(ir.Constant(_LANES, ir.Undefined), scalar, _INT(0))
-        return _shuffle(builder, single, single, [0] * LANES)
+        return _splat(builder, args[0])
 
     return _lanes(types.float32), emit
 
@@ -150,6 +156,32 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
         return builder.load(pointer, align=4)
 
     return _lanes(array, types.intp), emit
+
+
+@intrinsic
+def broadcast(typing_context: Any, array: Any, index: Any) -> Any:
+    """Returns one number of a contiguous float32 vector in all eight lanes."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return _splat(builder, builder.load(builder.gep(data, [args[1]])))
+
+    return _lanes(array, types.intp), emit
+
+
+@intrinsic
+def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
+    """Asks for the cache line of an element to be brought near."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), _BYTE.as_pointer())
+        # Read, keep in all levels, data (not instructions).
+        options = (_INT(0), _INT(3), _INT(1))
+        _llvm(builder, "llvm.prefetch.p0", ir.VoidType(), (pointer, *options))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), emit
 
 
 @intrinsic
@@ -286,28 +318,16 @@ def count_bits(typing_context: Any, number: Any) -> Any:
     return types.int64(types.uint64), emit
 
 
-#: Polynomial of 2**f on [-1/2, 1/2] by rising power: least largest relative error, 2**0 exact.
-_EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733953714371, 0.009671512991189957, 0.001326472032815218)
-#: Adding it rounds a small float32 to a whole number, left in the lowest bits of the sum.
-_ROUND = 1.5 * 2**23
-
-
 @intrinsic
-def exp2(typing_context: Any, a: Any) -> Any:
-    """Returns 2**a for a in [-126, 127] with a relative error of about 1e-7; else anything."""
+def scale_by_power(typing_context: Any, value: Any, shifted: Any) -> Any:
+    """Returns value * 2**n where `shifted` is n + 1.5 * 2**23, so that its lowest bits hold n."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (a,) = args
-        shifted = builder.fadd(a, _repeat(_ROUND))
-        fraction = builder.fsub(a, builder.fsub(shifted, _repeat(_ROUND)))
-        value: Any = _repeat(_EXP2[-1])
-        for coefficient in _EXP2[-2::-1]:
-            terms = (value, fraction, _repeat(coefficient))
-            value = _llvm(builder, "llvm.fmuladd.v8f32", _LANES, terms)
-        exponent = builder.shl(builder.bitcast(shifted, _INT_LANES), _repeat(23, _INT))
-        return builder.bitcast(builder.add(builder.bitcast(value, _INT_LANES), exponent), _LANES)
+        value, shifted = (builder.bitcast(arg, _INT_LANES) for arg in args)
+        exponent = builder.shl(shifted, _repeat(23, _INT))
+        return builder.bitcast(builder.add(value, exponent), _LANES)
 
-    return _lanes(_lanes), emit
+    return _lanes(_lanes, _lanes), emit
 
 
 @intrinsic
@@ -332,3 +352,17 @@ def sums(
         return rows[0]
 
     return _lanes(*([_lanes] * LANES)), emit
+
+
+@intrinsic
+def total(typing_context: Any, a: Any) -> Any:
+    """Returns the sum of the lanes (float32), added in pairs."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        (row,) = args
+        for width in (1, 2, 4):
+            order = [lane ^ width for lane in range(LANES)]
+            row = builder.fadd(row, _shuffle(builder, row, row, order))
+        return builder.extract_element(row, _INT(0))
+
+    return types.float32(_lanes), emit

@@ -1,0 +1,411 @@
+"""The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
+
+With s = x + y and d = x - y (x the image, y the target) SSIM needs four windowed means instead of
+five, M_s, M_d, E[s^2], E[d^2], and factors without cancellation between the two images:
+
+    SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
+
+with V = E[.^2] - M^2. Its gradient is G * a + s (G * b) + d (G * c), where G * is the same window and
+a, b, c hold the derivatives by M_s + M_d, V_s and V_d. Variances are differences of nearly equal
+numbers where the image is smooth, so s and d are taken relative to a centre: their means over the tile
+(per channel).
+
+The image is cut into tiles whose size depends on the image's size only. A tile runs down its rows with
+ring buffers of sixteen rows (s, d, mask; a, b, c), so that the working set stays in the second-level
+cache and memory does not grow with the image. Rows are kept interleaved, [column * 3 + channel]: a step
+of one column is three floats. Every tile recomputes its halo, so tiles are independent and the result
+has the same bits for any number of threads.
+"""
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from crossgrad_core.photometric._simd import (
+    LANES,
+    element_pointer,
+    emit_load,
+    f32x8,
+    load,
+    splat,
+    store,
+    symmetric_sum,
+    where_positive,
+)
+from crossgrad_core.photometric.reference import C1, C2, RADIUS, WINDOW, gaussian_window
+
+_TILE_ROWS = 64
+_TILE_COLUMNS = 384
+_SLOTS = 16  # rows of a ring; a power of two, at least WINDOW
+_CHANNELS = 3
+_HALO = _CHANNELS * RADIUS  # floats
+# Room for a tile with twice the halo on both sides, and for vectors that start before its end.
+_STRIDE = _CHANNELS * _TILE_COLUMNS + 4 * _HALO + _CHANNELS * WINDOW + 3 * LANES
+_STRIDE -= _STRIDE % LANES
+
+# Scratch memory of a tile, in floats.
+_SUM = 0  # ring of s - centre
+_DIFFERENCE = _SUM + _SLOTS * _STRIDE  # ring of d - centre
+_KEEP = _DIFFERENCE + _SLOTS * _STRIDE  # ring of 1 where a pixel counts, else 0
+_PARTIAL = _KEEP + _SLOTS * _STRIDE  # s, s^2, d, d^2 of one row, summed down the columns
+_BY_MEAN = _PARTIAL + 4 * _STRIDE  # rings of a, b, c
+_BY_SUM_VARIANCE = _BY_MEAN + _SLOTS * _STRIDE
+_BY_DIFFERENCE_VARIANCE = _BY_SUM_VARIANCE + _SLOTS * _STRIDE
+_BACK = _BY_DIFFERENCE_VARIANCE + _SLOTS * _STRIDE  # a, b, c of one row, summed down the columns
+_LINE = _BACK + 3 * _STRIDE  # a row of results
+_CENTRE_SUM = _LINE + _STRIDE  # what is subtracted from s
+_CENTRE_DIFFERENCE = _CENTRE_SUM + _STRIDE  # what is subtracted from d
+_SCRATCH = _CENTRE_DIFFERENCE + _STRIDE
+
+_WEIGHTS = tuple(float(np.float32(w)) for w in gaussian_window().numpy()[: RADIUS + 1])
+_ZERO, _ONE, _TWO, _HALF = (np.float32(v) for v in (0, 1, 2, 0.5))
+_TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
+_WHITE = np.float32(255)
+
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+# Only sums of float64 may be reordered (into vector lanes; the order is then fixed by the machine code).
+_SUM_OPTIONS = _OPTIONS | {"fastmath": {"contract", "nsz", "reassoc"}}
+
+
+@intrinsic
+def _across(typing_context, array, start):
+    """Window sum over eleven columns, the first of them at element `start`."""
+
+    def generate(context, builder, signature, args):
+        array_type = signature.args[0]
+        taps = []
+        for k in range(WINDOW):
+            index = builder.add(args[1], ir.Constant(args[1].type, _CHANNELS * k))
+            pointer = element_pointer(context, builder, array_type, args[0], index)
+            taps.append(emit_load(builder, pointer))
+        return symmetric_sum(builder, taps, _WEIGHTS)
+
+    return f32x8(array, types.intp), generate
+
+
+def _ring_taps(context, builder, array_type, array, start, row):
+    """Loads column `start` of the ring's rows row - 5 .. row + 5."""
+    integer = row.type
+    taps = []
+    for k in range(-RADIUS, RADIUS + 1):
+        slot = builder.and_(
+            builder.add(row, ir.Constant(integer, k)), ir.Constant(integer, _SLOTS - 1)
+        )
+        index = builder.add(start, builder.mul(slot, ir.Constant(integer, _STRIDE)))
+        pointer = element_pointer(context, builder, array_type, array, index)
+        taps.append(emit_load(builder, pointer))
+    return taps
+
+
+@intrinsic
+def _down(typing_context, array, start, row):
+    """Window sum over rows row - 5 .. row + 5 of the ring whose column is at element `start`."""
+
+    def generate(context, builder, signature, args):
+        taps = _ring_taps(context, builder, signature.args[0], *args)
+        return symmetric_sum(builder, taps, _WEIGHTS)
+
+    return f32x8(array, types.intp, types.intp), generate
+
+
+@intrinsic
+def _down_with_squares(typing_context, array, start, row):
+    """Window sums over rows row - 5 .. row + 5 of the ring's values and of their squares."""
+    pair = types.UniTuple(f32x8, 2)
+
+    def generate(context, builder, signature, args):
+        taps = _ring_taps(context, builder, signature.args[0], *args)
+        squares = [builder.fmul(tap, tap, flags=("contract", "nsz")) for tap in taps]
+        sums = [symmetric_sum(builder, values, _WEIGHTS) for values in (taps, squares)]
+        return context.make_tuple(builder, pair, sums)
+
+    return pair(array, types.intp, types.intp), generate
+
+
+@njit(**_OPTIONS)
+def _set_centres(scratch, image, target, target_8bit, is_8bit, box, width):
+    """Per channel, means of s and d over every eighth row of the tile, x and y clipped to [0, 1]."""
+    top, bottom, left, right = box
+    count = (bottom - top + 7) // 8 * (right - left)
+    for channel in range(_CHANNELS):
+        sum_x, sum_y = 0.0, 0.0
+        for row in range(top, bottom, 8):
+            for column in range(left, right):
+                i = (row * width + column) * _CHANNELS + channel
+                y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
+                # NaN fails both comparisons and counts as 0.
+                sum_x += _ONE if image[i] > _ONE else (image[i] if image[i] > _ZERO else _ZERO)
+                sum_y += _ONE if y > _ONE else (y if y > _ZERO else _ZERO)
+        centre_sum = np.float32((sum_x + sum_y) / count)
+        centre_difference = np.float32((sum_x - sum_y) / count)
+        for j in range(channel, _STRIDE, _CHANNELS):
+            scratch[_CENTRE_SUM + j] = centre_sum
+            scratch[_CENTRE_DIFFERENCE + j] = centre_difference
+
+
+@njit(**_OPTIONS)
+def _load_row(scratch, image, target, target_8bit, is_8bit, mask, is_masked, row, box, height, width):
+    """Puts s, d (relative to their centres) and the mask of a row into the rings.
+
+    Outside the image and at masked-out pixels both images are 0.
+    """
+    first = _CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
+    count = _CHANNELS * (box[3] - box[2] + 4 * RADIUS)
+    slot = (row & (_SLOTS - 1)) * _STRIDE
+    begin, end = 0, 0
+    if 0 <= row < height:
+        begin, end = max(0, -first), min(count, _CHANNELS * width - first)
+    for j in range(count):
+        scratch[_KEEP + slot + j] = np.float32(begin <= j < end)
+    if is_masked:
+        for j in range(begin, end, _CHANNELS):
+            keep = np.float32(mask[row * width + (first + j) // _CHANNELS])
+            for channel in range(_CHANNELS):
+                scratch[_KEEP + slot + j + channel] = keep
+    # First x and y themselves, 0 outside; the second half of the loop below turns them into s and d.
+    for j in range(begin):
+        scratch[_SUM + slot + j] = _ZERO
+        scratch[_DIFFERENCE + slot + j] = _ZERO
+    for j in range(end, count):
+        scratch[_SUM + slot + j] = _ZERO
+        scratch[_DIFFERENCE + slot + j] = _ZERO
+    source = row * _CHANNELS * width + first
+    for j in range(begin, end):
+        scratch[_SUM + slot + j] = image[source + j]
+    if is_8bit:
+        for j in range(begin, end):
+            scratch[_DIFFERENCE + slot + j] = np.float32(target_8bit[source + j]) / _WHITE
+    else:
+        for j in range(begin, end):
+            scratch[_DIFFERENCE + slot + j] = target[source + j]
+    zero = splat(_ZERO)
+    for j in range(0, count, LANES):
+        keep = load(scratch, _KEEP + slot + j)
+        x = where_positive(keep, load(scratch, _SUM + slot + j), zero)
+        y = where_positive(keep, load(scratch, _DIFFERENCE + slot + j), zero)
+        store(scratch, _SUM + slot + j, x + y - load(scratch, _CENTRE_SUM + j))
+        store(scratch, _DIFFERENCE + slot + j, x - y - load(scratch, _CENTRE_DIFFERENCE + j))
+
+
+@njit(**_OPTIONS)
+def _ssim_row(scratch, row, columns):
+    """Writes 1 - SSIM of a row to the line and its a, b, c to their rings, 0 where nothing counts."""
+    for j in range(0, _CHANNELS * (columns + 4 * RADIUS), LANES):
+        values, squares = _down_with_squares(scratch, _SUM + j, row)
+        store(scratch, _PARTIAL + j, values)
+        store(scratch, _PARTIAL + _STRIDE + j, squares)
+        values, squares = _down_with_squares(scratch, _DIFFERENCE + j, row)
+        store(scratch, _PARTIAL + 2 * _STRIDE + j, values)
+        store(scratch, _PARTIAL + 3 * _STRIDE + j, squares)
+    slot = (row & (_SLOTS - 1)) * _STRIDE
+    zero, one, two = splat(_ZERO), splat(_ONE), splat(_TWO)
+    twice_c1, twice_c2 = splat(_TWICE_C1), splat(_TWICE_C2)
+    for j in range(0, _CHANNELS * (columns + 2 * RADIUS), LANES):
+        keep = load(scratch, _KEEP + slot + _HALO + j)
+        local_s = _across(scratch, _PARTIAL + j)
+        local_d = _across(scratch, _PARTIAL + 2 * _STRIDE + j)
+        variance_s = _across(scratch, _PARTIAL + _STRIDE + j) - local_s * local_s
+        variance_d = _across(scratch, _PARTIAL + 3 * _STRIDE + j) - local_d * local_d
+        # Rounding may take a variance of nothing slightly below zero.
+        variance_s = where_positive(variance_s, variance_s, zero) + twice_c2
+        variance_d = where_positive(variance_d, variance_d, zero)
+        mean_s = local_s + load(scratch, _CENTRE_SUM + j)
+        mean_d = local_d + load(scratch, _CENTRE_DIFFERENCE + j)
+        bright = mean_s * mean_s + twice_c1
+        dark = mean_d * mean_d
+        over_mean = one / (bright + dark)
+        over_variance = one / (variance_s + variance_d)
+        # 1 minus the luminance term and 1 minus the contrast-structure term: exactly 0 where x = y.
+        luminance_loss = two * dark * over_mean
+        contrast_loss = two * variance_d * over_variance
+        dissimilarity = luminance_loss + contrast_loss - luminance_loss * contrast_loss
+        store(scratch, _LINE + j, where_positive(keep, dissimilarity, zero))
+        by_variance = two * (one - luminance_loss) * over_variance * over_variance
+        by_sum = by_variance * variance_d
+        by_difference = zero - by_variance * variance_s
+        by_mean = two * two * (one - contrast_loss) * over_mean * over_mean
+        by_mean = by_mean * (mean_s * dark - mean_d * bright)
+        by_mean = by_mean - two * (local_s * by_sum + local_d * by_difference)
+        store(scratch, _BY_MEAN + slot + j, where_positive(keep, by_mean, zero))
+        store(scratch, _BY_SUM_VARIANCE + slot + j, where_positive(keep, two * by_sum, zero))
+        store(
+            scratch,
+            _BY_DIFFERENCE_VARIANCE + slot + j,
+            where_positive(keep, two * by_difference, zero),
+        )
+
+
+@njit(**_OPTIONS)
+def _clear_row(scratch, row, columns):
+    """Sets a, b, c of a row outside the image to 0."""
+    slot = (row & (_SLOTS - 1)) * _STRIDE
+    for j in range(_CHANNELS * (columns + 2 * RADIUS)):
+        scratch[_BY_MEAN + slot + j] = _ZERO
+        scratch[_BY_SUM_VARIANCE + slot + j] = _ZERO
+        scratch[_BY_DIFFERENCE_VARIANCE + slot + j] = _ZERO
+
+
+@njit(**_OPTIONS)
+def _gradient_row(scratch, row, columns, l1_weight, ssim_weight):
+    """Writes the loss's gradient at a row of the tile to the line."""
+    for j in range(0, _CHANNELS * (columns + 2 * RADIUS), LANES):
+        store(scratch, _BACK + j, _down(scratch, _BY_MEAN + j, row))
+        store(scratch, _BACK + _STRIDE + j, _down(scratch, _BY_SUM_VARIANCE + j, row))
+        store(scratch, _BACK + 2 * _STRIDE + j, _down(scratch, _BY_DIFFERENCE_VARIANCE + j, row))
+    slot = (row & (_SLOTS - 1)) * _STRIDE + 2 * _HALO
+    zero, plus, weight = splat(_ZERO), splat(l1_weight), splat(ssim_weight)
+    minus = zero - plus
+    for j in range(0, _CHANNELS * columns, LANES):
+        s = load(scratch, _SUM + slot + j)
+        d = load(scratch, _DIFFERENCE + slot + j)
+        difference = d + load(scratch, _CENTRE_DIFFERENCE + j)
+        ssim = _across(scratch, _BACK + j)
+        ssim = ssim + s * _across(scratch, _BACK + _STRIDE + j)
+        ssim = ssim + d * _across(scratch, _BACK + 2 * _STRIDE + j)
+        l1 = where_positive(difference, plus, where_positive(zero - difference, minus, zero))
+        keep = load(scratch, _KEEP + slot + j)
+        store(scratch, _LINE + j, where_positive(keep, l1 - ssim * weight, zero))
+
+
+@njit(**_SUM_OPTIONS)
+def _sum(array, start, count):
+    total = 0.0
+    for j in range(start, start + count):
+        total += np.float64(array[j])
+    return total
+
+
+@njit(**_SUM_OPTIONS)
+def _sum_absolute(scratch, start, count):
+    """Sum of |d| from element `start` of the ring on; the pixel at `start` begins a period."""
+    total = 0.0
+    for j in range(count):
+        total += np.float64(abs(scratch[start + j] + scratch[_CENTRE_DIFFERENCE + j]))
+    return total
+
+
+@njit(**_OPTIONS)
+def _tile(
+    scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
+    box, height, width, l1_weight, ssim_weight,
+):  # fmt: skip
+    """Sums of |x - y| and 1 - SSIM over a tile; its gradient is written to `gradient`."""
+    top, bottom, left, right = box
+    columns = right - left
+    halo = RADIUS if with_gradient else 0
+    absolute, dissimilarity = 0.0, 0.0
+    _set_centres(scratch, image, target, target_8bit, is_8bit, box, width)
+    loaded = top - halo - RADIUS
+    for row in range(top - halo, bottom + halo):
+        while loaded <= row + RADIUS:
+            _load_row(
+                scratch, image, target, target_8bit, is_8bit, mask, is_masked, loaded, box,
+                height, width,
+            )  # fmt: skip
+            loaded += 1
+        if 0 <= row < height:
+            _ssim_row(scratch, row, columns)
+        else:
+            _clear_row(scratch, row, columns)
+        if top <= row < bottom:
+            dissimilarity += _sum(scratch, _LINE + _HALO, _CHANNELS * columns)
+            slot = _DIFFERENCE + (row & (_SLOTS - 1)) * _STRIDE + 2 * _HALO
+            absolute += _sum_absolute(scratch, slot, _CHANNELS * columns)
+        if with_gradient and row - RADIUS >= top:
+            _gradient_row(scratch, row - RADIUS, columns, l1_weight, ssim_weight)
+            destination = ((row - RADIUS) * width + left) * _CHANNELS
+            for j in range(_CHANNELS * columns):
+                gradient[destination + j] = scratch[_LINE + j]
+    return absolute, dissimilarity
+
+
+@njit(**_OPTIONS)
+def _every_nth_tile(
+    first, step, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
+    height, width, l1_weight, ssim_weight, sums,
+):  # fmt: skip
+    """Works on tiles first, first + step, ... with one scratch memory for all of them."""
+    scratch = np.zeros(_SCRATCH, np.float32)
+    down, across = _tile_counts(height, width)
+    rows, columns = (height + down - 1) // down, (width + across - 1) // across
+    for t in range(first, down * across, step):
+        top, left = t // across * rows, t % across * columns
+        box = (top, min(height, top + rows), left, min(width, left + columns))
+        if box[0] < box[1] and box[2] < box[3]:
+            sums[t, 0], sums[t, 1] = _tile(
+                scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient,
+                with_gradient, box, height, width, l1_weight, ssim_weight,
+            )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _tile_counts(height, width):
+    """Number of tiles down and across; a function of the image's size alone."""
+    down = (height + _TILE_ROWS - 1) // _TILE_ROWS
+    across = (width + _TILE_COLUMNS - 1) // _TILE_COLUMNS
+    return down, across
+
+
+@njit(parallel=True, **_OPTIONS)
+def _all_tiles(
+    image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
+    height, width, l1_weight, ssim_weight, sums, step,
+):  # fmt: skip
+    for first in prange(step):
+        _every_nth_tile(
+            np.int64(first), step, image, target, target_8bit, is_8bit, mask, is_masked,
+            gradient, with_gradient, height, width, l1_weight, ssim_weight, sums,
+        )  # fmt: skip
+
+
+def loss_terms(
+    image: NDArray[np.float32],
+    target: NDArray[np.float32] | NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None = None,
+    gradient: NDArray[np.float32] | None = None,
+    ssim_weight: float = 0.2,
+) -> tuple[float, float]:
+    """Means of |x - y| and of 1 - SSIM over the kept pixels, and the gradient of the loss by the image.
+
+    Args:
+        image: [H, W, 3], C-contiguous.
+        target: [H, W, 3], C-contiguous; 8-bit values are divided by 255.
+        mask: [H, W], True where the pixel counts; None keeps all.
+        gradient: [H, W, 3], C-contiguous, receives the gradient of (1 - w) * L1 + w * (1 - SSIM);
+            None leaves out that half of the work.
+        ssim_weight: w.
+
+    Returns:
+        L1 and 1 - SSIM; both 0 if no pixel is kept.
+    """
+    height, width, _ = image.shape
+    kept = height * width if mask is None else int(np.count_nonzero(mask))
+    if kept == 0:
+        if gradient is not None:
+            gradient.fill(0)
+        return 0.0, 0.0
+    count = kept * _CHANNELS
+    down, across = _tile_counts(height, width)
+    sums = np.zeros((down * across, 2))
+    is_8bit = target.dtype == np.uint8
+    _all_tiles(
+        image.reshape(-1),
+        np.empty(0, np.float32) if is_8bit else target.reshape(-1),
+        target.reshape(-1) if is_8bit else np.empty(0, np.uint8),
+        is_8bit,
+        np.empty(0, np.bool_) if mask is None else mask.reshape(-1),
+        mask is not None,
+        np.empty(0, np.float32) if gradient is None else gradient.reshape(-1),
+        gradient is not None,
+        height,
+        width,
+        np.float32((1 - ssim_weight) / count),
+        np.float32(ssim_weight / count),
+        sums,
+        min(numba.get_num_threads(), len(sums)),
+    )
+    absolute, dissimilarity = sums.sum(axis=0) / count
+    return float(absolute), float(dissimilarity)

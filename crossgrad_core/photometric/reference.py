@@ -1,0 +1,93 @@
+"""The photometric loss in plain torch: any device, any floating type, differentiable by autograd.
+
+It is the readable definition and the oracle of the fused kernel.
+"""
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - torch's own convention
+from torch import Tensor
+
+WINDOW = 11  # pixels
+RADIUS = WINDOW // 2
+SIGMA = 1.5  # pixels
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def gaussian_window() -> Tensor:
+    """The normalised one-dimensional window of SSIM, [11] float64."""
+    offset = torch.arange(WINDOW, dtype=torch.float64) - RADIUS
+    weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
+    return weight / weight.sum()
+
+
+def l1_ssim_loss(
+    image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """(1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
+
+    A masked-out pixel is 0 in both images before SSIM's windows are summed, has no term of its own in
+    either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
+
+    Args:
+        image: [H, W, C] floating point; values may lie outside [0, 1].
+        target: [H, W, C] floating point, or uint8 (then 255 means 1).
+        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        ssim_weight: w in [0, 1].
+
+    Returns:
+        Scalar of the image's type.
+
+    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
+    """
+    image, target = masked(image, mask), masked(unit_range(target, image.dtype), mask)
+    absolute = (image - target).abs()
+    dissimilarity = 1 - ssim_map(image, target)
+    if mask is None:
+        count = image.new_tensor(max(image.numel(), 1))
+    else:
+        dissimilarity = masked(dissimilarity, mask)
+        count = (mask.sum() * image.shape[-1]).clamp(min=1)
+    return ((1 - ssim_weight) * absolute.sum() + ssim_weight * dissimilarity.sum()) / count
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """SSIM of every pixel and channel, [H, W, C], windows zero-padded at the border.
+
+    Args:
+        image: [H, W, C] floating point.
+        target: [H, W, C] of the same type.
+
+    Source: Wang et al. 2004, eq. 13, 11 x 11 Gaussian window, sigma 1.5, L = 1.
+    """
+    x, y = image, target
+    mean_x, mean_y, xx, yy, xy = _windowed(torch.stack((x, y, x * x, y * y, x * y)))
+    variance_x = xx - mean_x * mean_x
+    variance_y = yy - mean_y * mean_y
+    covariance = xy - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    contrast_structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
+    return luminance * contrast_structure
+
+
+def masked(image: Tensor, mask: Tensor | None) -> Tensor:
+    """The image [H, W, C] with masked-out pixels set to 0, so that not even a NaN leaks from them."""
+    if mask is None:
+        return image
+    return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))
+
+
+def unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """The image in `dtype`, 8-bit values divided by 255."""
+    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+
+
+def _windowed(fields: Tensor) -> Tensor:
+    """Gaussian-weighted sums of [M, H, W, C] over the window around each pixel, same shape."""
+    if fields.numel() == 0:
+        return fields
+    planes = fields.permute(0, 3, 1, 2).flatten(0, 1).unsqueeze(1)  # [M * C, 1, H, W]
+    weight = gaussian_window().to(fields)
+    planes = F.conv2d(planes, weight.view(1, 1, WINDOW, 1), padding=(RADIUS, 0))
+    planes = F.conv2d(planes, weight.view(1, 1, 1, WINDOW), padding=(0, RADIUS))
+    return planes.squeeze(1).unflatten(0, (fields.shape[0], -1)).permute(0, 2, 3, 1)

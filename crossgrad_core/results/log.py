@@ -1,0 +1,75 @@
+"""log.txt: plain text of what the terminal showed, with the time of day."""
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
+from crossgrad_core.files import disk_errors
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.results.lines import Pace, evaluation_line, progress_line
+
+FILE = "log.txt"
+#: Progress goes into the log so many times in a run.
+PROGRESS_LINES = 20
+
+
+def _now() -> datetime:
+    return datetime.now().astimezone()
+
+
+class RunLog:
+    """Appends to log.txt; a plugin that the loop registers beside the selected ones.
+
+    Args:
+        folder: The run's folder; a log that is there already is continued.
+        clock: The local time.
+    """
+
+    def __init__(self, folder: Path, clock: Callable[[], datetime] = _now) -> None:
+        self._path = folder / FILE
+        self._clock = clock
+        self._pace = Pace(1)
+
+    def write(self, text: str) -> None:
+        """Appends a text of one or more lines, each with the time of day.
+
+        Raises:
+            UserError: The disk is full.
+        """
+        stamp = self._clock().strftime("%H:%M:%S")
+        lines = "".join(f"{stamp}  {line}".rstrip() + "\n" for line in text.splitlines())
+        # Opened for every entry, so that the file is complete whenever the run is interrupted.
+        with disk_errors(self._path, len(lines)), self._path.open("a", encoding="utf-8") as file:
+            file.write(lines)
+
+    @hookimpl
+    def crossgrad_run_start(self, run: RunInfo) -> None:
+        """Writes the date, the scene and the notes."""
+        self._pace = Pace(run.schedule.total)
+        self.write(f"{self._clock():%Y-%m-%d}, scene {run.scene.name}, {self._pace.total} steps")
+        for note in run.notes:
+            self.write(note)
+
+    @hookimpl
+    def crossgrad_step_end(self, record: StepRecord) -> None:
+        """Writes progress now and then."""
+        self._pace = self._pace.after(record)
+        if record.step % max(1, self._pace.total // PROGRESS_LINES) == 0:
+            self.write(progress_line(self._pace))
+
+    @hookimpl
+    def crossgrad_evaluation(self, report: EvaluationReport) -> None:
+        """Writes the metrics."""
+        self._pace = self._pace.evaluated(report)
+        self.write(evaluation_line(report))
+
+    @hookimpl
+    def crossgrad_message(self, text: str) -> None:
+        """Writes what the run says."""
+        self.write(text)
+
+    @hookimpl
+    def crossgrad_run_end(self, status: str) -> None:
+        """Writes how the run ended."""
+        self.write(f"run {status}")

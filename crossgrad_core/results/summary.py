@@ -1,0 +1,128 @@
+"""summary.json: the final figures of a run with all that is needed to understand them."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation import EvaluationResult
+from crossgrad_core.files import write_atomically
+from crossgrad_core.results.metrics_csv import Row
+from crossgrad_core.results.totals import Seconds, Totals
+from crossgrad_core.state import Json
+
+FILE = "summary.json"
+
+Status = Literal["finished", "stopped", "failed"]
+
+#: How the metrics are defined; they compare only with figures of the same definition.
+DEFINITIONS: Mapping[str, str] = {
+    "psnr": "dB; 20 log10(1 / sqrt(mse)) per image over all channels, mean over images",
+    "ssim": "3DGS form: 11 x 11 window, sigma 1.5, zero padding, mean over images",
+    "ssim_skimage": "scikit-image: gaussian_weights, sigma 1.5, use_sample_covariance off",
+    "renders": "rounded to 8 bits per channel before comparison; masked pixels do not count",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What summary.json says.
+
+    Attributes:
+        status: How the run ended.
+        scene: Name of the scene.
+        totals: Steps, views, backward passes, training seconds, primitives, memory.
+        result: The last evaluation; None where there was none.
+        rows: All rows of metrics.csv, to find the best one.
+        seconds: Wall-clock seconds by what they were spent on.
+        config: The resolved configuration as plain data, the seed included.
+        environment: Machine and versions.
+        notes: What was chosen or left out, and why.
+        error: Why the run failed; None otherwise.
+    """
+
+    status: Status
+    scene: str
+    totals: Totals
+    result: EvaluationResult | None
+    rows: Sequence[Row]
+    seconds: Seconds
+    config: Mapping[str, Any]
+    environment: Mapping[str, Json]
+    notes: Sequence[str] = ()
+    error: str | None = None
+
+
+def write_summary(folder: Path, summary: Summary) -> None:
+    """Writes summary.json; numbers that JSON does not know (NaN, infinite) become null.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    text = json.dumps(_finite(_as_data(summary)), indent=2, ensure_ascii=False, default=str)
+    write_atomically(folder / FILE, (text + "\n").encode())
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of a run's summary.json.
+
+    Raises:
+        UserError: There is none, or it is not JSON.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UserError(f"no {FILE}", where=folder, expected="the folder of a crossgrad run")
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"unreadable {FILE}", where=path, found=str(error)) from error
+    return content
+
+
+def _as_data(summary: Summary) -> dict[str, Any]:
+    return {
+        "status": summary.status,
+        "error": summary.error,
+        "scene": summary.scene,
+        **asdict(summary.totals),
+        **_metrics(summary.result),
+        "best": _best(summary.rows),
+        "seconds": asdict(summary.seconds),
+        "seed": summary.config.get("seed"),
+        "notes": list(summary.notes),
+        "definitions": dict(DEFINITIONS),
+        "environment": dict(summary.environment),
+        "config": dict(summary.config),
+    }
+
+
+def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
+    if result is None:
+        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation took place"}}
+    return {
+        "overall": asdict(result.overall),
+        "regimes": {name: asdict(means) for name, means in result.regimes.items()},
+        "null": dict(result.reasons),
+    }
+
+
+def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
+    """Step, training seconds and PSNR of the evaluation with the highest PSNR."""
+    scored = [row for row in rows if row.get("psnr") is not None]
+    if not scored:
+        return None
+    best = max(scored, key=lambda row: row["psnr"] or 0.0)
+    return {name: best[name] for name in ("step", "train_seconds", "psnr", "ssim")}
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

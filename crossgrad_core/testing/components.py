@@ -1,0 +1,61 @@
+"""Checks that every component must pass, whatever its slot."""
+
+from pydantic import ValidationError
+
+from crossgrad_core.component import Component
+from crossgrad_core.manager import make_manager
+from crossgrad_core.testing.contract import Check, ContractError, Make, require
+from crossgrad_core.wording import listed
+
+
+def options_are_frozen(make: Make[Component]) -> None:
+    """An option cannot be changed afterwards, and the component can be hashed."""
+    component = make()
+    require(component.model_config.get("frozen"), "the model is not frozen: keep `frozen=True`")
+    try:
+        hash(component)
+    except TypeError as error:
+        raise ContractError(
+            f"the component has no hash ({error}): use tuples and frozen values as options"
+        ) from error
+
+
+def unknown_options_are_refused(make: Make[Component]) -> None:
+    """A misspelt option is an error, not ignored."""
+    component = make()
+    surprise = {**component.model_dump(), "no_such_option_": 1}
+    try:
+        type(component).model_validate(surprise)
+    except ValidationError:
+        return
+    raise ContractError("an unknown option is accepted: keep `extra='forbid'`")
+
+
+def options_survive_the_configuration_file(make: Make[Component]) -> None:
+    """Written to config.yaml and read again, the options are the same."""
+    component = make()
+    again = type(component).model_validate(component.model_dump(mode="json"))
+    require(again == component, f"the options {component!r} are read back as {again!r}")
+
+
+def options_are_described(make: Make[Component]) -> None:
+    """`crossgrad plugins show` can say what each option does."""
+    fields = type(make()).model_fields
+    silent = [name for name, field in fields.items() if not field.description]
+    require(
+        not silent, f"options without a description: {listed(silent)}; use Field(description=...)"
+    )
+
+
+def hooks_exist(make: Make[Component]) -> None:
+    """Every hook that it implements exists, is marked and takes the hook's arguments."""
+    make_manager({"component": make()})
+
+
+COMPONENT_CHECKS: tuple[Check[Component], ...] = (
+    options_are_frozen,
+    unknown_options_are_refused,
+    options_survive_the_configuration_file,
+    options_are_described,
+    hooks_exist,
+)

@@ -1,0 +1,130 @@
+"""What contract checks are made of.
+
+A check is a plain function `check(make)`: `make()` gives a fresh component with default options;
+the check raises `ContractError` with a sentence for the author of the component. Checks need
+neither pytest nor hypothesis; with pytest they are two lines:
+
+    @pytest.mark.parametrize("check", OPERATOR_CHECKS)
+    def test_contract(check):
+        check(MyOperator)
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from random import getstate
+from typing import TypeVar
+from unittest import SkipTest
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from crossgrad_core.component import Component, ViewCounts
+from crossgrad_core.state import PluginState
+
+C = TypeVar("C", bound=Component)
+
+#: Gives a fresh component with default options.
+Make = Callable[[], C]
+#: Raises `ContractError` where a component breaks the contract, `SkipTest` where it cannot be told.
+Check = Callable[[Make[C]], None]
+
+#: Numbers of views per step that checks try where they are admitted.
+VIEW_COUNTS = range(1, 7)
+
+
+class ContractError(AssertionError):
+    """A component breaks the contract of its slot; the text says how."""
+
+
+def require(holds: object, otherwise: str) -> None:
+    """Raises `ContractError(otherwise)` unless a condition holds (also under `python -O`)."""
+    if not holds:
+        raise ContractError(otherwise)
+
+
+def cannot_tell(reason: str) -> SkipTest:
+    """To be raised where a check does not apply to a component; pytest counts it as skipped."""
+    return SkipTest(reason)
+
+
+def admitted(views: ViewCounts) -> tuple[int, ...]:
+    """The numbers of views per step that checks try.
+
+    Raises:
+        ContractError: None of the usual ones is admitted.
+    """
+    found = tuple(count for count in VIEW_COUNTS if views.admits(count))
+    require(found, f"no number of views from 1 to {max(VIEW_COUNTS)} is admitted: {views}")
+    return found
+
+
+def revived(state: PluginState) -> PluginState:
+    """The state as a checkpoint gives it back: values through JSON, tensors copied.
+
+    Raises:
+        ContractError: The values do not survive JSON.
+    """
+    try:
+        values = json.loads(json.dumps(state.values, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ContractError(
+            f"the state's values do not survive JSON ({error}): keep plain numbers, strings, "
+            "lists and dictionaries with string keys there, and tensors in `tensors`"
+        ) from error
+    require(
+        values == _listed(state.values),
+        f"the state's values change on the way through JSON: {state.values!r} became {values!r}",
+    )
+    return PluginState(values, _cloned(state.tensors), _cloned(state.per_primitive))
+
+
+def same_state(one: PluginState, other: PluginState) -> bool:
+    """Whether two states hold the same values and the same bits."""
+    return (
+        _listed(one.values) == _listed(other.values)
+        and _same_tensors(one.tensors, other.tensors)
+        and _same_tensors(one.per_primitive, other.per_primitive)
+    )
+
+
+@contextmanager
+def global_randomness_untouched() -> Iterator[None]:
+    """Raises `ContractError` where the block draws from a global random number generator."""
+    before = _global_states()
+    yield
+    for name, state in _global_states().items():
+        require(
+            state == before[name],
+            f"the component draws from the global generator of {name}; every random number must "
+            "come from the generator that it is given",
+        )
+
+
+def _global_states() -> dict[str, object]:
+    algorithm, keys, *rest = np.random.get_state()  # noqa: NPY002 - watched, not used
+    return {
+        "numpy": (algorithm, np.asarray(keys).tobytes(), tuple(rest)),
+        "torch": torch.get_rng_state().numpy().tobytes(),
+        "random": getstate(),
+    }
+
+
+def _cloned(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+
+def _same_tensors(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(
+        torch.equal(tensor, other[name]) for name, tensor in one.items()
+    )
+
+
+def _listed(value: object) -> object:
+    """Plain data with tuples as lists, as JSON gives them back."""
+    if isinstance(value, Mapping):
+        return {key: _listed(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_listed(each) for each in value]
+    return value

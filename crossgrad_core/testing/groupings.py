@@ -1,0 +1,98 @@
+"""Contract checks of groupings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    global_randomness_untouched,
+    require,
+)
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.wording import listed
+
+
+@dataclass(frozen=True)
+class SampleProbe:
+    """Gradients of which those of far views agree with each other, and those of near views.
+
+    Attributes:
+        scene: The scene whose regimes decide.
+    """
+
+    scene: Scene
+
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """[2]."""
+        return ("means", "f_dc")
+
+    def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
+        """[2, V, V]."""
+        names = [self.scene.train_views[view].regime for view in views]
+        same = np.array([[one == other for other in names] for one in names])
+        gramian = np.where(same, 0.9, -0.5) + 0.1 * np.eye(len(names))
+        return np.stack([gramian, 2.0 * gramian])
+
+
+def labelled(grouping: Grouping, views: Sequence[View], scene: Scene, seed: int = 0) -> Labelling:
+    """What a grouping answers for views of a scene."""
+    probe: GradientProbe | None = SampleProbe(scene) if grouping.needs_probe else None
+    return grouping.label(scene, views, np.random.default_rng(seed), probe)
+
+
+def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
+    """One label per view, each of them announced in `labels` (unless the user's input names it)."""
+    grouping, scene = make(), sample_scene()
+    for views in (scene.train_views, scene.views, scene.views[:1]):
+        answer = labelled(grouping, views, scene)
+        require(isinstance(answer, Labelling), f"the answer is {answer!r}, not a Labelling")
+        require(
+            len(answer.labels) == len(views),
+            f"{len(views)} views have {len(answer.labels)} labels",
+        )
+        foreign = sorted(set(answer.labels) - set(grouping.labels)) if grouping.labels else []
+        require(not foreign, f"labels that are not declared in `labels`: {listed(foreign)}")
+
+
+def every_group_has_training_views(make: Make[Grouping]) -> None:
+    """No declared group is empty without an error, for samplers draw from all of them."""
+    grouping, scene = make(), sample_scene()
+    found = set(labelled(grouping, scene.train_views, scene).labels)
+    empty = sorted(set(grouping.labels) - found)
+    require(not empty, f"groups without training views: {listed(empty)}; raise UserError instead")
+
+
+def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
+    """A view's label depends on the training views and itself, not on what else is labelled."""
+    grouping, scene = make(), sample_scene()
+    together = labelled(grouping, scene.views, scene).labels
+    for view, label in zip(scene.views, together, strict=True):
+        alone = labelled(grouping, (view,), scene).labels[0]
+        require(
+            alone == label,
+            f"{view.name} is {alone!r} when labelled alone and {label!r} among the others",
+        )
+
+
+def same_seed_same_labels(make: Make[Grouping]) -> None:
+    """The labels depend on the arguments alone, and randomness comes from `rng`."""
+    scene = sample_scene()
+    with global_randomness_untouched():
+        one = labelled(make(), scene.views, scene)
+        other = labelled(make(), scene.views, scene)
+    require(one == other, "two calls with one seed give different labels")
+
+
+GROUPING_CHECKS: tuple[Check[Grouping], ...] = (
+    every_view_has_a_declared_label,
+    every_group_has_training_views,
+    the_rule_is_fitted_on_training_views,
+    same_seed_same_labels,
+)

@@ -1,0 +1,267 @@
+"""Contract checks of operators.
+
+The Gramians of the checks come from gradients that training does produce: zero, repeated, opposite,
+of very different length, very long and very short, and fewer dimensions than views.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.blocks import BlockKind
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    admitted,
+    cannot_tell,
+    global_randomness_untouched,
+    require,
+    revived,
+    same_state,
+)
+
+Array = NDArray[np.float64]
+
+_SIZE = 8
+_KINDS: tuple[BlockKind, ...] = ("geometry", "appearance", "neutral")
+#: Steps that state is followed for.
+_STEPS = 4
+#: A power of two, so that scaled gradients have exactly scaled Gramians.
+_SCALE = 64.0
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class OperatorCase:
+    """Gradients of K views, one block per family, and what an operator is told about them.
+
+    Attributes:
+        families: [B] what is special about each block's gradients.
+        gramians: [B, K, K].
+        context: The context.
+    """
+
+    families: tuple[str, ...]
+    gramians: Array
+    context: OperatorContext
+
+
+def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase:
+    """All families of gradients of K = `views` views, times `scale`, drawn anew for each step."""
+    rng = np.random.default_rng(step)
+    families = dict(_families(rng.normal(size=(views, _SIZE))))
+    gradients = scale * np.stack(list(families.values()))
+    gramians = gradients @ gradients.transpose(0, 2, 1)
+    context = OperatorContext(
+        step=step,
+        blocks=tuple(name.replace(" ", "_") for name in families),
+        kinds=tuple(_KINDS[block % len(_KINDS)] for block in range(len(families))),
+        losses=rng.uniform(0.05, 0.3, views),
+        labels=tuple(("near", "far")[view % 2] for view in range(views)),
+        distances=rng.uniform(0.2, 1.0, views),
+        reference_distance=0.5,
+        present=np.einsum("bkk->bk", gramians) > 0.0,
+    )
+    return OperatorCase(tuple(families), gramians, context)
+
+
+def _families(draw: Array) -> Iterator[tuple[str, Array]]:
+    """Name -> gradients [K, _SIZE] from one draw of normal ones."""
+    views = len(draw)
+    ramp = np.arange(views)[:, None]
+    yield "usual", draw
+    yield "zero", np.zeros_like(draw)
+    yield "one view zero", np.where(ramp == 0, 0.0, draw)
+    yield "all but one view zero", np.where(ramp == views - 1, draw, 0.0)
+    yield "equal", np.repeat(draw[:1], views, axis=0)
+    yield "opposite", draw[:1] * (-1.0) ** ramp
+    yield "parallel of other length", draw[:1] * (1.0 + ramp)
+    yield "two dimensions", np.where(np.arange(_SIZE) < 2, draw, 0.0)  # noqa: PLR2004
+    yield "length ratio 1e6", draw * 10.0 ** (6.0 * (ramp % 2))
+    yield "very long", draw * 1e30
+    yield "very short", draw * 1e-30
+
+
+def transformed(
+    operator: Operator, case: OperatorCase, state: PluginState = EMPTY_STATE, seed: int = 0
+) -> tuple[Array, PluginState]:
+    """What the operator answers to a case."""
+    rng = np.random.default_rng(seed)
+    return operator.transform(case.gramians, case.context, state, rng)
+
+
+def _gramian_operator(make: Make[Operator]) -> Operator:
+    """The operator, where it works on Gramians.
+
+    Raises:
+        SkipTest: It has its own `aggregate`.
+    """
+    operator = make()
+    if type(operator).aggregate is not Operator.aggregate:
+        raise cannot_tell("it overrides aggregate and need not answer transform")
+    return operator
+
+
+def matrices_have_the_shape(make: Make[Operator]) -> None:
+    """`transform` answers [B, R, K] float64 for every number of views that it admits."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case = operator_case(views)
+        matrices, _ = transformed(operator, case)
+        blocks = len(case.families)
+        expected = f"[{blocks}, R, {views}] for K = {views}"
+        shape = np.shape(matrices)
+        fits = len(shape) == 3 and (shape[0], shape[2]) == (blocks, views)  # noqa: PLR2004
+        require(fits, f"the matrices have the shape {list(shape)}, expected {expected}")
+        require(matrices.dtype == np.float64, f"the matrices are {matrices.dtype}, not float64")
+
+
+def matrices_are_finite(make: Make[Operator]) -> None:
+    """No finite gradients give a NaN or an infinity."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case = operator_case(views)
+        matrices, _ = transformed(operator, case)
+        for family, matrix in zip(case.families, matrices, strict=True):
+            require(
+                np.isfinite(matrix).all(),
+                f"K = {views}, gradients: {family}: the matrix is not finite: {matrix.tolist()}",
+            )
+
+
+def one_block_is_enough(make: Make[Operator]) -> None:
+    """Each block is treated by itself: alone it gets the matrix that it gets among others."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case = operator_case(views)
+        matrices, _ = transformed(operator, case)
+        alone, _ = transformed(operator, _only(case, 0))
+        require(
+            np.shape(alone)[0] == 1 and np.allclose(alone[0], matrices[0], rtol=_TOLERANCE),
+            f"K = {views}: the first block's matrix depends on the other blocks",
+        )
+
+
+def _only(case: OperatorCase, block: int) -> OperatorCase:
+    context = case.context
+    one = slice(block, block + 1)
+    alone = OperatorContext(
+        context.step,
+        context.blocks[one],
+        context.kinds[one],
+        context.losses,
+        context.labels,
+        context.distances,
+        context.reference_distance,
+        context.present[one],
+    )
+    return OperatorCase(case.families[one], case.gramians[one], alone)
+
+
+def inputs_stay_untouched(make: Make[Operator]) -> None:
+    """`transform` changes neither the Gramians nor what the context holds nor the old state."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        _, state = transformed(operator, operator_case(views))
+        before, kept = operator_case(views, 2), revived(state)
+        case = operator_case(views, 2)
+        transformed(operator, case, state)
+        for name in ("losses", "distances", "present"):
+            same = np.array_equal(getattr(case.context, name), getattr(before.context, name))
+            require(same, f"transform changes context.{name}")
+        require(np.array_equal(case.gramians, before.gramians), "transform changes the Gramians")
+        require(same_state(state, kept), "transform changes the state that it was given")
+
+
+def same_seed_same_answer(make: Make[Operator]) -> None:
+    """The answer depends on the arguments alone, and randomness comes from `rng`."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        with global_randomness_untouched():
+            one, one_state = transformed(operator, operator_case(views))
+            other, other_state = transformed(make(), operator_case(views))
+        require(np.array_equal(one, other), f"K = {views}: two calls with one seed differ")
+        require(same_state(one_state, other_state), f"K = {views}: two calls leave two states")
+
+
+def state_survives_a_checkpoint(make: Make[Operator]) -> None:
+    """After each step the state can be written, read and continued from, bit for bit."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        state, copy = EMPTY_STATE, EMPTY_STATE
+        for step in range(1, _STEPS + 1):
+            case = operator_case(views, step)
+            matrices, state = transformed(operator, case, state, step)
+            again, copy = transformed(operator, case, revived(copy), step)
+            require(
+                np.array_equal(matrices, again),
+                f"K = {views}, step {step}: the answer differs after a checkpoint; keep everything "
+                "that is remembered in the returned state",
+            )
+
+
+def absent_views_have_no_weight(make: Make[Operator]) -> None:
+    """A view whose gradient is zero or not finite gets the weight 0."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case = operator_case(views)
+        weights = transformed(operator, case)[0].sum(axis=1)
+        for family, weight, present in zip(
+            case.families, weights, case.context.present, strict=True
+        ):
+            require(
+                not weight[~present].any(),
+                f"K = {views}, gradients: {family}: absent views (present = {present.tolist()}) "
+                f"have the weights {weight.tolist()}",
+            )
+
+
+def one_view_keeps_its_direction(make: Make[Operator]) -> None:
+    """With one view the answer is a positive multiple of its gradient."""
+    operator = _gramian_operator(make)
+    if not operator.views.admits(1):
+        raise cannot_tell(f"it needs {operator.views}")
+    case = operator_case(1)
+    weights = transformed(operator, case)[0].sum(axis=1)
+    for family, weight, present in zip(case.families, weights, case.context.present, strict=True):
+        require(
+            weight[0] > 0.0 or not present[0],
+            f"gradients: {family}: the only view has the weight {weight[0]}, not a positive one",
+        )
+
+
+def scales_with_the_gradients(make: Make[Operator]) -> None:
+    """Gradients times c > 0 give the answer times c, so no threshold hides an absolute length."""
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case, scaled = operator_case(views), operator_case(views, scale=_SCALE)
+        weights = transformed(operator, case)[0].sum(axis=1)
+        again = transformed(operator, scaled)[0].sum(axis=1)
+        lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
+        for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
+            # Measured against the longest summand: that is what rounding is relative to.
+            error = np.abs((one - other) * length).max()
+            size = np.abs(one * length).max()
+            require(
+                error <= _TOLERANCE * size,
+                f"K = {views}, gradients: {family}: the weights {one.tolist()} become "
+                f"{other.tolist()} for gradients {_SCALE:g} times as long; compare lengths with "
+                "each other, never with a constant",
+            )
+
+
+OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
+    matrices_have_the_shape,
+    matrices_are_finite,
+    one_block_is_enough,
+    inputs_stay_untouched,
+    same_seed_same_answer,
+    state_survives_a_checkpoint,
+    absent_views_have_no_weight,
+    one_view_keeps_its_direction,
+    scales_with_the_gradients,
+)

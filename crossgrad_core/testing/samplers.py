@@ -1,0 +1,140 @@
+"""Contract checks of samplers."""
+
+from functools import cache
+from typing import cast
+
+import numpy as np
+
+from crossgrad_core.contexts import Draw
+from crossgrad_core.grouping import Grouping
+from crossgrad_core.registry import build
+from crossgrad_core.sampler import Sampler
+from crossgrad_core.scene.types import Scene
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    admitted,
+    global_randomness_untouched,
+    require,
+    revived,
+    same_state,
+)
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.posed import SamplerRun
+
+#: Steps after which a run is interrupted, and steps that follow.
+_BEFORE, _AFTER = 7, 12
+#: Steps within which every training view must come: for uniform draws of one view of nine the
+#: probability of missing one is 9 (8/9)^400 < 1e-19.
+_PATIENCE = 400
+
+
+@cache
+def _scene() -> Scene:
+    return sample_scene()
+
+
+@cache
+def _groups(grouping: str) -> tuple[str, ...]:
+    scene = _scene()
+    rule = cast("Grouping", build("groupings", grouping, {}))
+    return rule.label(scene, scene.train_views, np.random.default_rng(0)).labels
+
+
+def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
+    """A run of the sampler on the sample scene, with the groups that it needs."""
+    needed = sampler.default_grouping
+    losses = np.random.default_rng(1).uniform(0.05, 0.3, len(_scene().train)).tolist()
+    groups = None if needed is None else _groups(needed)
+    return SamplerRun(sampler, _scene(), groups, views, losses=losses)
+
+
+def usual_views_are_admitted(make: Make[Sampler]) -> None:
+    """K where the user names none is one that the sampler has a meaning for."""
+    sampler = make()
+    require(
+        sampler.view_counts.admits(sampler.usual_views),
+        f"the usual K is {sampler.usual_views}, but the sampler needs {sampler.view_counts}",
+    )
+
+
+def draws_are_training_views(make: Make[Sampler]) -> None:
+    """Every draw holds K positions of training views, and K labels where it holds labels."""
+    sampler = make()
+    for views in admitted(sampler.view_counts):
+        run = sampler_run(sampler, views)
+        for draw in run.draws(_AFTER):
+            _require_good(draw, views, len(run.scene.train))
+
+
+def _require_good(draw: Draw, views: int, available: int) -> None:
+    require(isinstance(draw, Draw), f"the sampler answers {draw!r}, not a Draw and a state")
+    require(
+        isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
+        f"the drawn views {draw.views!r} are not a tuple of plain integers",
+    )
+    require(len(draw.views) == views, f"K = {views}, but {len(draw.views)} views were drawn")
+    require(
+        all(0 <= view < available for view in draw.views),
+        f"the drawn views {draw.views} are not all positions in 0 .. {available - 1}",
+    )
+    require(
+        draw.labels is None or len(draw.labels) == views,
+        f"{views} views were drawn with the labels {draw.labels}",
+    )
+
+
+def every_view_comes(make: Make[Sampler]) -> None:
+    """Each training view is drawn sooner or later."""
+    sampler = make()
+    run = sampler_run(sampler)
+    missing = set(range(len(run.scene.train)))
+    for draw in run.draws(_PATIENCE):
+        missing -= set(draw.views)
+        if not missing:
+            return
+    require(not missing, f"the training views {sorted(missing)} never came in {_PATIENCE} steps")
+
+
+def same_seed_same_draws(make: Make[Sampler]) -> None:
+    """The draws depend on the arguments alone, and randomness comes from `context.rng`."""
+    with global_randomness_untouched():
+        one = list(sampler_run(make()).draws(_AFTER))
+        other = list(sampler_run(make()).draws(_AFTER))
+    require(one == other, "two runs with one seed draw different views")
+
+
+def resumes_exactly(make: Make[Sampler]) -> None:
+    """A run that continues from a checkpoint draws what an uninterrupted run draws."""
+    whole, broken = sampler_run(make()), sampler_run(make())
+    for _ in range(_BEFORE):
+        whole.draw()
+        broken.draw()
+    broken.sampler, broken.state = make(), revived(broken.state)
+    for step in range(_BEFORE + 1, _BEFORE + _AFTER + 1):
+        one, other = whole.draw(), broken.draw()
+        require(
+            one == other,
+            f"step {step}: an uninterrupted run draws {one.views}, a resumed one {other.views}; "
+            "keep everything that is remembered in the returned state",
+        )
+
+
+def old_states_stay_untouched(make: Make[Sampler]) -> None:
+    """`sample` returns a new state and leaves the old one as it was."""
+    run = sampler_run(make())
+    for _ in range(_BEFORE):
+        old = run.state
+        kept = revived(old)
+        run.draw()
+        require(same_state(old, kept), "sample changes the state that it was given")
+
+
+SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
+    usual_views_are_admitted,
+    draws_are_training_views,
+    every_view_comes,
+    same_seed_same_draws,
+    resumes_exactly,
+    old_states_stay_untouched,
+)

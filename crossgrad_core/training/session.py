@@ -1,0 +1,171 @@
+"""Where the results of a run go while it trains and when it ends."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+
+from torch import Tensor
+
+from crossgrad_core.checkpoint import Keep, save
+from crossgrad_core.contexts import EvaluationReport
+from crossgrad_core.evaluation import EvaluationResult, evaluate
+from crossgrad_core.ply import write_ply
+from crossgrad_core.results.curve import draw_curve
+from crossgrad_core.results.environment import environment
+from crossgrad_core.results.metrics_csv import MetricsCsv, metrics_row, read_metrics
+from crossgrad_core.results.panels import PanelWriter
+from crossgrad_core.results.per_view import write_per_view
+from crossgrad_core.results.summary import Status, Summary, write_summary
+from crossgrad_core.results.totals import Seconds, Totals
+from crossgrad_core.scene.types import View
+from crossgrad_core.splat_cloud import SplatCloud
+from crossgrad_core.training.memory import peak_mebibytes
+from crossgrad_core.training.persist import to_checkpoint
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import eval_background
+
+#: Held-out views of which panels are drawn.
+PANELS = 4
+
+
+class Session:
+    """Writes one run's folder; the sink of the training loop.
+
+    Args:
+        folder: The run's folder.
+        table: Its metrics.csv.
+    """
+
+    def __init__(self, folder: Path, table: MetricsCsv) -> None:
+        self.folder = folder
+        self._table = table
+        self.result: EvaluationResult | None = None
+        self._saved_step = -1
+        self._evaluated_step = -1
+
+    @classmethod
+    def fresh(cls, folder: Path, setup: Setup) -> "Session":
+        """The session of a new run."""
+        return cls(folder, MetricsCsv.create(folder, regimes_of(setup)))
+
+    @classmethod
+    def resumed(cls, folder: Path, setup: Setup, step: int) -> "Session":
+        """The session of a run that continues after `step`."""
+        session = cls(folder, MetricsCsv.resume(folder, regimes_of(setup), step))
+        session._saved_step = step
+        rows = read_metrics(folder)
+        if rows:
+            session._evaluated_step = int(rows[-1]["step"] or 0)
+        return session
+
+    def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
+        """Evaluates the held-out views and records a row; draws `panels` of them."""
+        start = perf_counter()
+        writer = None
+        if panels > 0:
+            views = setup.scene.test_views
+            writer = PanelWriter.of(self.folder, state.step, views, panels)
+        result = evaluate(
+            setup.scene.test_views,
+            renderer(setup, state),
+            on_view=None if writer is None else writer.write,
+        )
+        state.clock.evaluate += perf_counter() - start
+        self.result = result
+        if self._evaluated_step == state.step:
+            return
+        self._evaluated_step = state.step
+        row = metrics_row(totals(setup, state), result)
+        self._table.append(row)
+        setup.hook.crossgrad_evaluation(report=EvaluationReport(state.step, row))
+
+    def save(self, setup: Setup, state: TrainState) -> None:
+        """Writes a checkpoint."""
+        if self._saved_step == state.step:
+            return
+        start = perf_counter()
+        save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
+        self._saved_step = state.step
+        state.clock.report += perf_counter() - start
+
+    def finish(
+        self, setup: Setup, state: TrainState, status: Status, error: str | None = None
+    ) -> None:
+        """Writes everything that describes the run as a whole."""
+        start = perf_counter()
+        rows = read_metrics(self.folder)
+        if self.result is not None:
+            write_per_view(self.folder, self.result)
+        if rows:
+            draw_curve(self.folder, rows, title(setup), view_counts(setup))
+        for note in export_ply(setup, state, self.folder / "point_cloud.ply"):
+            setup.hook.crossgrad_message(text=note)
+        state.clock.report += perf_counter() - start
+        summary = Summary(
+            status=status,
+            scene=setup.scene.name,
+            totals=totals(setup, state),
+            result=self.result,
+            rows=rows,
+            seconds=Seconds(**asdict(state.clock)),
+            config=setup.config.model_dump(mode="json"),
+            environment=environment(str(setup.device)),
+            notes=setup.notes,
+            error=error,
+        )
+        write_summary(self.folder, summary)
+
+
+def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
+    """Renders a view with the current parameters as an evaluation does."""
+    background = eval_background(setup)
+    phase = setup.phase(state.step, training=False)
+
+    def render_one(view: View) -> Tensor:
+        gaussians = setup.backbone.decode(state.parameters, view.camera, phase)
+        return setup.rasterizer.render(gaussians, view.camera, background).image
+
+    return render_one
+
+
+def export_ply(setup: Setup, state: TrainState, path: Path) -> tuple[str, ...]:
+    """Writes the standard PLY in the coordinates of the input; notes for the user."""
+    gaussians = setup.backbone.bake(state.parameters, setup.phase(state.step, training=False))
+    comments = (f"crossgrad step {state.step}",)
+    cloud = SplatCloud.from_gaussians(gaussians)
+    return write_ply(path, cloud, setup.scene.similarity, comments)
+
+
+def totals(setup: Setup, state: TrainState) -> Totals:
+    """What the run has cost so far."""
+    losses = state.last.losses if state.last is not None else ()
+    return Totals(
+        step=state.step,
+        views=state.counters.views,
+        backward_passes=state.counters.backward_passes,
+        train_seconds=state.clock.train,
+        primitives=state.primitives(setup),
+        peak_memory_mib=peak_mebibytes(setup.device),
+        loss=sum(losses) / len(losses) if losses else None,
+    )
+
+
+def regimes_of(setup: Setup) -> list[str]:
+    """The regimes of the held-out views."""
+    return sorted({view.regime for view in setup.scene.test_views})
+
+
+def view_counts(setup: Setup) -> dict[str, int]:
+    """Number of held-out views overall and per regime."""
+    views = setup.scene.test_views
+    counts = {regime: sum(v.regime == regime for v in views) for regime in regimes_of(setup)}
+    return {"overall": len(views), **counts}
+
+
+def title(setup: Setup) -> str:
+    """What the curve is called."""
+    names = setup.selection.names
+    parts = f"{names['backbone']}, {names['sampler']}, {names['operator']}"
+    return f"{setup.scene.name}: {parts}, K = {setup.selection.views_per_step}"

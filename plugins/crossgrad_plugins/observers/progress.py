@@ -1,0 +1,128 @@
+"""Progress in the terminal: a bar, or plain lines where stderr is no terminal."""
+
+import sys
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, PrivateAttr
+
+from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.observer import Observer
+from crossgrad_core.results.lines import Pace, evaluation_line, figures, progress_line
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+_BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+
+#: Counted in most steps, hence no news.
+_OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
+
+
+class Progress(Observer):
+    """Shows step, loss, PSNR, primitives, speed and time left on stderr.
+
+    Attributes:
+        level: How much is shown.
+        interval: Seconds between plain lines; one also comes at every tenth of the run.
+    """
+
+    level: Literal["quiet", "normal", "verbose"] = Field(
+        "normal",
+        description="quiet: nothing; normal: progress, evaluations, messages; "
+        "verbose: also the notes of the run and every change of density control",
+    )
+    interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
+
+    # What is on the screen; no part of the run's state.
+    _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
+    _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
+    _last_line: float = PrivateAttr(default=0.0)
+
+    @hookimpl
+    def crossgrad_run_start(self, run: RunInfo) -> None:
+        """Shows the scene, and with `verbose` the notes of the run."""
+        self._pace = Pace(run.schedule.total)
+        self._last_line = monotonic()
+        if self.level == "quiet":
+            return
+        train, test = len(run.scene.train), len(run.scene.test)
+        self._say(f"{run.scene.name}: {train} training views, {test} held out")
+        if run.folder is not None:
+            self._say(f"results in {run.folder}")
+        if self.level == "verbose":
+            for note in run.notes:
+                self._say(f"- {note}")
+
+    @hookimpl
+    def crossgrad_step_end(self, record: StepRecord) -> None:
+        """Moves the bar, or writes a line now and then."""
+        if self.level == "quiet":
+            return
+        self._pace = self._pace.after(record)
+        if sys.stderr.isatty():
+            self._move_bar(record)
+        elif self._line_is_due(record.step):
+            self._last_line = monotonic()
+            self._say(progress_line(self._pace))
+        if self.level == "verbose":
+            self._tell_changes(record)
+
+    @hookimpl
+    def crossgrad_evaluation(self, report: EvaluationReport) -> None:
+        """Shows the metrics."""
+        self._pace = self._pace.evaluated(report)
+        if self.level != "quiet":
+            self._say(evaluation_line(report))
+
+    @hookimpl
+    def crossgrad_message(self, text: str) -> None:
+        """Shows what the run says."""
+        if self.level != "quiet":
+            self._say(text)
+
+    @hookimpl
+    def crossgrad_run_end(self, status: str) -> None:
+        """Leaves the finished bar on the screen."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        if self.level != "quiet" and status != "finished":
+            self._say(f"run {status}")
+
+    def _tell_changes(self, record: StepRecord) -> None:
+        changes = [
+            f"{count:,} {name}"
+            for name, count in record.counts.items()
+            if count and name not in _OF_AGGREGATION
+        ]
+        if changes:
+            self._say(f"step {record.step}: {', '.join(changes)}")
+
+    def _line_is_due(self, step: int) -> bool:
+        tenth = step % max(1, self._pace.total // 10) == 0
+        return tenth or monotonic() - self._last_line >= self.interval
+
+    def _move_bar(self, record: StepRecord) -> None:
+        from tqdm import tqdm
+
+        if self._bar is None:
+            self._bar = tqdm(
+                total=self._pace.total,
+                initial=self._pace.first,
+                unit="step",
+                bar_format=_BAR,
+                dynamic_ncols=True,
+                file=sys.stderr,
+            )
+        self._bar.set_postfix_str(", ".join(figures(self._pace)), refresh=False)
+        self._bar.update(record.step - self._bar.n)
+
+    def _say(self, text: str) -> None:
+        if self._bar is None:
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+        else:
+            # The bar would otherwise be torn by the line.
+            self._bar.write(text, file=sys.stderr)

@@ -1,0 +1,1 @@
+"""Tile-based CPU kernels of the `numba` rasterizer: plain arrays in, plain arrays out."""

@@ -1,0 +1,307 @@
+"""Gradients of the tiles' pixels, summed per entry (Gaussian and tile), front to back.
+
+With S the part of the loss' linear form still to come behind the Gaussian at hand (its start value
+is the gradient of the pixel times the pixel), and c the gradient times the Gaussian's colour,
+
+    dL/d(alpha) = T c - S / (1 - alpha),
+
+so one pass in drawing order suffices, and the transmittance T is the forward pass' own, bit for
+bit. The gradient of the accumulated opacity only lowers the start value of S by itself times the
+final transmittance; the accumulated depth is one more colour channel.
+"""
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.constants import (
+    LARGEST_ALPHA,
+    OFFSETS,
+    ONE,
+    STOPPED,
+    TOUCHED,
+    exp2,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
+    ROW_CENTRE,
+    ROW_DY,
+    ROW_EXPONENT,
+    ROWS,
+    fill_rows,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    BLUE,
+    DECAY,
+    DEPTH,
+    GREEN,
+    PARTIAL,
+    RECORD,
+    RED,
+    ROW_DECAY,
+    SEGMENT,
+    SEGMENTS,
+    SLOPE,
+    SUM_ABS_X,
+    SUM_ABS_Y,
+    SUM_BLUE,
+    SUM_DEPTH,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.simd import (
+    LANES,
+    as_negative,
+    broadcast,
+    fma,
+    fnma,
+    load,
+    lowest_bit,
+    magnitude,
+    prefetch,
+    smaller,
+    splat,
+    store,
+    sums,
+    total,
+    where,
+)
+
+#: Entries whose row buffers are filled before the first of them is processed.
+BATCH = 8
+
+# State of a segment: transmittance (negative once finished), S, gradient of the three channels.
+# The gradients of the depths of all segments follow the states of all segments.
+_T, _REST, _RED, _GREEN, _BLUE = 0, LANES, 2 * LANES, 3 * LANES, 4 * LANES
+_STATE = 5 * LANES
+_DEPTHS = SEGMENTS * _STATE
+
+
+@device
+def _start(
+    state: NDArray[np.float32],
+    top: int,
+    left: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the state of a tile."""
+    state[:] = np.float32(0.0)
+    for segment in range(SEGMENTS):
+        for x in range(SEGMENT):
+            state[segment * _STATE + _T + x] = np.float32(-1.0)
+    for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
+        for x in range(min(TILE_WIDTH, image.shape[1] - left)):
+            segment = (x // SEGMENT) * TILE_HEIGHT + y
+            at = segment * _STATE + x % SEGMENT
+            i, j = top + y, left + x
+            red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
+            rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
+            if v_alpha is not None:
+                rest -= v_alpha[i, j] * (np.float32(1.0) - alpha[i, j])
+            if depth is not None and v_depth is not None:
+                rest += v_depth[i, j] * depth[i, j]
+                state[_DEPTHS + segment * LANES + x % SEGMENT] = v_depth[i, j]
+            state[at + _T] = np.float32(1.0)
+            state[at + _REST] = rest
+            state[at + _RED] = red
+            state[at + _GREEN] = green
+            state[at + _BLUE] = blue
+
+
+@device
+def _gather(
+    reached: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    base: int,
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+    absolute: NDArray[np.float32] | None,
+    partials: NDArray[np.float32],
+    partial: int,
+) -> None:
+    """Sums the gradients of one Gaussian over the reached segments into partials[partial:]."""
+    decay = broadcast(records, record + DECAY)
+    red = broadcast(records, record + RED)
+    green = broadcast(records, record + GREEN)
+    blue = broadcast(records, record + BLUE)
+    z = broadcast(records, record + DEPTH)
+    # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
+    pull = broadcast(records, record + ROW_DECAY)
+    lean = decay * broadcast(records, record + SLOPE)
+    zero = splat(np.float32(0.0))
+    sum_1 = sum_d = sum_dd = sum_y = sum_yy = sum_dy = zero
+    sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
+    while reached != np.uint64(0):
+        segment = lowest_bit(reached)
+        reached &= reached - np.uint64(1)
+        row = base + (segment & (TILE_HEIGHT - 1))
+        at = segment * _STATE
+        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+        dx = offsets - broadcast(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+        touched = power >= load(constants, TOUCHED)
+        uncapped = exp2(power, constants)
+        alpha = smaller(uncapped, load(constants, LARGEST_ALPHA))
+        alpha = where(touched, alpha, zero)
+        before = load(state, at + _T)
+        weight = alpha * before
+        after = before - weight
+        blended = after >= load(constants, STOPPED)
+        store(state, at + _T, where(blended, after, as_negative(before)))
+        weight = where(blended, weight, zero)
+        v_red = load(state, at + _RED)
+        v_green = load(state, at + _GREEN)
+        v_blue = load(state, at + _BLUE)
+        sum_red = fma(weight, v_red, sum_red)
+        sum_green = fma(weight, v_green, sum_green)
+        sum_blue = fma(weight, v_blue, sum_blue)
+        toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
+        if v_depth is not None:
+            v_z = load(state, _DEPTHS + segment * LANES)
+            sum_depth = fma(weight, v_z, sum_depth)
+            toned = fma(v_z, z, toned)
+        own = weight * toned
+        rest = load(state, at + _REST) - own
+        store(state, at + _REST, rest)
+        # alpha * dL/d(alpha), the gradient of the exponent and of the log of the opacity
+        capped = uncapped > load(constants, LARGEST_ALPHA)
+        s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
+        s = where(blended, s, zero)
+        s = where(capped, zero, s)
+        dy = broadcast(rows, row + ROW_DY)
+        sd = s * dx
+        sy = s * dy
+        sum_1 = sum_1 + s
+        sum_d = sum_d + sd
+        sum_y = sum_y + sy
+        sum_dd = fma(sd, dx, sum_dd)
+        sum_dy = fma(sd, dy, sum_dy)
+        sum_yy = fma(sy, dy, sum_yy)
+        if absolute is not None:
+            sum_abs_x = sum_abs_x + magnitude(sd)
+            sum_abs_y = sum_abs_y + magnitude(fnma(lean, sd, pull * sy))
+    store(
+        partials,
+        partial,
+        sums(sum_1, sum_d, sum_dd, sum_y, sum_yy, sum_dy, sum_red, sum_green),
+    )
+    partials[partial + SUM_BLUE] = total(sum_blue)
+    if v_depth is not None:
+        partials[partial + SUM_DEPTH] = total(sum_depth)
+    if absolute is not None:
+        partials[partial + SUM_ABS_X] = total(sum_abs_x)
+        partials[partial + SUM_ABS_Y] = total(sum_abs_y)
+
+
+@device
+def _backward(
+    tile: int,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    masks: NDArray[np.uint32],
+    records: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+    absolute: NDArray[np.float32] | None,
+    partials: NDArray[np.float32],
+) -> None:
+    """Sums the gradients of one tile's entries."""
+    columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
+    top = (tile // columns) * TILE_HEIGHT
+    left = (tile % columns) * TILE_WIDTH
+    state = np.empty(_DEPTHS + SEGMENTS * LANES, np.float32)
+    rows = np.empty(BATCH * ROWS, np.float32)
+    batch = np.empty(BATCH, np.int64)
+    _start(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
+    entry, stop = starts[tile], starts[tile + 1]
+    while entry < stop:
+        filled = 0
+        while filled < BATCH and entry < stop:
+            prefetch(records, np.intp(entries[min(entry + BATCH, stop - 1)]) * RECORD)
+            record = np.intp(entries[entry]) * RECORD
+            fill_rows(records, record, np.float32(left), np.float32(top), rows, filled * ROWS)
+            batch[filled] = entry
+            filled += np.intp(masks[entry] != 0)
+            entry += 1
+        for k in range(filled):
+            at = batch[k]
+            _gather(
+                np.uint64(masks[at]),
+                records,
+                np.intp(entries[at]) * RECORD,
+                rows,
+                k * ROWS,
+                state,
+                constants,
+                v_depth,
+                absolute,
+                partials,
+                at * PARTIAL,
+            )
+
+
+@parallel_kernel
+def differentiate(
+    tiles: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    masks: NDArray[np.uint32],
+    records: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+    absolute: NDArray[np.float32] | None,
+    partials: NDArray[np.float32],
+) -> None:
+    """Sums the gradients of every entry with a mask over its tile's pixels.
+
+    Args:
+        tiles: [T] every tile once.
+        starts: [T + 1] first entry of each tile.
+        entries: [E] records of each tile, front to back.
+        masks: [E] segments per entry, as the forward pass left them.
+        records: Records of the drawn Gaussians, flat.
+        constants: From `vector_constants`.
+        image: [H, W, 3] as drawn, background included.
+        alpha: [H, W] as drawn.
+        depth: [H, W] as drawn, or None.
+        v_image: [H, W, 3] gradient of the loss by the image.
+        v_alpha: [H, W] gradient by alpha, or None.
+        v_depth: [H, W] gradient by the depth, or None.
+        absolute: Any vector asks for the sums of absolute gradients; None leaves them out.
+        partials: [E * PARTIAL] written where the mask is not zero.
+    """
+    for job in prange(tiles.shape[0]):
+        _backward(
+            tiles[job],
+            starts,
+            entries,
+            masks,
+            records,
+            constants,
+            image,
+            alpha,
+            depth,
+            v_image,
+            v_alpha,
+            v_depth,
+            absolute,
+            partials,
+        )

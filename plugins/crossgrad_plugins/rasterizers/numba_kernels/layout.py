@@ -1,0 +1,51 @@
+"""Sizes and the layout of a drawn Gaussian's record, shared by all kernels.
+
+The 2-D Gaussian is kept by rows of pixels, which is well conditioned even for needles: with
+covariance [[A, B], [B, C]] (dilated), row offset dy and column offset dx from the mean,
+
+    exponent = -(dy^2 / C + (dx - k dy)^2 / V) / 2,   k = B / C,   V = (A C - B^2) / C,
+
+so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of log 2.
+"""
+
+import math
+
+import numpy as np
+
+#: Pixels of a tile, a multiple of eight on both sides.
+TILE_WIDTH = 16
+TILE_HEIGHT = 16
+#: A segment is eight pixels of a row; a tile's segments are numbered down its columns of segments.
+SEGMENT = 8
+COLUMNS = TILE_WIDTH // SEGMENT
+SEGMENTS = COLUMNS * TILE_HEIGHT
+
+#: Gaussians that one job of the projection handles.
+CHUNK = 2048
+
+#: Floats of a record (one cache line), and what is where.
+RECORD = 16
+U_WHOLE, U_PART = 0, 1  # projected mean, pixels: whole and fractional part
+V_WHOLE, V_PART = 2, 3
+SLOPE = 4  # k
+ROW_DECAY = 5  # log2(e) / (2 C)
+DECAY = 6  # log2(e) / (2 V)
+WIDTH = 7  # 1 / DECAY
+LOG_OPACITY = 8  # log2 of the opacity (with the antialiasing factor)
+RED, GREEN, BLUE = 9, 10, 11
+DEPTH = 12
+
+#: Sums over pixels that the backward pass leaves per drawn Gaussian and tile.
+PARTIAL = 12
+SUM_1, SUM_D, SUM_DD, SUM_Y, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
+SUM_RED, SUM_GREEN, SUM_BLUE = 6, 7, 8
+SUM_DEPTH = 9
+SUM_ABS_X, SUM_ABS_Y = 10, 11
+
+LOG2_E = 1.0 / math.log(2.0)
+#: A pixel is touched where the exponent plus log2 of the opacity reaches this.
+TOUCH = np.float32(-math.log2(255.0))
+#: Row extents are computed with this much to spare, so that rounding loses no touched pixel.
+SPARE = np.float32(1e-4)
+#: Compositing stops before a blend that would bring the transmittance below this.
+STOP = np.float32(1e-4)

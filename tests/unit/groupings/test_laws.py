@@ -1,0 +1,226 @@
+"""What every grouping promises, and what each does on a scene made for it."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.groupings.anchors import Anchors
+from crossgrad_plugins.groupings.gmm import GaussianMixture
+from crossgrad_plugins.groupings.kmeans import KMeans
+from crossgrad_plugins.groupings.percentile import Percentile
+from crossgrad_plugins.groupings.radial import Radial
+from crossgrad_plugins.groupings.terciles import Terciles
+
+BY_POSITION = (
+    "altitude",
+    "anchors",
+    "footprint",
+    "gmm",
+    "kmeans",
+    "percentile",
+    "radial",
+    "terciles",
+)
+
+
+class AgreementProbe:
+    """Gradients of street cameras along one axis and of aerial ones along another."""
+
+    def __init__(self, sides):
+        self.blocks = ("means",)
+        self.sides = np.array(sides)
+
+    def gramians(self, views):
+        sides = self.sides[list(views)]
+        return np.where(sides[:, None] == sides[None, :], 1.0, -0.2)[None] + 0.5 * np.eye(
+            len(sides)
+        )
+
+
+def hybrid(street=12, aerial=9, scale=1.0, test=(0, 20)):
+    """A street ring at height 1 and an aerial ring at height 8 that look at the origin."""
+    views = []
+    for count, radius, height, folder in ((street, 3.0, 1.0, "street"), (aerial, 9.0, 8.0, "air")):
+        for i in range(count):
+            angle = 2 * np.pi * (i + 0.3 * (i % 3)) / count
+            center = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+            center[2] += 0.05 * i
+            view = posed_view(center * scale, f"{folder}/{i:02}.png", forward=-center, focal=40.0)
+            views.append(view)
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.5 * scale
+    return posed_scene(views, points, test=test)
+
+
+def label(name, scene, views=None, seed=0, **options):
+    probe = AgreementProbe(["street" not in view.name for view in scene.train_views])
+    grouping = build("groupings", name, options)
+    views = scene.train_views if views is None else views
+    return grouping.label(scene, views, np.random.default_rng(seed), probe).labels
+
+
+@pytest.mark.parametrize("name", entries("groupings"))
+def test_labels_are_among_the_declared_ones_and_no_needed_group_is_empty(name):
+    scene = hybrid()
+    labels = label(name, scene)
+    declared = build("groupings", name, {}).labels
+    assert len(labels) == len(scene.train)
+    assert set(labels) == set(declared or ("street", "air"))
+
+
+@pytest.mark.parametrize("name", entries("groupings"))
+def test_the_rule_is_fitted_on_training_cameras_and_applied_to_all(name):
+    scene = hybrid()
+    every = label(name, scene, scene.views)
+    assert tuple(every[i] for i in scene.train) == label(name, scene)
+    moved = list(scene.views)
+    moved[0] = posed_view((500.0, 0.0, 90.0), "street/00.png", forward=(-5, 0, -1))
+    other = posed_scene(moved, scene.points, test=scene.test)
+    assert label(name, other) == label(name, scene)
+
+
+@pytest.mark.parametrize("name", entries("groupings"))
+def test_the_unit_of_length_does_not_matter(name):
+    labels = label(name, hybrid())
+    assert label(name, hybrid(scale=1e-3)) == labels
+    assert label(name, hybrid(scale=1e4)) == labels
+
+
+@pytest.mark.parametrize("name", ["altitude", "conflict-signature", "footprint", "gmm", "radial"])
+def test_the_regimes_of_a_hybrid_scene_are_found(name):
+    scene = hybrid(street=10, aerial=10, test=())
+    expected = tuple("near" if "street" in view.name else "far" for view in scene.train_views)
+    assert label(name, scene) == expected
+
+
+@pytest.mark.parametrize("name", ["altitude", "conflict-signature", "gmm"])
+def test_the_regimes_are_found_whatever_their_sizes(name):
+    scene = hybrid(street=16, aerial=6, test=())
+    expected = tuple("near" if "street" in view.name else "far" for view in scene.train_views)
+    options = {"cut": "gap"} if name == "altitude" else {}
+    assert label(name, scene, **options) == expected
+
+
+@pytest.mark.parametrize("name", entries("groupings"))
+@pytest.mark.parametrize("cameras", [1, 6])
+def test_cameras_that_do_not_differ_are_a_user_error(name, cameras):
+    views = [posed_view((1, 2, 3), f"{i}.png", forward=(0, 1, -1)) for i in range(cameras)]
+    scene = posed_scene(views, [(1, 3, 2)])
+    with pytest.raises(UserError) as error:
+        label(name, scene)
+    assert error.value.todo or "one label" in error.value.what
+
+
+@pytest.mark.parametrize("name", entries("groupings"))
+def test_no_training_views_are_a_user_error(name):
+    scene = posed_scene([posed_view((0, 0, 1), "a/1.png")], test=[0])
+    with pytest.raises(UserError, match="training views"):
+        label(name, scene)
+
+
+@pytest.mark.parametrize("name", BY_POSITION)
+def test_the_fit_is_reported(name):
+    scene = hybrid()
+    labelling = build("groupings", name, {}).label(scene, scene.views, np.random.default_rng(0))
+    assert any(note.startswith(f"grouping {name}:") for note in labelling.notes)
+
+
+@pytest.mark.parametrize("name", ["gmm", "kmeans"])
+def test_restarts_make_the_seed_unimportant(name):
+    rng = np.random.default_rng(2)
+    centers = [*rng.normal(size=(12, 3)), *(rng.normal(size=(5, 3)) + np.array([0, 9, 20]))]
+    scene = posed_scene([posed_view(p, f"{i:02}.png") for i, p in enumerate(centers)])
+    labels = {label(name, scene, seed=seed) for seed in range(12)}
+    assert labels == {("near",) * 12 + ("far",) * 5}
+
+
+def on_a_line(*distances):
+    """Cameras at these distances on either side of the origin, so that their mean is the origin."""
+    views = [
+        posed_view((side * r, 0, 0), f"{r}{side}.png") for r in distances for side in (1.0, -1.0)
+    ]
+    return posed_scene(views)
+
+
+def test_radial_puts_ties_at_the_median_near():
+    scene = on_a_line(1.0, 2.0, 2.0, 2.0, 5.0)
+    labels = Radial().label(scene, scene.views, np.random.default_rng(0)).labels
+    assert labels == ("near",) * 8 + ("far",) * 2
+
+
+def test_radial_refuses_ties_that_leave_far_empty():
+    scene = on_a_line(1.0, 2.0, 2.0, 2.0)
+    with pytest.raises(UserError, match="near: 8, far: 0"):
+        Radial().label(scene, scene.views, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("q", "near"), [(30.0, 6), (50.0, 10), (70.0, 14)])
+def test_percentile_sets_the_share_of_near_cameras(q, near):
+    scene = on_a_line(*np.linspace(1.0, 2.0, 10))
+    labels = Percentile(q=q).label(scene, scene.views, np.random.default_rng(0)).labels
+    assert labels.count("near") == near
+
+
+def test_terciles_have_equal_shares():
+    scene = on_a_line(*np.linspace(1.0, 2.0, 9))
+    labels = Terciles().label(scene, scene.views, np.random.default_rng(0)).labels
+    assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 6, 6]
+
+
+def test_anchors_are_thirty_percent_on_either_side():
+    scene = on_a_line(*np.linspace(1.0, 2.0, 10))
+    labels = Anchors().label(scene, scene.views, np.random.default_rng(0)).labels
+    assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 8, 6]
+
+
+def test_anchors_need_no_middle():
+    scene = posed_scene([posed_view((0, 0, 0), "a.png"), posed_view((1, 0, 0), "b.png")])
+    three = posed_scene([*scene.views, posed_view((5, 0, 0), "c.png")])
+    labels = Anchors(share=0.5).label(three, three.views, np.random.default_rng(0)).labels
+    assert set(labels) == {"near", "far"}
+
+
+def test_kmeans_calls_the_inner_cluster_near():
+    views = [posed_view((x, 0, 0), f"{x}.png") for x in (0.0, 0.1, 0.2, 0.3, 9.0)]
+    scene = posed_scene(views)
+    labels = KMeans().label(scene, scene.views, np.random.default_rng(0)).labels
+    assert labels == ("near",) * 4 + ("far",)
+
+
+def test_gmm_recovers_a_mixture():
+    low = np.exp(norm.ppf((np.arange(30) + 0.5) / 30) * 0.2)
+    high = np.exp(2.0 + norm.ppf((np.arange(15) + 0.5) / 15) * 0.1)
+    scene = on_a_line(*low, *high)
+    labels = GaussianMixture().label(scene, scene.views, np.random.default_rng(0)).labels
+    assert labels == ("near",) * 60 + ("far",) * 30
+
+
+@pytest.mark.parametrize(
+    "distances",
+    [
+        pytest.param((1.0, 1.0, 1.0, 9.0), id="one component without spread"),
+        pytest.param((0.0, 0.0, 1.0, 2.0), id="cameras at the mean"),
+        pytest.param((1e-12, 1.0, 1.1, 1.2, 1.3), id="an outlier at the mean"),
+    ],
+)
+def test_gmm_survives_degenerate_distances(distances):
+    scene = on_a_line(*distances)
+    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
+    assert set(labelling.labels) == {"near", "far"}
+
+
+def test_gmm_falls_back_to_the_median_and_says_so():
+    # The median is zero: no logarithm of these distances makes sense.
+    scene = on_a_line(0.0, 0.0, 0.0, 1.0, 2.0)
+    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
+    radial = Radial().label(scene, scene.views, np.random.default_rng(0))
+    assert labelling.labels == radial.labels
+    assert "degenerate" in labelling.notes[0]
+
+
+def test_gmm_is_not_said_to_be_degenerate_where_it_is_not():
+    scene = hybrid()
+    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
+    assert not any("degenerate" in note for note in labelling.notes)

@@ -1,0 +1,152 @@
+"""Groupings that look at more than positions: footprints, gradients, the user's lists."""
+
+import numpy as np
+import pytest
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.groupings.conflict_signature import (
+    ConflictSignature,
+    mean_cosines,
+    spectral_cut,
+)
+from crossgrad_plugins.groupings.footprint import Footprint, footprint_of
+from crossgrad_plugins.groupings.lists import Lists
+
+RNG = np.random.default_rng(0)
+
+
+def names(*paths):
+    return posed_scene([posed_view((i, 0, 0), path) for i, path in enumerate(paths)])
+
+
+def test_a_footprint_is_the_median_of_focal_length_over_depth():
+    points = [(0, 2, 0), (0, 4, 0), (0, 10, 0), (0, -3, 0)]
+    view = posed_view((0, 0, 0), focal=12.0, seen=(0, 1, 2, 3))
+    assert footprint_of(posed_scene([view], points), view) == pytest.approx(12.0 / 4.0)
+
+
+def test_a_view_that_observed_nothing_takes_the_points_in_its_image():
+    points = [(0, 2, 0), (0, 8, 0), (50, 3, 0), (0, -3, 0)]
+    view = posed_view((0, 0, 0), focal=10.0)
+    assert footprint_of(posed_scene([view], points), view) == pytest.approx(10.0 / 5.0)
+
+
+def test_a_view_of_nothing_at_all_is_a_user_error():
+    view = posed_view((0, 0, 0))
+    with pytest.raises(UserError, match=r"view\.png"):
+        footprint_of(posed_scene([view], [(0, -5, 0)]), view)
+
+
+def test_the_focal_length_decides_at_one_place():
+    views = [posed_view((0, 0, 0), f"{f}.png", focal=f, seen=(0,)) for f in (4.0, 8.0, 16.0, 2.0)]
+    scene = posed_scene(views, [(0, 5, 0)])
+    labels = Footprint().label(scene, scene.views, RNG).labels
+    assert labels == ("far", "near", "near", "far")
+
+
+def test_without_a_probe_the_signature_says_how_to_get_one():
+    scene = names("a.png", "b.png")
+    with pytest.raises(UserError, match="crossgrad diagnose"):
+        ConflictSignature().label(scene, scene.views, RNG)
+
+
+class VectorProbe:
+    """Gradients given as vectors; remembers which views it was asked for."""
+
+    def __init__(self, *vectors):
+        self.blocks = tuple(str(i) for i in range(len(vectors)))
+        self.vectors = [np.array(block, dtype=float) for block in vectors]
+        self.asked = []
+
+    def gramians(self, views):
+        self.asked += list(views)
+        rows = [block[list(views)] for block in self.vectors]
+        return np.stack([row @ row.T for row in rows])
+
+
+def test_the_signature_splits_where_gradients_oppose():
+    probe = VectorProbe([[1, 0], [-1, 0.1], [1, 0.1], [-1, 0]])
+    scene = names("a.png", "b.png", "c.png", "d.png")
+    labels = ConflictSignature().label(scene, scene.views, RNG, probe).labels
+    assert labels[0] == labels[2] != labels[1] == labels[3]
+
+
+def test_the_signature_ignores_lengths_and_zero_gradients():
+    probe = VectorProbe([[1e-9, 0], [-3e7, 0], [2, 0], [0, 0]], [[1, 0], [-1, 0], [1, 0], [-2, 0]])
+    scene = names("a.png", "b.png", "c.png", "d.png")
+    labels = ConflictSignature().label(scene, scene.views, RNG, probe).labels
+    assert labels[0] == labels[2] != labels[1] == labels[3]
+
+
+def test_views_that_were_not_probed_follow_the_nearest_one():
+    probe = VectorProbe([[1.0]] * 5 + [[-1.0]] * 5)
+    scene = names(*(f"{i}.png" for i in range(10)))
+    labels = ConflictSignature(cameras=4).label(scene, scene.views, RNG, probe).labels
+    assert probe.asked == [0, 3, 6, 9]
+    assert labels[:5] == (labels[0],) * 5
+    assert labels[5:] == (labels[9],) * 5
+    assert labels[0] != labels[9]
+
+
+def test_cosines_are_averaged_over_blocks_that_have_them():
+    gramians = np.array([[[1.0, -1.0], [-1.0, 1.0]], [[0.0, 0.0], [0.0, 4.0]]])
+    assert np.allclose(mean_cosines(gramians), [[1.0, -1.0], [-1.0, 1.0]])
+
+
+def test_the_cut_survives_exact_opposition():
+    cosines = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+    sides = spectral_cut(cosines)
+    assert sides[0] == sides[1] != sides[2]
+
+
+def test_folders_are_labels():
+    scene = names("street/1.png", "aerial/1.png", "street/deep/2.png")
+    labelling = Lists().label(scene, scene.views, RNG)
+    assert labelling.labels == ("street", "aerial", "street")
+
+
+def test_one_folder_is_a_user_error():
+    scene = names("a/1.png", "a/2.png")
+    with pytest.raises(UserError, match="CSV"):
+        Lists().label(scene, scene.views, RNG)
+
+
+@pytest.fixture
+def listed(tmp_path):
+    def write(text, *paths):
+        file = tmp_path / "labels.csv"
+        file.write_text(text)
+        scene = names(*paths)
+        return Lists(file=file).label(scene, scene.views, RNG).labels
+
+    return write
+
+
+def test_a_file_names_views_and_folders(listed):
+    text = "# name,label\nnear/,near\nnear/3.png,far\nb.png, far\n\nnear/deep/,low\n"
+    labels = listed(text, "near/1.png", "near/3.png", "b.png", "near/deep/1.png")
+    assert labels == ("near", "far", "far", "low")
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        pytest.param("a.png,near\n", "b.png", id="a view is missing"),
+        pytest.param("a.png,near\nb.png\n", "b.png", id="no label"),
+        pytest.param("a.png,near\nb.png,\n", "b.png", id="an empty label"),
+        pytest.param("a.png,near\na.png,far\nb.png,far\n", "a.png: near, far", id="two labels"),
+        pytest.param("a.png,near\nb.png,near\n", "near", id="one group"),
+    ],
+)
+def test_a_bad_file_is_a_user_error_that_names_the_row(listed, text, found):
+    with pytest.raises(UserError) as error:
+        listed(text, "a.png", "b.png")
+    assert found in error.value.found
+    assert "labels.csv" in error.value.where
+
+
+def test_a_missing_file_is_a_user_error(tmp_path):
+    scene = names("a.png", "b.png")
+    with pytest.raises(UserError, match="cannot be read"):
+        Lists(file=tmp_path / "no.csv").label(scene, scene.views, RNG)
