@@ -154,7 +154,7 @@ def load(folder: Path) -> Checkpoint:
             generators=state["generators"],
             scalars=state["scalars"],
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise damaged(folder, f"{type(error).__name__}: {error}") from error
 
 

@@ -11,7 +11,6 @@ from math import fsum
 import torch
 from torch import Tensor
 
-from crossgrad_core.metrics import psnr, quantise, ssim, ssim_skimage
 from crossgrad_core.scene.types import View
 
 NO_VIEWS = "no held-out views: the split keeps every view for training"
@@ -122,6 +121,8 @@ def summarised(views: Sequence[ViewMetrics]) -> EvaluationResult:
 
 
 def _evaluated(view: View, render: Tensor, lpips: Lpips | None) -> Evaluated:
+    from crossgrad_core.metrics import psnr, quantise, ssim, ssim_skimage
+
     photo, mask = view.photo.image(), view.photo.mask()
     image = quantise(render.detach().cpu().float())
     reference = photo.float() / 255.0

@@ -151,7 +151,7 @@ def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
     valid = (np.abs(cloud.means) <= np.finfo(np.float32).max).all(axis=1)
     valid &= np.isfinite(cloud.logit_opacities)
     for array in (cloud.log_scales, cloud.quats, cloud.sh_dc, cloud.sh_rest):
-        valid &= np.isfinite(array.reshape(len(cloud), -1)).all(axis=1)
+        valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     return valid
 
 

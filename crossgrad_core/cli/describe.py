@@ -5,7 +5,6 @@ from textwrap import fill, indent
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 from crossgrad_core import registry
 from crossgrad_core.component import Component
@@ -37,11 +36,21 @@ def describe(entry: registry.Entry) -> str:
     component = registry.load_entry(entry)
     parts = [
         f"{singular(entry.slot)} {entry.name}\n{_MARGIN}{entry.origin}",
-        indent(inspect.getdoc(component) or "No description.", _MARGIN),
+        indent(_rewrapped(inspect.getdoc(component) or "No description."), _MARGIN),
         "\n".join(f"{_MARGIN}{label}: {text}" for label, text in _traits(component)),
         _options(entry, component),
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def _rewrapped(docstring: str) -> str:
+    """The docstring with its plain paragraphs filled to the width; lists stay as they are."""
+    blocks = docstring.split("\n\n")
+    return "\n\n".join(block if "\n " in block else _filled(block) for block in blocks)
+
+
+def _filled(text: str) -> str:
+    return fill(" ".join(text.split()), _WIDTH - len(_MARGIN))
 
 
 def _traits(component: type[Component]) -> list[tuple[str, str]]:
@@ -50,7 +59,8 @@ def _traits(component: type[Component]) -> list[tuple[str, str]]:
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
             many = isinstance(value, frozenset | tuple)
-            found.append((label, listed(sorted(value)) if many else str(value)))
+            if value:
+                found.append((label, listed(sorted(value)) if many else str(value)))
     return found
 
 
@@ -65,7 +75,7 @@ def _options(entry: registry.Entry, component: type[Component]) -> str:
 
 
 def _option(name: str, field: FieldInfo) -> str:
-    default = "required" if field.default is PydanticUndefined else f"default {field.default!r}"
+    default = "required" if field.is_required() else f"default {field.default}"
     facts = ", ".join([_type_name(field.annotation), default, *_bounds(field.metadata)])
     text = fill(field.description or "no description", _WIDTH - 8)
     return f"{_MARGIN * 2}{name}  ({facts})\n{indent(text, _MARGIN * 4)}"
@@ -73,7 +83,7 @@ def _option(name: str, field: FieldInfo) -> str:
 
 def _type_name(annotation: object) -> str:
     if get_origin(annotation) is Literal:
-        return " | ".join(repr(choice) for choice in get_args(annotation))
+        return " | ".join(str(choice) for choice in get_args(annotation))
     return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 

@@ -23,7 +23,7 @@ def gramian(column: Column, scale: float = 1.0) -> Tensor:
 
 
 def largest(column: Column) -> Tensor:
-    """[K] float64 largest magnitude of each gradient; 0 where absent or empty, NaN if it has one."""
+    """[K] float64 largest magnitude of each gradient; 0 where absent or empty."""
     first = _any(column)
     zero = first.new_zeros((), dtype=torch.float64)
     return torch.stack(
@@ -31,7 +31,7 @@ def largest(column: Column) -> Tensor:
     )
 
 
-def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tensor) -> None:  # noqa: FBT001
+def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tensor) -> None:
     """Writes the weighted sum of a column: in float64 and rounded once, in the order given.
 
     Args:
@@ -40,7 +40,9 @@ def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tens
         plain: Whether to add without weights in the type of the gradients instead.
         out: The result; may be one of the gradients.
     """
-    used = [(w, g.reshape(-1)) for w, g in zip(weights.tolist(), column, strict=True) if g is not None]
+    used = [
+        (w, g.reshape(-1)) for w, g in zip(weights.tolist(), column, strict=True) if g is not None
+    ]
     flat = out.view(-1)
     step = PIECE.get(out.device.type, PIECE["cpu"])
     for start in range(0, flat.numel(), step):
@@ -67,9 +69,10 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     views = len(columns[0])
     total = np.zeros((rows, views, views))
     for column in columns:
-        if rows and any(g is not None for g in column):
-            wide = _stacked(column, rows)
-            total += torch.einsum("knd,lnd->nkl", wide, wide).cpu().numpy()
+        if not rows or all(g is None for g in column):
+            continue
+        for piece, wide in _row_pieces(column, rows):
+            total[piece] += torch.einsum("knd,lnd->nkl", wide, wide).cpu().numpy()
     return total
 
 
@@ -116,11 +119,12 @@ def _pieces(column: Column, scale: float) -> Iterator[Tensor]:
         yield torch.stack(rows)
 
 
-def _stacked(column: Column, rows: int) -> Tensor:
+def _row_pieces(column: Column, rows: int) -> Iterator[tuple[slice, Tensor]]:
+    """Row ranges with [K, n, d] float64 gradients of their rows."""
     first = _any(column)
-    return torch.stack(
-        [
-            (torch.zeros_like(first) if g is None else g).reshape(rows, -1).double()
-            for g in column
-        ]
-    )
+    width = max(first.numel() // rows, 1)
+    step = max(PIECE.get(first.device.type, PIECE["cpu"]) // width, 1)
+    flat = [(torch.zeros_like(first) if g is None else g).reshape(rows, -1) for g in column]
+    for start in range(0, rows, step):
+        piece = slice(start, start + step)
+        yield piece, torch.stack([g[piece].double() for g in flat])

@@ -1,12 +1,16 @@
 """Passes over float32 gradients on the CPU: all tensors of a step in one parallel kernel call."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.gradient_passes import Column
+
+#: Up to this many elements one core is done before the others are awake.
+SMALL: Final = 1 << 17
 
 
 def _addresses(columns: Sequence[Column]) -> NDArray[np.int64]:
@@ -20,6 +24,10 @@ def _sizes(columns: Sequence[Column]) -> NDArray[np.int64]:
     return np.array([max(_size(g) for g in column) for column in columns], np.int64)
 
 
+def _worth_waking(sizes: NDArray[np.int64]) -> bool:
+    return int(sizes.sum()) > SMALL
+
+
 def _size(gradient: Tensor | None) -> int:
     return 0 if gradient is None else gradient.numel()
 
@@ -29,7 +37,9 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
     from crossgrad_core.numba_kernels import dense
 
     sizes = _sizes(columns)
-    return dense.gramians(_addresses(columns), sizes, dense.chunk_table(sizes))
+    kernel = dense.gramians if _worth_waking(sizes) else dense.gramians_serial
+    result: NDArray[np.float64] = kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
+    return result
 
 
 def combine(
@@ -48,12 +58,11 @@ def combine(
     """
     from crossgrad_core.numba_kernels import dense
 
-    sizes = _sizes(columns)
-    # The largest first, except where the order of accumulation is asked for: the place of each
-    # address is the order in which the kernel adds.
+    sizes = np.array([result.numel() for result in out], np.int64)
     places = np.array([result.data_ptr() for result in out], np.int64)
     table = dense.chunk_table(sizes)
-    dense.combine(_addresses(columns), weights, plain, places, sizes, table)
+    kernel = dense.combine if _worth_waking(sizes) else dense.combine_serial
+    kernel(_addresses(columns), weights, plain, places, sizes, table)
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
@@ -70,18 +79,22 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     """[N, K, K] Gramians of the rows of a block's tensors."""
     from crossgrad_core.numba_kernels import rows as kernels
 
-    widths = _sizes(columns) // max(rows, 1)
-    return kernels.row_gramians(_addresses(columns), widths, rows)
+    sizes = _sizes(columns)
+    kernel = kernels.row_gramians if _worth_waking(sizes) else kernels.row_gramians_serial
+    result: NDArray[np.float64] = kernel(_addresses(columns), sizes // max(rows, 1), rows)
+    return result
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
     """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
     from crossgrad_core.numba_kernels import rows as kernels
 
-    width = out.numel() // max(len(weights), 1)
-    if width:
+    sizes = np.array([out.numel()], np.int64)
+    kernel = kernels.row_combine if _worth_waking(sizes) else kernels.row_combine_serial
+    if out.numel():
+        width = out.numel() // len(weights)
         addresses = _addresses([column])[0]
-        kernels.row_combine(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
+        kernel(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
 
 
 def row_overlap(

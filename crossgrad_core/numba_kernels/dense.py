@@ -6,13 +6,17 @@ elements. The work is cut into chunks of `CHUNK` elements whatever the number of
 partial sums are added in the order of the chunks: same input, same bits.
 """
 
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
 import numpy as np
-from numba import carray, njit, prange
+from numba import carray, njit, prange  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from crossgrad_core.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
 from crossgrad_core.numba_kernels.pointers import float32_pointer
 
+Kernel: TypeAlias = Callable[..., Any]
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
@@ -20,6 +24,11 @@ Floats = NDArray[np.float64]
 CHUNK = 4096
 #: Elements of a chunk that a weighted sum works on at a time.
 PIECE = 1024
+
+
+def on_all_cores_and_on_one(function: Kernel) -> tuple[Kernel, Kernel]:
+    """A kernel on all cores, and one without the cost of waking them up: the same bits."""
+    return njit(cache=True, parallel=True)(function), njit(cache=True)(function)
 
 
 @njit(cache=True)
@@ -41,7 +50,8 @@ def chunk_table(sizes: Ints) -> Ints:
 @njit(cache=True, inline="always")
 def row(address: int, start: int, length: int) -> NDArray[np.float32]:
     """Inside kernels: the `length` elements from element `start` of the tensor at `address`."""
-    return carray(float32_pointer(address + 4 * start), (length,))
+    pointer: Any = float32_pointer(address + 4 * start)  # type: ignore[call-arg]
+    return carray(pointer, (length,))
 
 
 @njit(cache=True)
@@ -63,9 +73,7 @@ def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> 
 
 
 @njit(cache=True)
-def _chunk_gramian(
-    addresses: Ints, start: int, length: int, compact: Floats, out: Floats
-) -> None:
+def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, out: Floats) -> None:
     """Upper triangle of one chunk's Gramian; rows of absent views stay as they are (zero)."""
     views = addresses.size
     rows = np.empty(views, np.int64)
@@ -95,20 +103,6 @@ def _chunk_gramian(
             out[places[i], places[j]] = compact[i, j]
 
 
-@njit(cache=True, parallel=True)
-def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
-    """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
-    tensors, views = addresses.shape
-    chunks = table.shape[0]
-    partial = np.zeros((chunks, views, views))
-    for c in prange(chunks):
-        t, start = table[c, 0], table[c, 1]
-        length = min(CHUNK, sizes[t] - start)
-        compact = np.empty((views, views))
-        _chunk_gramian(addresses[t], start, length, compact, partial[c])
-    return _summed(partial, table, tensors)
-
-
 @njit(cache=True)
 def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     """Adds the chunks' Gramians with Neumaier's compensation, and mirrors the upper triangle."""
@@ -132,9 +126,25 @@ def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     return total
 
 
+def _gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+    """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
+    tensors, views = addresses.shape
+    chunks = table.shape[0]
+    partial = np.zeros((chunks, views, views))
+    for c in prange(chunks):
+        t, start = table[c, 0], table[c, 1]
+        length = min(CHUNK, sizes[t] - start)
+        compact = np.empty((views, views))
+        _chunk_gramian(addresses[t], start, length, compact, partial[c])
+    return _summed(partial, table, tensors)
+
+
+gramians, gramians_serial = on_all_cores_and_on_one(_gramians)
+
+
 @njit(cache=True)
 def _weighted(rows: Ints, weights: Floats, count: int, start: int, wide: Floats) -> None:
-    """wide = sum of weights times rows.
+    """Fills `wide` with the sum of weights times rows.
 
     In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
     """
@@ -156,7 +166,7 @@ def _weighted(rows: Ints, weights: Floats, count: int, start: int, wide: Floats)
 
 @njit(cache=True)
 def _plain(rows: Ints, count: int, start: int, narrow: NDArray[np.float32]) -> None:
-    """narrow = rows added in order in float32: the bits of accumulation."""
+    """Fills `narrow` with the rows added in order in float32: the bits of accumulation."""
     n = narrow.size
     a = row(rows[0], start, n)
     if count == 1:
@@ -172,8 +182,39 @@ def _plain(rows: Ints, count: int, start: int, narrow: NDArray[np.float32]) -> N
             narrow[i] += c[i]
 
 
-@njit(cache=True, parallel=True)
-def combine(
+@njit(cache=True)
+def _combine_chunk(
+    addresses: Ints, weights: Floats, plain: bool, out: int, first: int, end: int
+) -> None:
+    views = addresses.size
+    rows = np.empty(views, np.int64)
+    used = np.empty(views)
+    count = 0
+    for k in range(views):
+        if addresses[k] != 0:
+            rows[count] = addresses[k]
+            used[count] = weights[k]
+            count += 1
+    # Results pass through a piece of fast memory, as they may overwrite one of the rows.
+    wide = np.empty(PIECE)
+    narrow = np.empty(PIECE, np.float32)
+    for start in range(first, end, PIECE):
+        length = min(PIECE, end - start)
+        result = row(out, start, length)
+        if count == 0:
+            for i in range(length):
+                result[i] = 0.0
+        elif plain:
+            _plain(rows, count, start, narrow[:length])
+            for i in range(length):
+                result[i] = narrow[i]
+        else:
+            _weighted(rows, used, count, start, wide[:length])
+            for i in range(length):
+                result[i] = np.float32(wide[i])
+
+
+def _combine(
     addresses: Ints, weights: Floats, plain: NDArray[np.bool_], out: Ints, sizes: Ints, table: Ints
 ) -> None:
     """Writes the weighted sums of all tensors, in one pass over all views.
@@ -182,37 +223,17 @@ def combine(
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T] whether to add the rows in float32 in the order of the views instead.
-        out: [T] addresses of the results; one may be that of a view (element-wise, so safe).
+        out: [T] addresses of the results; one may be that of a view.
         sizes: [T].
         table: From `chunk_table`.
     """
-    views = addresses.shape[1]
-    for chunk in prange(table.shape[0]):
-        t, first = table[chunk, 0], table[chunk, 1]
+    for c in prange(table.shape[0]):
+        t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
-        rows = np.empty(views, np.int64)
-        used = np.empty(views)
-        # Results pass through a piece of fast memory, as they may overwrite one of the rows.
-        wide = np.empty(PIECE)
-        narrow = np.empty(PIECE, np.float32)
-        count = 0
-        for k in range(views):
-            if addresses[t, k] != 0:
-                rows[count] = addresses[t, k]
-                used[count] = weights[t, k]
-                count += 1
-        for start in range(first, end, PIECE):
-            length = min(PIECE, end - start)
-            result = row(out[t], start, length)
-            if count == 0:
-                result[:] = 0.0
-            elif plain[t]:
-                _plain(rows, count, start, narrow[:length])
-                result[:] = narrow[:length]
-            else:
-                _weighted(rows, used, count, start, wide[:length])
-                for i in range(length):
-                    result[i] = np.float32(wide[i])
+        _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
+
+
+combine, combine_serial = on_all_cores_and_on_one(_combine)
 
 
 @njit(cache=True)

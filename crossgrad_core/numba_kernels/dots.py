@@ -4,8 +4,6 @@ Sums may be reordered within a call, which lets them run in vector registers. Pr
 numbers are exact in float64, and squares from 1e-90 to 1e77 are neither lost nor infinite there.
 """
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

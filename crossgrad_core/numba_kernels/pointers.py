@@ -6,10 +6,10 @@ from numba import types
 from numba.extending import intrinsic
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def float32_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ANN401
+@intrinsic
+def float32_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ANN401, ARG001
     """Inside kernels: int64 address -> pointer to float32, which `numba.carray` makes an array."""
-    signature = types.CPointer(types.float32)(types.int64)
+    signature = types.CPointer(types.float32)(types.int64)  # type: ignore[no-untyped-call]
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401
         return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))

@@ -7,14 +7,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numba_kernels.dense import Floats, Ints, row
+from crossgrad_core.numba_kernels.dense import Floats, Ints, on_all_cores_and_on_one, row
 
 #: Rows that one task works on.
 ROWS = 2048
 
 
-@njit(cache=True, parallel=True)
-def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
+def _row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
     """[N, K, K] float64 Gramians of the rows of a block of T tensors.
 
     Args:
@@ -47,8 +46,10 @@ def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
     return out
 
 
-@njit(cache=True, parallel=True)
-def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
+row_gramians, row_gramians_serial = on_all_cores_and_on_one(_row_gramians)
+
+
+def _row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
     """Writes sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
 
     Args:
@@ -74,6 +75,9 @@ def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
         result = row(out, first * width, wide.size)
         for j in range(wide.size):
             result[j] = np.float32(wide[j])
+
+
+row_combine, row_combine_serial = on_all_cores_and_on_one(_row_combine)
 
 
 @njit(cache=True)

@@ -146,6 +146,39 @@ def _set_centres(scratch, image, target, target_8bit, is_8bit, box, width):
             scratch[_CENTRE_DIFFERENCE + j] = centre_difference
 
 
+# Loops over views from 0 on, because an index that may be negative keeps LLVM from vectorising.
+
+
+@njit(**_OPTIONS)
+def _fill(array, start, count, value):
+    view = array[start : start + count]
+    for j in range(count):
+        view[j] = value
+
+
+@njit(**_OPTIONS)
+def _copy(destination, start, source, source_start, count):
+    view, values = destination[start : start + count], source[source_start : source_start + count]
+    for j in range(count):
+        view[j] = values[j]
+
+
+@njit(**_OPTIONS)
+def _copy_8bit(destination, start, source, source_start, count):
+    view, values = destination[start : start + count], source[source_start : source_start + count]
+    for j in range(count):
+        view[j] = np.float32(values[j]) / _WHITE
+
+
+@njit(**_OPTIONS)
+def _copy_mask(destination, start, mask, mask_start, pixels):
+    """Each pixel's mask, once per channel, as 0 or 1."""
+    view, values = destination[start : start + _CHANNELS * pixels], mask[mask_start:]
+    for pixel in range(pixels):
+        keep = np.float32(values[pixel])
+        view[3 * pixel], view[3 * pixel + 1], view[3 * pixel + 2] = keep, keep, keep
+
+
 @njit(**_OPTIONS)
 def _load_row(scratch, image, target, target_8bit, is_8bit, mask, is_masked, row, box, height, width):
     """Puts s, d (relative to their centres) and the mask of a row into the rings.
@@ -155,39 +188,32 @@ def _load_row(scratch, image, target, target_8bit, is_8bit, mask, is_masked, row
     first = _CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
     count = _CHANNELS * (box[3] - box[2] + 4 * RADIUS)
     slot = (row & (_SLOTS - 1)) * _STRIDE
+    s, d, keep = _SUM + slot, _DIFFERENCE + slot, _KEEP + slot
     begin, end = 0, 0
     if 0 <= row < height:
         begin, end = max(0, -first), min(count, _CHANNELS * width - first)
-    for j in range(count):
-        scratch[_KEEP + slot + j] = np.float32(begin <= j < end)
-    if is_masked:
-        for j in range(begin, end, _CHANNELS):
-            keep = np.float32(mask[row * width + (first + j) // _CHANNELS])
-            for channel in range(_CHANNELS):
-                scratch[_KEEP + slot + j + channel] = keep
-    # First x and y themselves, 0 outside; the second half of the loop below turns them into s and d.
-    for j in range(begin):
-        scratch[_SUM + slot + j] = _ZERO
-        scratch[_DIFFERENCE + slot + j] = _ZERO
-    for j in range(end, count):
-        scratch[_SUM + slot + j] = _ZERO
-        scratch[_DIFFERENCE + slot + j] = _ZERO
-    source = row * _CHANNELS * width + first
-    for j in range(begin, end):
-        scratch[_SUM + slot + j] = image[source + j]
+    # x and y themselves come first, and are turned into s and d in place.
+    for ring in (s, d, keep):
+        _fill(scratch, ring, begin, _ZERO)
+        _fill(scratch, ring + end, count - end, _ZERO)
+    source = row * _CHANNELS * width + first + begin
+    _copy(scratch, s + begin, image, source, end - begin)
     if is_8bit:
-        for j in range(begin, end):
-            scratch[_DIFFERENCE + slot + j] = np.float32(target_8bit[source + j]) / _WHITE
+        _copy_8bit(scratch, d + begin, target_8bit, source, end - begin)
     else:
-        for j in range(begin, end):
-            scratch[_DIFFERENCE + slot + j] = target[source + j]
+        _copy(scratch, d + begin, target, source, end - begin)
+    if is_masked:
+        pixels = (end - begin) // _CHANNELS
+        _copy_mask(scratch, keep + begin, mask, source // _CHANNELS, pixels)
+    else:
+        _fill(scratch, keep + begin, end - begin, _ONE)
     zero = splat(_ZERO)
     for j in range(0, count, LANES):
-        keep = load(scratch, _KEEP + slot + j)
-        x = where_positive(keep, load(scratch, _SUM + slot + j), zero)
-        y = where_positive(keep, load(scratch, _DIFFERENCE + slot + j), zero)
-        store(scratch, _SUM + slot + j, x + y - load(scratch, _CENTRE_SUM + j))
-        store(scratch, _DIFFERENCE + slot + j, x - y - load(scratch, _CENTRE_DIFFERENCE + j))
+        kept = load(scratch, keep + j)
+        x = where_positive(kept, load(scratch, s + j), zero)
+        y = where_positive(kept, load(scratch, d + j), zero)
+        store(scratch, s + j, x + y - load(scratch, _CENTRE_SUM + j))
+        store(scratch, d + j, x - y - load(scratch, _CENTRE_DIFFERENCE + j))
 
 
 @njit(**_OPTIONS)
@@ -242,10 +268,8 @@ def _ssim_row(scratch, row, columns):
 def _clear_row(scratch, row, columns):
     """Sets a, b, c of a row outside the image to 0."""
     slot = (row & (_SLOTS - 1)) * _STRIDE
-    for j in range(_CHANNELS * (columns + 2 * RADIUS)):
-        scratch[_BY_MEAN + slot + j] = _ZERO
-        scratch[_BY_SUM_VARIANCE + slot + j] = _ZERO
-        scratch[_BY_DIFFERENCE_VARIANCE + slot + j] = _ZERO
+    for ring in (_BY_MEAN, _BY_SUM_VARIANCE, _BY_DIFFERENCE_VARIANCE):
+        _fill(scratch, ring + slot, _CHANNELS * (columns + 2 * RADIUS), _ZERO)
 
 
 @njit(**_OPTIONS)
@@ -272,18 +296,20 @@ def _gradient_row(scratch, row, columns, l1_weight, ssim_weight):
 
 @njit(**_SUM_OPTIONS)
 def _sum(array, start, count):
+    view = array[start : start + count]
     total = 0.0
-    for j in range(start, start + count):
-        total += np.float64(array[j])
+    for j in range(count):
+        total += np.float64(view[j])
     return total
 
 
 @njit(**_SUM_OPTIONS)
 def _sum_absolute(scratch, start, count):
     """Sum of |d| from element `start` of the ring on; the pixel at `start` begins a period."""
+    view, centre = scratch[start : start + count], scratch[_CENTRE_DIFFERENCE:]
     total = 0.0
     for j in range(count):
-        total += np.float64(abs(scratch[start + j] + scratch[_CENTRE_DIFFERENCE + j]))
+        total += np.float64(abs(view[j] + centre[j]))
     return total
 
 
@@ -317,48 +343,30 @@ def _tile(
         if with_gradient and row - RADIUS >= top:
             _gradient_row(scratch, row - RADIUS, columns, l1_weight, ssim_weight)
             destination = ((row - RADIUS) * width + left) * _CHANNELS
-            for j in range(_CHANNELS * columns):
-                gradient[destination + j] = scratch[_LINE + j]
+            _copy(gradient, destination, scratch, _LINE, _CHANNELS * columns)
     return absolute, dissimilarity
-
-
-@njit(**_OPTIONS)
-def _every_nth_tile(
-    first, step, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
-    height, width, l1_weight, ssim_weight, sums,
-):  # fmt: skip
-    """Works on tiles first, first + step, ... with one scratch memory for all of them."""
-    scratch = np.zeros(_SCRATCH, np.float32)
-    down, across = _tile_counts(height, width)
-    rows, columns = (height + down - 1) // down, (width + across - 1) // across
-    for t in range(first, down * across, step):
-        top, left = t // across * rows, t % across * columns
-        box = (top, min(height, top + rows), left, min(width, left + columns))
-        if box[0] < box[1] and box[2] < box[3]:
-            sums[t, 0], sums[t, 1] = _tile(
-                scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient,
-                with_gradient, box, height, width, l1_weight, ssim_weight,
-            )  # fmt: skip
-
-
-@njit(**_OPTIONS)
-def _tile_counts(height, width):
-    """Number of tiles down and across; a function of the image's size alone."""
-    down = (height + _TILE_ROWS - 1) // _TILE_ROWS
-    across = (width + _TILE_COLUMNS - 1) // _TILE_COLUMNS
-    return down, across
 
 
 @njit(parallel=True, **_OPTIONS)
 def _all_tiles(
-    image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
-    height, width, l1_weight, ssim_weight, sums, step,
+    scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
+    height, width, l1_weight, ssim_weight, sums,
 ):  # fmt: skip
+    """Runs every tile; tile t uses row t % step of `scratch` [step, _SCRATCH], step threads at most."""
+    step = scratch.shape[0]
+    down, across = sums.shape[0], sums.shape[1]
+    rows, columns = (height + down - 1) // down, (width + across - 1) // across
     for first in prange(step):
-        _every_nth_tile(
-            np.int64(first), step, image, target, target_8bit, is_8bit, mask, is_masked,
-            gradient, with_gradient, height, width, l1_weight, ssim_weight, sums,
-        )  # fmt: skip
+        for t in range(np.int64(first), down * across, step):
+            top, left = t // across * rows, t % across * columns
+            box = (top, min(height, top + rows), left, min(width, left + columns))
+            if box[0] < box[1] and box[2] < box[3]:
+                absolute, dissimilarity = _tile(
+                    scratch[first], image, target, target_8bit, is_8bit, mask, is_masked, gradient,
+                    with_gradient, box, height, width, l1_weight, ssim_weight,
+                )  # fmt: skip
+                sums[t // across, t % across, 0] = absolute
+                sums[t // across, t % across, 1] = dissimilarity
 
 
 def loss_terms(
@@ -388,10 +396,12 @@ def loss_terms(
             gradient.fill(0)
         return 0.0, 0.0
     count = kept * _CHANNELS
-    down, across = _tile_counts(height, width)
-    sums = np.zeros((down * across, 2))
+    down, across = -(-height // _TILE_ROWS), -(-width // _TILE_COLUMNS)
+    sums = np.zeros((down, across, 2))
+    threads = min(numba.get_num_threads(), down * across)
     is_8bit = target.dtype == np.uint8
     _all_tiles(
+        np.zeros((threads, _SCRATCH), np.float32),
         image.reshape(-1),
         np.empty(0, np.float32) if is_8bit else target.reshape(-1),
         target.reshape(-1) if is_8bit else np.empty(0, np.uint8),
@@ -405,7 +415,6 @@ def loss_terms(
         np.float32((1 - ssim_weight) / count),
         np.float32(ssim_weight / count),
         sums,
-        min(numba.get_num_threads(), len(sums)),
     )
-    absolute, dissimilarity = sums.sum(axis=0) / count
+    absolute, dissimilarity = sums.sum(axis=(0, 1)) / count
     return float(absolute), float(dissimilarity)

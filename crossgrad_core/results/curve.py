@@ -23,6 +23,7 @@ _MARKERS = ("s", "^", "D", "v", "P", "X")
 _STYLES = ("--", "-.", ":")
 #: With more points than this, markers would hide the line.
 _MOST_MARKERS = 25
+_LONGEST_IN_TWO_COLUMNS = 48  # characters of a legend entry
 
 
 class _Line(NamedTuple):
@@ -54,10 +55,12 @@ def draw_curve(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     scored = any(row.get("psnr") is not None for row in rows)
     charts = [("psnr", "PSNR (dB)"), ("ssim", "SSIM")] if scored else [("loss", "training loss")]
-    figure = Figure(figsize=(7.2, 2.4 + 2.6 * len(charts)), dpi=150, layout="constrained")
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.07)  # inches
+    figure = Figure(figsize=(7.5, 2.2 + 2.6 * len(charts)), dpi=150, layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(charts), 1, sharex=True, squeeze=False)[:, 0]
     lines = _lines(rows, views or {}) if scored else [_Line("mean of the step's views", "")]
@@ -68,7 +71,7 @@ def draw_curve(
     axes[-1].set_xlabel("training seconds (compiling, loading and evaluating excluded)")
     _add_view_axis(axes[0], rows)
     _add_legend(figure, axes[0])
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(_literal(title), fontsize=11)
     return _saved(figure, folder / FILE)
 
 
@@ -85,9 +88,17 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
 def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> str:
     """A name with its number of views and its final figures."""
     count = views.get(name)
-    label = name if count is None else f"{name} ({count} view{'s' if count != 1 else ''})"
+    label = _literal(name)
+    if count is not None:
+        label += f" ({count} view{'s' if count != 1 else ''})"
     psnr, ssim = last.get(f"psnr{column}"), last.get(f"ssim{column}")
     return label if psnr is None or ssim is None else f"{label}: {psnr:.2f} dB, {ssim:.3f}"
+
+
+def _literal(text: str) -> str:
+    """Text that matplotlib shows as it is: it hides a leading _ and reads formulas between $."""
+    text = text.replace("$", r"\$")
+    return f"'{text}'" if text.startswith("_") else text
 
 
 def _draw(ax: "Axes", rows: Sequence[Row], metric: str, lines: Sequence[_Line]) -> None:
@@ -132,7 +143,8 @@ def _add_legend(figure: "Figure", ax: "Axes") -> None:
         handles[::-1],
         labels[::-1],
         loc="outside lower left",
-        ncols=2 if len(handles) > 1 else 1,
+        ncols=2 if max(map(len, labels)) <= _LONGEST_IN_TWO_COLUMNS else 1,
+        fontsize=9,
         frameon=False,
         handlelength=3.0,
     )

@@ -55,9 +55,8 @@ def create_run_folder(
     Raises:
         UserError: `out` holds something, the folder cannot be written to, or the disk is too full.
     """
+    check_out(out)
     wanted = out if out is not None else root / name.folder
-    if out is not None:
-        _refuse_used(out)
     if free_bytes(wanted) < needed:
         raise disk_full(wanted, needed)
     with disk_errors(wanted):
@@ -66,6 +65,28 @@ def create_run_folder(
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(b"crossgrad")
     return folder
+
+
+def check_out(out: Path | None) -> None:
+    """Refuses a folder that holds something; makes nothing, so that it can be asked at once.
+
+    Raises:
+        UserError: `out` is a file or is not empty.
+    """
+    if out is None or not out.exists():
+        return
+    if not out.is_dir():
+        raise UserError(
+            "the output folder is a file", where=out, todo="choose another --out, or remove it"
+        )
+    if any(out.iterdir()):
+        raise UserError(
+            "the output folder is not empty, and results are never overwritten",
+            where=out,
+            expected="a new or empty folder",
+            found=", ".join(sorted(path.name for path in out.iterdir())[:4]),
+            todo="choose another --out, or continue that run with --resume",
+        )
 
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
@@ -77,21 +98,6 @@ def expected_bytes(primitives: int, checkpoints: int) -> int:
 def _safe(part: str) -> str:
     """A path component that every file system takes."""
     return _UNSAFE.sub("_", part).strip(".") or "_"
-
-
-def _refuse_used(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise UserError(
-            "the output folder is a file", where=out, todo="choose another --out, or remove it"
-        )
-    if out.is_dir() and any(out.iterdir()):
-        raise UserError(
-            "the output folder is not empty, and results are never overwritten",
-            where=out,
-            expected="a new or empty folder",
-            found=", ".join(sorted(path.name for path in out.iterdir())[:4]),
-            todo="choose another --out, or continue that run with --resume",
-        )
 
 
 def _made(wanted: Path, *, taken: bool) -> Path:

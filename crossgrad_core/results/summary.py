@@ -111,10 +111,11 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
 
 def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
     """Step, training seconds and PSNR of the evaluation with the highest PSNR."""
-    scored = [row for row in rows if row.get("psnr") is not None]
-    if not scored:
+    scored = [(psnr, row) for row in rows if (psnr := row.get("psnr")) is not None]
+    valid = [(psnr, row) for psnr, row in scored if not math.isnan(psnr)]
+    if not valid:
         return None
-    best = max(scored, key=lambda row: row["psnr"] or 0.0)
+    _, best = max(valid, key=lambda pair: pair[0])
     return {name: best[name] for name in ("step", "train_seconds", "psnr", "ssim")}
 
 

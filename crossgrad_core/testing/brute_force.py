@@ -217,10 +217,10 @@ def _cumulative(x: Array) -> Array:
 
 
 def _rotation(quat: Array) -> Array:
-    """[3, 3]: rotates each axis by q v q* of the normalised quaternion wxyz [4]."""
-    w, v = quat[0] / np.linalg.norm(quat), quat[1:] / np.linalg.norm(quat)
-    columns = [e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)]
-    return np.stack(columns, -1)
+    """[3, 3] rotation of a quaternion wxyz [4] of any length, by Rodrigues' formula."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
 
 
 def _colors(gaussians: Gaussians, center: Array) -> Array:

@@ -1,6 +1,7 @@
 """A small scene in memory, and what the seams offer about it."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,7 @@ class NoisePhoto:
         return mask
 
 
+@cache
 def sample_scene(views: int = 12, points: int = 40) -> Scene:
     """A scene of near and far cameras around a small cloud; every fourth view is held out.
 

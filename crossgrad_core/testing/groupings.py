@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
 from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
     Make,
@@ -91,6 +92,7 @@ def same_seed_same_labels(make: Make[Grouping]) -> None:
 
 
 GROUPING_CHECKS: tuple[Check[Grouping], ...] = (
+    *COMPONENT_CHECKS,
     every_view_has_a_declared_label,
     every_group_has_training_views,
     the_rule_is_fitted_on_training_views,

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from crossgrad_core.blocks import BlockKind
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.testing.aggregation import AGGREGATION_CHECKS
+from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
     Make,
@@ -98,11 +100,11 @@ def _gramian_operator(make: Make[Operator]) -> Operator:
     """The operator, where it works on Gramians.
 
     Raises:
-        SkipTest: It has its own `aggregate`.
+        SkipTest: It works on the elements of the gradients: it has its own `aggregate`.
     """
     operator = make()
     if type(operator).aggregate is not Operator.aggregate:
-        raise cannot_tell("it overrides aggregate and need not answer transform")
+        raise cannot_tell("it has its own aggregate and does not work on Gramians")
     return operator
 
 
@@ -255,6 +257,8 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 
 
 OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
+    *COMPONENT_CHECKS,
+    *AGGREGATION_CHECKS,
     matrices_have_the_shape,
     matrices_are_finite,
     one_block_is_enough,

@@ -9,7 +9,7 @@ from crossgrad_core.contexts import Draw
 from crossgrad_core.grouping import Grouping
 from crossgrad_core.registry import build
 from crossgrad_core.sampler import Sampler
-from crossgrad_core.scene.types import Scene
+from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
     Make,
@@ -30,13 +30,8 @@ _PATIENCE = 400
 
 
 @cache
-def _scene() -> Scene:
-    return sample_scene()
-
-
-@cache
 def _groups(grouping: str) -> tuple[str, ...]:
-    scene = _scene()
+    scene = sample_scene()
     rule = cast("Grouping", build("groupings", grouping, {}))
     return rule.label(scene, scene.train_views, np.random.default_rng(0)).labels
 
@@ -44,9 +39,9 @@ def _groups(grouping: str) -> tuple[str, ...]:
 def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
     """A run of the sampler on the sample scene, with the groups that it needs."""
     needed = sampler.default_grouping
-    losses = np.random.default_rng(1).uniform(0.05, 0.3, len(_scene().train)).tolist()
+    losses = np.random.default_rng(1).uniform(0.05, 0.3, len(sample_scene().train)).tolist()
     groups = None if needed is None else _groups(needed)
-    return SamplerRun(sampler, _scene(), groups, views, losses=losses)
+    return SamplerRun(sampler, sample_scene(), groups, views, losses=losses)
 
 
 def usual_views_are_admitted(make: Make[Sampler]) -> None:
@@ -131,6 +126,7 @@ def old_states_stay_untouched(make: Make[Sampler]) -> None:
 
 
 SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
+    *COMPONENT_CHECKS,
     usual_views_are_admitted,
     draws_are_training_views,
     every_view_comes,

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _BALLS = 6
 _WAVES = 8
 _SUPERSAMPLING = 2
+_DISTORTION = {"FOV": 0.4, "EUCM": 0.5}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ def _make_world(rng: np.random.Generator) -> _World:
     radii = rng.uniform(0.15, 0.4, _BALLS)
     xy = rng.uniform(-1.2, 1.2, (_BALLS, 2))
     angles = rng.uniform(0, 2 * np.pi, _WAVES)
-    lengths = np.geomspace(0.6, 4.0, _WAVES)
+    lengths = np.geomspace(1.2, 6.0, _WAVES)
     waves = np.stack([np.cos(angles), np.sin(angles)], 1) * (2 * np.pi / lengths)[:, None]
     return _World(
         centers=np.column_stack([xy, radii]),
@@ -118,9 +119,8 @@ def _make_camera(camera_id: int, model: str, width: int, height: int, focal: flo
     camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height)
     params = np.array(camera.params)
     params[list(camera.principal_point_idxs())] += [1.5, -1.0]
-    extra = list(camera.extra_params_idxs())
-    # Division and unified models are degenerate at 0; they keep their defaults beyond k1.
-    params[extra[:1]] = -0.08 if model != "FOV" else 0.4
+    first_extra = list(camera.extra_params_idxs())[:1]
+    params[first_extra] = _DISTORTION.get(model, -0.08)
     camera.params = params
     return camera
 

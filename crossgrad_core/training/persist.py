@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from crossgrad_core.checkpoint import Checkpoint
 from crossgrad_core.contexts import StepRecord
-from crossgrad_core.optimizer.adam import AdamState
+from crossgrad_core.optimizer import AdamState
 from crossgrad_core.state import Json
 from crossgrad_core.training.rngs import restored_streams, stream_states
 from crossgrad_core.training.setup import Setup

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from crossgrad_core.blocks import Parameters
-from crossgrad_core.optimizer.adam import AdamState
+from crossgrad_core.optimizer import AdamState
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.training.loop import timed_step
@@ -36,7 +36,7 @@ def first_state(setup: Setup) -> TrainState:
         for name, tensor in parameters.items()
     }
     parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
-    return TrainState(parameters=parameters, adam=AdamState.zeros(parameters), rngs=rngs)
+    return TrainState(parameters=parameters, adam=AdamState(), rngs=rngs)
 
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:

@@ -7,7 +7,7 @@ import numpy as np
 
 from crossgrad_core.blocks import Parameters, primitives_of
 from crossgrad_core.contexts import StepRecord
-from crossgrad_core.optimizer.adam import AdamState
+from crossgrad_core.optimizer import AdamState
 from crossgrad_core.state import PluginState
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
@@ -77,7 +77,7 @@ class Snapshot:
         """A deep copy of what training changes. Plugin states are values and need no copy."""
         return cls(
             parameters={name: t.detach().clone() for name, t in state.parameters.items()},
-            adam=state.adam.clone(),
+            adam=copied_moments(state.adam),
             states=dict(state.states),
             step=state.step,
             last=state.last,
@@ -89,9 +89,18 @@ class Snapshot:
             name: t.clone().requires_grad_(state.parameters[name].requires_grad)
             for name, t in self.parameters.items()
         }
-        state.adam = self.adam.clone()
+        state.adam = copied_moments(self.adam)
         state.states = dict(self.states)
         state.step = self.step
         state.last = self.last
         state.rewinds += 1
         state.rngs = make_streams(seed, state.rewinds)
+
+
+def copied_moments(adam: AdamState) -> AdamState:
+    """A deep copy."""
+    return AdamState(
+        exp_avg={name: tensor.clone() for name, tensor in adam.exp_avg.items()},
+        exp_avg_sq={name: tensor.clone() for name, tensor in adam.exp_avg_sq.items()},
+        steps=dict(adam.steps),
+    )

@@ -22,7 +22,7 @@ from crossgrad_core.contexts import (
 from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
 from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.manager import call_seam
-from crossgrad_core.optimizer.adam import adam_step
+from crossgrad_core.optimizer import adam_step
 from crossgrad_core.topology import Edit, NoEdit
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError

@@ -25,7 +25,7 @@ def sections(slot):
 
 def rows(slot):
     """Name -> the other cells of its row in the page's table."""
-    lines = [line for line in PAGES[slot].read_text(encoding="utf-8").splitlines()]
+    lines = PAGES[slot].read_text(encoding="utf-8").splitlines()
     cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines if line[:3] == "| `"]
     return {row[0].strip("`"): row[1:] for row in cells}
 

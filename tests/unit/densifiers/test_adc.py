@@ -37,9 +37,7 @@ def record(gradient, radii, origin=None):
     gaussians = Gaussians(torch.zeros(n, 3), torch.zeros(n, 4), torch.ones(n, 3), torch.ones(n))
     screen = Screen(torch.tensor(radii, dtype=torch.int32), mean_gradient=torch.tensor(gradient))
     view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
-    return ViewRecord(
-        0, view, None, 0.1, replace(gaussians, origin=origin), screen, torch.zeros(3)
-    )
+    return ViewRecord(0, view, None, 0.1, replace(gaussians, origin=origin), screen, torch.zeros(3))
 
 
 def context(views, *, step, params=None, room=100, rng=0):
@@ -75,7 +73,9 @@ def test_statistic_is_the_mean_ndc_norm_over_visible_renders():
 def test_statistics_of_decoded_gaussians_go_to_their_primitives():
     view = record([[1e-5, 0.0]] * 3, [1, 1, 1], origin=torch.tensor([1, 1, 0]))
     params = parameters((0.1, 0.1), (0.5, 0.5))
-    _, state = AdaptiveDensityControl().densify(context([view], step=1, params=params), PluginState())
+    _, state = AdaptiveDensityControl().densify(
+        context([view], step=1, params=params), PluginState()
+    )
     assert state.per_primitive["renders"].tolist() == [1.0, 2.0]
 
 

@@ -279,6 +279,16 @@ def smaller(typing_context: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
+def larger(typing_context: Any, a: Any, b: Any) -> Any:
+    """Returns the larger of each two numbers; `b` where they do not compare."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return _lanes(_lanes, _lanes), emit
+
+
+@intrinsic
 def where(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
     """Returns `a` where the mask is true and `b` elsewhere."""
 

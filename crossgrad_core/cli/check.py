@@ -1,0 +1,109 @@
+"""`crossgrad plugins check`: the report on a package's plugins."""
+
+from collections.abc import Sequence
+from textwrap import fill
+
+from crossgrad_core import registry
+from crossgrad_core.errors import UserError
+from crossgrad_core.slots import GROUPS
+from crossgrad_core.testing.checking import Result, check_entry
+from crossgrad_core.wording import did_you_mean, sentences, singular
+
+_WIDTH = 80
+_INDENT = " " * 6
+
+
+def check_package(package: str) -> tuple[str, bool]:
+    """Checks every plugin of a package.
+
+    Args:
+        package: Name of a distribution, or of an import package that holds plugins.
+
+    Returns:
+        The report in 80 columns, and whether every check passed.
+
+    Raises:
+        UserError: No such package is installed, or it offers no plugin.
+    """
+    found = _entries_of(package)
+    origins = sorted({f"{entry.distribution} {entry.version}" for entry in found})
+    lines, failed = [", ".join(origins)], 0
+    width = max(len(_label(entry)) for entry in found)
+    for entry in found:
+        results = check_entry(entry)
+        failures = [result for result in results if result.failure is not None]
+        failed += bool(failures)
+        lines.append(f"  {_label(entry):<{width}}  {_verdict(results, failures)}")
+        lines += [_reason(result) for result in failures]
+    total = len(found)
+    lines.append(f"{total - failed} of {total} plugins keep the contract of their slot")
+    return "\n".join(lines), failed == 0
+
+
+def _entries_of(package: str) -> list[registry.Entry]:
+    """The plugins of a package by slot and name.
+
+    Raises:
+        UserError: See `check_package`.
+    """
+    offered = [entry for slot in GROUPS for entry in registry.offers(slot)]
+    found = [entry for entry in offered if package in _names_of(entry)]
+    found = found or [
+        entry for entry in offered if _normalized(package) == _normalized(entry.distribution)
+    ]
+    if found:
+        return found
+    known = sorted({entry.distribution for entry in offered})
+    if _is_installed(package):
+        raise UserError(
+            f"package {package!r} offers no plugins",
+            expected=f"entry points in a group such as {GROUPS['operators']}",
+            todo="name them in its pyproject.toml (docs/plugins.md) and install it again",
+        )
+    raise UserError(
+        f"there is no installed package {package!r}",
+        expected=f"a package such as {', '.join(known)}",
+        todo=sentences(did_you_mean(package, known), "install it into this environment with pip"),
+    )
+
+
+def _names_of(entry: registry.Entry) -> tuple[str, str]:
+    """Distribution and import package of an entry."""
+    return entry.distribution, entry.value.partition(":")[0].partition(".")[0].strip()
+
+
+def _normalized(name: str) -> str:
+    """A distribution's name as pip compares it."""
+    return name.lower().replace("_", "-").replace(".", "-")
+
+
+def _is_installed(package: str) -> bool:
+    from importlib.metadata import PackageNotFoundError, distribution
+    from importlib.util import find_spec
+
+    try:
+        distribution(package)
+    except (PackageNotFoundError, ValueError):
+        return package.isidentifier() and find_spec(package) is not None
+    return True
+
+
+def _label(entry: registry.Entry) -> str:
+    return f"{singular(entry.slot)} {entry.name}"
+
+
+def _verdict(results: Sequence[Result], failures: Sequence[Result]) -> str:
+    skipped = sum(result.skipped is not None for result in results)
+    note = f", {skipped} do not apply" if skipped else ""
+    run = len(results) - skipped
+    if failures:
+        return f"FAIL  {len(failures)} of {run} checks{note}"
+    return f"pass  {run} checks{note}"
+
+
+def _reason(result: Result) -> str:
+    """`check: reason`, wrapped and indented below its plugin."""
+    text = f"{result.check}: {result.failure}"
+    return fill(
+        text, _WIDTH, initial_indent="    - ", subsequent_indent=_INDENT, break_long_words=False
+    )

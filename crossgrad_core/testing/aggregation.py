@@ -1,0 +1,143 @@
+"""Contract checks of operators as the training step sees them: from K gradients to one."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from crossgrad_core.blocks import Block, LearningRate
+from crossgrad_core.contexts import AggregateContext, Aggregated
+from crossgrad_core.dense_gradients import DenseViewGradients
+from crossgrad_core.operator import Operator
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    admitted,
+    global_randomness_untouched,
+    require,
+    revived,
+    same_state,
+)
+from crossgrad_core.testing.fixtures import step_fields
+
+_RATE = LearningRate(0.01)
+BLOCKS = (
+    Block("means", ("means",), True, "geometry", _RATE),
+    Block("f_dc", ("f_dc",), True, "appearance", _RATE),
+    Block("net", ("net.weight", "net.bias"), False, "neutral", _RATE),
+)
+_SHAPES = {"means": (5, 3), "f_dc": (5, 1, 3), "net.weight": (4, 2), "net.bias": (4,)}
+
+Gradients = dict[str, Tensor | None]
+
+
+def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
+    """The gradients of K = `views` views: usual ones, conflicting ones, and an untouched block."""
+    rng = np.random.default_rng([views, seed])
+
+    def gradient(shape: tuple[int, ...]) -> Tensor:
+        return torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+
+    found: list[Gradients] = [
+        {name: gradient(shape) for name, shape in _SHAPES.items()} for _ in range(views)
+    ]
+    # The last view does not see the network; for a single view it is seen all the same.
+    if views > 1:
+        found[-1] |= {"net.weight": None, "net.bias": None}
+    return found
+
+
+def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> AggregateContext:
+    """What the seam offers for these gradients."""
+    views = len(gradients)
+    rng = np.random.default_rng(views)
+    return AggregateContext(
+        **step_fields(),
+        gradients=DenseViewGradients(gradients, BLOCKS),
+        losses=rng.uniform(0.05, 0.3, views),
+        labels=tuple(("near", "far")[view % 2] for view in range(views)),
+        distances=rng.uniform(0.2, 1.0, views),
+        reference_distance=0.5,
+        blocks=BLOCKS,
+    )
+
+
+def aggregated(operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggregated:
+    """What the operator answers at the seam."""
+    answer: object = operator.crossgrad_aggregate_gradients(aggregate_context(gradients))
+    if not isinstance(answer, Aggregated):
+        require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
+        raise TypeError
+    return answer
+
+
+def every_tensor_is_answered(make: Make[Operator]) -> None:
+    """The answer holds a finite gradient of the right shape for every tensor."""
+    operator = make()
+    for views in admitted(operator.views):
+        answer = aggregated(operator, sample_gradients(views))
+        names = set(answer.gradients)
+        require(names == set(_SHAPES), f"K = {views}: gradients of {sorted(names)} were answered")
+        for name, shape in _SHAPES.items():
+            _require_gradient(f"K = {views}: the gradient of {name}", answer.gradients[name], shape)
+        good = all(type(count) is int and count >= 0 for count in answer.counts.values())
+        require(good, f"the counts {answer.counts} are not plain numbers")
+
+
+def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]) -> None:
+    require(gradient is not None, f"{what} is missing")
+    if gradient is not None:
+        require(tuple(gradient.shape) == shape, f"{what} has the shape {list(gradient.shape)}")
+        require(gradient.dtype == torch.float32, f"{what} is {gradient.dtype}")
+        require(gradient.isfinite().all(), f"{what} is not finite")
+
+
+def broken_views_are_dropped(make: Make[Operator]) -> None:
+    """A view with a NaN is left out of its block; where all views are broken there is no answer."""
+    operator = make()
+    for views in admitted(operator.views):
+        gradients = sample_gradients(views)
+        gradients[0]["means"] = torch.full(_SHAPES["means"], torch.nan)
+        found = aggregated(operator, gradients).gradients["means"]
+        if views > 1:
+            _require_gradient(f"K = {views}, one view broken: means", found, _SHAPES["means"])
+        for view in gradients:
+            view["means"] = torch.full(_SHAPES["means"], torch.nan)
+        found = aggregated(operator, gradients).gradients["means"]
+        require(found is None, f"K = {views}, all views broken: the gradient is not None")
+
+
+def gradients_stay_untouched(make: Make[Operator]) -> None:
+    """The views' gradients are the same afterwards: diagnostics look at them, too."""
+    operator = make()
+    for views in admitted(operator.views):
+        gradients, copies = sample_gradients(views), sample_gradients(views)
+        aggregated(operator, gradients)
+        for mine, copy in zip(gradients, copies, strict=True):
+            for name, gradient in mine.items():
+                kept = copy[name]
+                same = gradient is None or (kept is not None and torch.equal(gradient, kept))
+                require(same, f"K = {views}: aggregating changes the views' gradients of {name}")
+
+
+def same_seed_same_aggregation(make: Make[Operator]) -> None:
+    """Two calls with one seed give the same bits and states that survive a checkpoint."""
+    for views in admitted(make().views):
+        with global_randomness_untouched():
+            one = aggregated(make(), sample_gradients(views))
+            other = aggregated(make(), sample_gradients(views))
+        for name, gradient in one.gradients.items():
+            again = other.gradients[name]
+            same = gradient is not None and again is not None and torch.equal(gradient, again)
+            require(same, f"K = {views}: two calls with one seed differ in {name}")
+        for name, state in one.states.items():
+            require(same_state(revived(state), other.states[name]), f"K = {views}: states differ")
+
+
+AGGREGATION_CHECKS: tuple[Check[Operator], ...] = (
+    every_tensor_is_answered,
+    broken_views_are_dropped,
+    gradients_stay_untouched,
+    same_seed_same_aggregation,
+)

@@ -1,0 +1,216 @@
+"""Contract checks of backbones: blocks, decoding, gradients, checkpoints, topology edits."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.blocks import Parameters, primitives_of
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
+from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
+from crossgrad_core.topology import Edit, apply_to_parameters
+from crossgrad_core.wording import listed
+
+#: Steps at which decoding is looked at: before the first, early, the last.
+_STEPS = (0, 1, 30_000)
+
+
+def created(backbone: Backbone, seed: int = 0) -> Parameters:
+    """Parameters for the sample scene, ready for the first step."""
+    scene = sample_scene()
+    parameters = backbone.create(scene, np.random.default_rng(seed))
+    return backbone.prepare(parameters, scene, sample_phase(0))
+
+
+def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
+    """Every trained tensor is in exactly one block, per-primitive ones have a row per primitive."""
+    backbone = make()
+    blocks, parameters = backbone.blocks(), created(backbone)
+    names = [block.name for block in blocks]
+    require(len(set(names)) == len(names), f"block names occur twice: {listed(names)}")
+    held = [tensor for block in blocks for tensor in block.tensors]
+    require(len(set(held)) == len(held), f"a tensor is in two blocks: {listed(held)}")
+    missing = sorted(set(held) - set(parameters))
+    require(not missing, f"blocks hold tensors that create() does not make: {listed(missing)}")
+    trained = {name for name, tensor in parameters.items() if tensor.requires_grad}
+    loose = sorted(trained - set(held))
+    require(not loose, f"trained tensors that are in no block: {listed(loose)}")
+    rows = primitives_of(blocks, parameters)
+    for block in blocks:
+        single = len(block.tensors) > 1 or block.tensors[0] == block.name
+        require(single, f"the single-tensor block {block.name} does not carry its tensor's name")
+        for name in block.tensors if block.per_primitive else ():
+            found = parameters[name].shape[0]
+            require(found == rows, f"{name} has {found} rows for {rows} primitives")
+
+
+def created_from_the_scene(make: Make[Backbone]) -> None:
+    """Parameters are finite float32 leaves on the CPU, the same for the same seed."""
+    with global_randomness_untouched():
+        one, other = created(make()), created(make())
+    require(primitives_of(make().blocks(), one) > 0, "create() makes no primitives")
+    for name, tensor in one.items():
+        good = tensor.is_leaf and tensor.device.type == "cpu" and tensor.dtype == torch.float32
+        require(good or not tensor.requires_grad, f"{name} is no float32 leaf on the CPU")
+        require(tensor.isfinite().all(), f"{name} is not finite")
+        require(torch.equal(tensor, other[name]), f"{name} differs between two calls with one seed")
+
+
+def decoding_has_the_shape(make: Make[Backbone]) -> None:
+    """Decoding gives valid Gaussians at every step, in training and out of it."""
+    backbone = make()
+    parameters = created(backbone)
+    rows = primitives_of(backbone.blocks(), parameters)
+    for step in _STEPS:
+        for training in (True, False):
+            phase = sample_phase(step, training=training)
+            _require_valid(backbone.decode(parameters, sample_camera(), phase), rows)
+
+
+def _require_valid(gaussians: Gaussians, primitives: int) -> None:
+    number = len(gaussians)
+    shapes = {"means": (number, 3), "quats": (number, 4), "scales": (number, 3)}
+    for name, shape in {**shapes, "opacities": (number,)}.items():
+        tensor: Tensor = getattr(gaussians, name)
+        require(tuple(tensor.shape) == shape, f"{name} has the shape {list(tensor.shape)}")
+        require(tensor.isfinite().all(), f"{name} is not finite")
+    require((gaussians.scales > 0.0).all(), "a scale is not positive")
+    inside = (gaussians.opacities >= 0.0).all() and (gaussians.opacities <= 1.0).all()
+    require(inside, "an opacity is outside [0, 1]")
+    one = (gaussians.colors is None) != (gaussians.sh_dc is None)
+    require(one, "exactly one of colors and sh_dc must be given")
+    origin = gaussians.origin
+    if origin is None:
+        require(number == primitives, f"{number} Gaussians of {primitives} primitives, no origin")
+    else:
+        good = origin.dtype == torch.int64 and tuple(origin.shape) == (number,)
+        require(good, "origin is not [N] int64")
+        within = number == 0 or (int(origin.min()) >= 0 and int(origin.max()) < primitives)
+        require(within, f"origin leaves 0 .. {primitives - 1}")
+
+
+def gradients_reach_every_block(make: Make[Backbone]) -> None:
+    """What is decoded over all views depends on every block that is trained."""
+    backbone = make()
+    parameters = created(backbone)
+    for view in sample_scene().train_views:
+        gaussians = backbone.decode(parameters, view.camera, sample_phase())
+        _weighted(gaussians).backward()  # type: ignore[no-untyped-call]
+    for block in backbone.blocks():
+        gradients = [parameters[name].grad for name in block.tensors]
+        reached = any(gradient is not None and gradient.any() for gradient in gradients)
+        frozen = block.lr.initial == 0.0
+        require(reached or frozen, f"no gradient reaches block {block.name} (lr {block.lr})")
+        for gradient in gradients:
+            finite = gradient is None or gradient.isfinite().all()
+            require(finite, f"the gradient of block {block.name} is not finite")
+
+
+def _weighted(gaussians: Gaussians) -> Tensor:
+    """A sum over everything decoded in which no two numbers count alike."""
+    names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+    tensors = [getattr(gaussians, name) for name in names]
+    given = [tensor.flatten() for tensor in tensors if tensor is not None]
+    flat = torch.cat(given)
+    weighted: Tensor = (flat * torch.linspace(0.5, 1.5, flat.numel())).sum()
+    return weighted
+
+
+def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
+    """Parameters that were written and read decode to the same bits."""
+    backbone = make()
+    parameters = created(backbone)
+    written = save({name: tensor.detach().contiguous() for name, tensor in parameters.items()})
+    phase = sample_phase(training=False)
+    one = backbone.decode(parameters, sample_camera(), phase)
+    other = make().decode(load(written), sample_camera(), phase)
+    for name in ("means", "quats", "scales", "opacities"):
+        same = torch.equal(getattr(one, name), getattr(other, name))
+        require(same, f"{name} differs after a checkpoint; keep everything in the parameters")
+
+
+def edits_keep_rows_together(make: Make[Backbone]) -> None:
+    """After an edit every row of every per-primitive tensor is still the same primitive's."""
+    backbone = make()
+    before = created(backbone)
+    rows = primitives_of(backbone.blocks(), before)
+    # Drops the last two primitives, repeats the first two at the end, turns the rest around.
+    source = torch.cat([torch.arange(rows - 3, -1, -1), torch.tensor([0, 1])])
+    after = _edited(backbone, before, source)
+    for block in backbone.blocks():
+        for name in block.tensors if block.per_primitive else ():
+            same = torch.equal(after[name], before[name][source])
+            require(same, f"prepare() changes the trained tensor {name} after an edit")
+    _require_valid(backbone.decode(after, sample_camera(), sample_phase()), rows)
+
+
+def few_primitives_are_no_error(make: Make[Backbone]) -> None:
+    """One primitive, and none, can be prepared and decoded: density control may go so far."""
+    backbone = make()
+    parameters = created(backbone)
+    for rows in (1, 0):
+        left = _edited(backbone, parameters, torch.arange(rows))
+        _require_valid(backbone.decode(left, sample_camera(), sample_phase()), rows)
+
+
+def _edited(backbone: Backbone, parameters: Parameters, source: Tensor) -> Parameters:
+    new = apply_to_parameters(Edit(source=source), backbone.blocks(), parameters)
+    return backbone.prepare(new, sample_scene(), sample_phase())
+
+
+def parameters_stay_untouched(make: Make[Backbone]) -> None:
+    """Decoding and baking change no parameter."""
+    backbone = make()
+    parameters = created(backbone)
+    copies = {name: tensor.detach().clone() for name, tensor in parameters.items()}
+    backbone.decode(parameters, sample_camera(), sample_phase())
+    backbone.bake(parameters, sample_phase(training=False), sample_camera())
+    _require_equal(parameters, copies)
+
+
+def _require_equal(parameters: Mapping[str, Tensor], copies: Mapping[str, Tensor]) -> None:
+    for name, tensor in parameters.items():
+        require(torch.equal(tensor.detach(), copies[name]), f"decoding or baking changes {name}")
+
+
+def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
+    """What is written to a PLY are Gaussians with spherical harmonics, without a graph."""
+    backbone = make()
+    baked = backbone.bake(created(backbone), sample_phase(training=False), sample_camera())
+    require(baked.sh_dc is not None and baked.colors is None, "bake() does not give sh_dc")
+    require(not baked.means.requires_grad, "bake() gives tensors with a graph")
+    require(len(baked) > 0, "bake() gives no Gaussians")
+    finite = all(getattr(baked, name).isfinite().all() for name in ("means", "quats", "scales"))
+    require(finite, "bake() gives Gaussians that are not finite")
+
+
+def fitting_respects_the_user(make: Make[Backbone]) -> None:
+    """`fitted_to` says what it left out and changes no option that the user set."""
+    backbone = make()
+    fitted, notes = backbone.fitted_to(sample_scene())
+    told = fitted == backbone or len(notes) > 0
+    require(told, "fitted_to() changes options and says nothing about it")
+    asked = type(backbone).model_validate(backbone.model_dump())
+    require(
+        asked.fitted_to(sample_scene())[0] == asked, "fitted_to() changes options that were set"
+    )
+
+
+BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
+    *COMPONENT_CHECKS,
+    blocks_cover_the_parameters,
+    created_from_the_scene,
+    decoding_has_the_shape,
+    gradients_reach_every_block,
+    checkpoints_give_the_same_gaussians,
+    edits_keep_rows_together,
+    few_primitives_are_no_error,
+    parameters_stay_untouched,
+    baking_gives_plain_gaussians,
+    fitting_respects_the_user,
+)

@@ -1,0 +1,216 @@
+"""Contract checks of rasterizers: shapes, gradients, statistics, the common rule set."""
+
+from dataclasses import fields, replace
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.gaussians import Gaussians, Render
+from crossgrad_core.rasterizer import Rasterizer
+from crossgrad_core.registry import build
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
+from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_camera, sample_gaussians
+
+#: Largest difference of a pixel from the reference: a few Gaussians at the edge of their footprint.
+_PIXEL = 0.02
+#: Largest mean difference of pixels, and relative difference of gradients, from the reference.
+_MEAN, _GRADIENT = 2e-4, 2e-2
+_ROUNDING = 1e-4
+
+
+def _device(rasterizer: Rasterizer) -> torch.device:
+    """Where the checks run.
+
+    Raises:
+        SkipTest: The rasterizer needs a device that is not there.
+    """
+    if "cpu" in rasterizer.devices:
+        return torch.device("cpu")
+    if "cuda" in rasterizer.devices and torch.cuda.is_available():
+        return torch.device("cuda")
+    raise cannot_tell(f"it needs one of the devices {sorted(rasterizer.devices)}")
+
+
+def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The tensors that are given, by name."""
+    found = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+
+
+def _moved(gaussians: Gaussians, device: torch.device) -> Gaussians:
+    """Copies on a device, as leaves with gradients."""
+    leaves: dict[str, Any] = {
+        name: tensor.detach().clone().to(device).requires_grad_()
+        for name, tensor in _tensors(gaussians).items()
+    }
+    return replace(gaussians, **leaves)
+
+
+def _drawn(
+    rasterizer: Rasterizer, gaussians: Gaussians, level: float = 0.0, *, backward: bool = False
+) -> Render:
+    """A render with all optional outputs over a grey background, and its backward pass."""
+    background = torch.full((3,), level, device=gaussians.means.device)
+    render = rasterizer.render(gaussians, sample_camera(), background, rasterizer.provides)
+    if backward:
+        _backward(_loss(render))
+    return render
+
+
+def _loss(render: Render) -> Tensor:
+    """A weighted sum of the image in which no two pixels count alike."""
+    weights = torch.linspace(0.5, 1.5, render.image.numel()).reshape(render.image.shape)
+    return (render.image * weights.to(render.image)).sum()
+
+
+def _backward(loss: Tensor) -> None:
+    loss.backward()  # type: ignore[no-untyped-call]
+
+
+def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
+    found = None if tensor is None else list(tensor.shape)
+    require(found == list(expected), f"{name} has the shape {found}, expected {list(expected)}")
+
+
+def renders_have_the_shape(make: Make[Rasterizer]) -> None:
+    """Image [H, W, 3], alpha [H, W], radii [N] int32, and each optional output that it provides."""
+    rasterizer = make()
+    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    render = _drawn(rasterizer, gaussians)
+    _shape("image", render.image, HEIGHT, WIDTH, 3)
+    _shape("alpha", render.alpha, HEIGHT, WIDTH)
+    _shape("screen.radii", render.screen.radii, len(gaussians))
+    require(render.screen.radii.dtype == torch.int32, "screen.radii is not int32")
+    require(render.image.dtype == torch.float32, "float32 Gaussians give another type of image")
+    if "depth" in rasterizer.provides:
+        _shape("depth", render.depth, HEIGHT, WIDTH)
+    if "pixels" in rasterizer.provides:
+        _shape("screen.pixels", render.screen.pixels, len(gaussians))
+
+
+def the_background_shows_through(make: Make[Rasterizer]) -> None:
+    """A pixel is the blend plus (1 - alpha) times the background."""
+    rasterizer = make()
+    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    black, white = _drawn(rasterizer, gaussians), _drawn(rasterizer, gaussians, 1.0)
+    error = (white.image - black.image - (1.0 - black.alpha)[..., None]).detach().abs().max()
+    require(error < _ROUNDING, f"the background enters with an error of {float(error):.2g}")
+    inside = (black.alpha >= 0.0).all() and (black.alpha <= 1.0).all()
+    require(inside, "alpha leaves [0, 1]")
+
+
+def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
+    """No Gaussians, or none in front of the camera, give the background and radius 0."""
+    rasterizer = make()
+    device = _device(rasterizer)
+    some = _moved(sample_gaussians(), device)
+    behind = 2.0 * sample_camera().center.to(device).float()
+    for gaussians, what in (
+        (_moved(sample_gaussians(0), device), "no Gaussians"),
+        (replace(some, means=(some.means.detach() + behind).requires_grad_()), "all behind"),
+    ):
+        render = _drawn(rasterizer, gaussians, 0.25)
+        require((render.image == 0.25).all(), f"{what}: the image is not the background")  # noqa: PLR2004
+        require((render.alpha == 0.0).all(), f"{what}: alpha is not 0")
+        require((render.screen.radii == 0).all(), f"{what}: a radius is not 0")
+
+
+def gradients_reach_every_input(make: Make[Rasterizer]) -> None:
+    """Every tensor of the Gaussians gets a finite gradient that is not all zero."""
+    rasterizer = make()
+    for harmonics in (False, True):
+        gaussians = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
+        _drawn(rasterizer, gaussians, backward=True)
+        for name, tensor in _tensors(gaussians).items():
+            gradient = tensor.grad
+            require(gradient is not None, f"{name} gets no gradient")
+            if gradient is not None:
+                require(gradient.isfinite().all(), f"the gradient of {name} is not finite")
+                require(gradient.any(), f"the gradient of {name} is zero")
+
+
+def statistics_are_filled(make: Make[Rasterizer]) -> None:
+    """The backward pass fills the screen statistics that density control reads."""
+    rasterizer = make()
+    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    screen = _drawn(rasterizer, gaussians, backward=True).screen
+    number = len(gaussians)
+    visible = screen.radii > 0
+    require(visible.any(), "no Gaussian in front of the camera has a radius")
+    _shape("screen.mean_gradient", screen.mean_gradient, number, 2)
+    if screen.mean_gradient is not None:
+        require(screen.mean_gradient[visible].any(), "screen.mean_gradient is zero")
+        unseen = screen.mean_gradient[~visible]
+        require(not unseen.any(), "screen.mean_gradient of an invisible Gaussian is not zero")
+    if "abs_gradient" in rasterizer.provides:
+        _shape("screen.abs_gradient", screen.abs_gradient, number, 2)
+        if screen.abs_gradient is not None and screen.mean_gradient is not None:
+            short = screen.mean_gradient.abs() - screen.abs_gradient
+            scale = screen.abs_gradient.max()
+            require(
+                short.max() <= _ROUNDING * scale, "screen.abs_gradient is below |mean_gradient|"
+            )
+    if "pixels" in rasterizer.provides and screen.pixels is not None:
+        require((screen.pixels[~visible] == 0).all(), "an invisible Gaussian has pixels")
+        require((screen.pixels[visible] > 0).any(), "no visible Gaussian has pixels")
+
+
+def same_input_same_bits(make: Make[Rasterizer]) -> None:
+    """Two renders and their gradients are equal to the last bit, and inputs stay as they were."""
+    results = []
+    original = sample_gaussians(harmonics=True)
+    for _ in range(2):
+        rasterizer = make()
+        gaussians = _moved(original, _device(rasterizer))
+        render = _drawn(rasterizer, gaussians, backward=True)
+        gradients = {name: tensor.grad for name, tensor in _tensors(gaussians).items()}
+        results.append({"image": render.image.detach(), "alpha": render.alpha, **gradients})
+        for name, tensor in _tensors(gaussians).items():
+            same = torch.equal(tensor.detach().cpu(), _tensors(original)[name].detach())
+            require(same, f"rendering changes the Gaussians' {name}")
+    for name, one in results[0].items():
+        other = results[1][name]
+        same = one is not None and other is not None and torch.equal(one, other)
+        require(same, f"two renders of one input differ in {name}")
+
+
+def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
+    """Image and gradients agree with rasterizer `torch`, the readable form of the rule set."""
+    rasterizer = make()
+    shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
+    reference = cast("Rasterizer", build("rasterizers", "torch", shared))
+    for harmonics in (False, True):
+        ours = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
+        theirs = _moved(sample_gaussians(harmonics=harmonics), torch.device("cpu"))
+        image = _drawn(rasterizer, ours, backward=True).image.detach().cpu()
+        expected = _drawn(reference, theirs, backward=True).image.detach()
+        error = (image - expected).abs()
+        require(
+            error.max() < _PIXEL and error.mean() < _MEAN,
+            f"pixels differ from the reference by up to {float(error.max()):.2g}, "
+            f"{float(error.mean()):.2g} in the mean",
+        )
+        for name, tensor in _tensors(theirs).items():
+            _same_gradient(name, _tensors(ours)[name].grad, tensor.grad)
+
+
+def _same_gradient(name: str, ours: Tensor | None, theirs: Tensor | None) -> None:
+    if ours is None or theirs is None:
+        require(ours is theirs, f"the gradient of {name} is missing")
+        return
+    error = float((ours.cpu() - theirs).norm() / theirs.norm())
+    require(error < _GRADIENT, f"the gradient of {name} is {error:.2g} off the reference's")
+
+
+RASTERIZER_CHECKS: tuple[Check[Rasterizer], ...] = (
+    *COMPONENT_CHECKS,
+    renders_have_the_shape,
+    the_background_shows_through,
+    nothing_to_draw_is_no_error,
+    gradients_reach_every_input,
+    statistics_are_filled,
+    same_input_same_bits,
+    the_reference_draws_the_same,
+)

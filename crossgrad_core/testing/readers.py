@@ -1,0 +1,52 @@
+"""Contract checks of readers: what every reader does with folders that it cannot read."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.reader import Reader
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, ContractError, Make, require
+
+
+def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
+    """`accepts` says no to a folder that is empty, missing, or a file; it never raises."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "notes.txt"
+        for path, what in ((Path(folder), "an empty"), (Path(folder) / "gone", "a missing")):
+            require(make().accepts(path) is False, f"accepts() takes {what} folder")
+        file.write_text("no scene")
+        require(make().accepts(file) is False, "accepts() takes a text file")
+
+
+def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
+    """Reading a folder that is no scene ends in a UserError that says what is missing."""
+    with TemporaryDirectory() as folder:
+        for path in (Path(folder), Path(folder) / "gone"):
+            try:
+                make().read(path, SceneOptions.model_validate({}))
+            except UserError:
+                continue
+            except Exception as error:
+                raise ContractError(f"reading {path} raises {error!r}, not a UserError") from error
+            raise ContractError(f"reading {path}, which is no scene, raises nothing")
+
+
+def folders_stay_as_they_are(make: Make[Reader]) -> None:
+    """Neither `accepts` nor a failed `read` writes into the folder."""
+    with TemporaryDirectory() as folder:
+        make().accepts(Path(folder))
+        try:
+            make().read(Path(folder), SceneOptions.model_validate({}))
+        except UserError:
+            left = sorted(path.name for path in Path(folder).iterdir())
+            require(not left, f"the reader leaves files behind: {left}")
+
+
+READER_CHECKS: tuple[Check[Reader], ...] = (
+    *COMPONENT_CHECKS,
+    foreign_folders_are_not_accepted,
+    foreign_folders_are_a_user_error,
+    folders_stay_as_they_are,
+)

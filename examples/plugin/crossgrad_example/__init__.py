@@ -1,0 +1,1 @@
+"""An operator, a sampler and a hook wrapper for crossgrad."""

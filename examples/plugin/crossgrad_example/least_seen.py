@@ -1,0 +1,23 @@
+"""The views that were rendered least often come first."""
+
+from typing import ClassVar, cast
+
+import numpy as np
+from typing_extensions import override
+
+from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler
+
+
+class LeastSeen(Sampler):
+    """Draws the K training views that were rendered least often, ties at random."""
+
+    default_views: ClassVar[int] = 2
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        number = len(context.scene.train)
+        seen = np.array(cast("list[int]", state.values.get("seen", [0] * number)))
+        order = np.lexsort((context.rng.random(number), seen))
+        views = tuple(int(view) for view in order[: context.views_per_step])
+        seen[list(views)] += 1
+        return Draw(views), PluginState({"seen": seen.tolist()})

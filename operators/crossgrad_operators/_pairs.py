@@ -1,0 +1,43 @@
+"""What the pairwise projections share."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.operator import OperatorContext
+
+
+def slot_order(views: int) -> NDArray[np.int64]:
+    """[K, K] partners of each view in the order of their slots."""
+    return np.tile(np.arange(views), (views, 1))
+
+
+def random_order(views: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """[K, K] partners of each view in random order; nothing is drawn where there is one partner."""
+    order = slot_order(views)
+    return order if views <= 2 else rng.permuted(order, axis=1)  # noqa: PLR2004
+
+
+def project(
+    gramians: NDArray[np.float64],
+    context: OperatorContext,
+    order: NDArray[np.int64],
+    *,
+    gates: NDArray[np.bool_] | None = None,
+    threshold: float = 0.0,
+    strength: float = 1.0,
+) -> NDArray[np.float64]:
+    """[B, K, K] matrices that project each gradient against the others where they conflict.
+
+    Args:
+        gramians: [B, K, K].
+        context: Tells which views are present.
+        order: [K, K] for each view the order of its partners.
+        gates: [B, K, K] which pairs may be projected; all by default.
+        threshold: Only cosines below minus this count as a conflict.
+        strength: The share of the conflicting component that is taken away.
+    """
+    from crossgrad_operators.numba_kernels.projection import projected
+
+    if gates is None:
+        gates = np.ones(gramians.shape, np.bool_)
+    return projected(gramians, context.present, order, gates, threshold, strength)

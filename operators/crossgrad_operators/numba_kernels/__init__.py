@@ -1,0 +1,1 @@
+"""Small exact solvers, batched over Gramians, in float64."""

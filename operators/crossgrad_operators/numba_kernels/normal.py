@@ -1,0 +1,51 @@
+"""Gramians as norms and cosines, which no ratio of norms can spoil."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+#: Two directions with 1 + cos up to this count as exactly opposite: what is left of them after a
+#: projection is rounding noise, which a scale-free optimizer would follow.
+OPPOSITE = 1e-12
+
+
+@njit(cache=True)
+def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
+    """Fills norms [K] and cosines [K, K] of one Gramian; zero for views that are not present."""
+    views = present.size
+    for k in range(views):
+        norms[k] = np.sqrt(gramian[k, k]) if present[k] else 0.0
+    for i in range(views):
+        cosines[i, i] = 1.0 if present[i] else 0.0
+        for j in range(i):
+            c = 0.0
+            if present[i] and present[j]:
+                c = min(max(gramian[i, j] / norms[i] / norms[j], -1.0), 1.0)
+            cosines[i, j] = c
+            cosines[j, i] = c
+
+
+@njit(cache=True)
+def form(a: Floats, cosines: Floats, b: Floats) -> float:
+    """a^T C b."""
+    total = 0.0
+    for i in range(a.size):
+        if a[i] != 0.0:
+            inner = 0.0
+            for j in range(b.size):
+                inner += cosines[i, j] * b[j]
+            total += a[i] * inner
+    return total
+
+
+@njit(cache=True)
+def times(cosines: Floats, j: int, b: Floats) -> float:
+    """(C b)_j."""
+    total = 0.0
+    for k in range(b.size):
+        total += cosines[j, k] * b[k]
+    return total

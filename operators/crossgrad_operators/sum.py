@@ -1,0 +1,43 @@
+"""The plain sum of the views' gradients."""
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.contexts import AggregateContext, Aggregated
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+
+
+class Sum(Operator):
+    """u = sum of g_k: what one backward pass through the summed losses gives.
+
+    Needs no Gramian and no separate gradients; both ways lead to the same bits.
+    """
+
+    separate: ClassVar[bool] = False
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        blocks, views, _ = gramians.shape
+        return np.broadcast_to(np.eye(views), (blocks, views, views)), state
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[Aggregated, PluginState]:
+        gradients = context.gradients
+        finite, present = gradients.finite("tensor"), gradients.present("tensor")
+        counts = {
+            "zero": int((finite & ~present).any(axis=1).sum()),
+            "dropped": int((~finite).any(axis=1).sum()),
+        }
+        return Aggregated(gradients.total(), counts), state

@@ -1,0 +1,275 @@
+"""Lists of the records that reach each tile, front to back.
+
+The tiles of a record are found in the order of the records, which is that of memory, and kept in
+consecutive slots; the tile lists are then filled in the order of depth.
+"""
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    CHUNK,
+    LOG_OPACITY,
+    RECORD,
+    ROW_DECAY,
+    SLOPE,
+    SPARE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TOUCH,
+    U_PART,
+    U_WHOLE,
+    V_PART,
+    V_WHOLE,
+    WIDTH,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.simd import (
+    LANES,
+    Lanes,
+    broadcast,
+    fma,
+    fnma,
+    larger,
+    prefetch,
+    ramp,
+    round_down,
+    round_up,
+    smaller,
+    splat,
+    square_root,
+    store,
+    where,
+)
+
+#: Parts into which the chunks are divided for counting; fixed, so as not to depend on the threads.
+PARTS = 16
+
+#: Records ahead for which memory is asked: first the slot numbers, then the slots.
+_FAR, _NEAR = 32, 16
+
+#: What filing needs to know of a record.
+FIRST_SLOT, SLOTS, FIRST_ROW, LAST_ROW = 0, 1, 2, 3
+SHELF = 4
+
+
+@kernel
+def collect(
+    drawn: NDArray[np.int64],
+    room: NDArray[np.int64],
+    depths: NDArray[np.float64],
+    shelves: NDArray[np.int32],
+) -> tuple[NDArray[np.int32], NDArray[np.float64], int]:
+    """Closes the gaps between chunks.
+
+    Args:
+        drawn: [chunks] records per chunk.
+        room: [chunks] slots per chunk.
+        depths: [N] per record.
+        shelves: [N, SHELF] per record; the first slots are made global.
+
+    Returns:
+        The records drawn [M], their depths [M] and the number of slots.
+    """
+    total = drawn.sum()
+    items = np.empty(total, np.int32)
+    keys = np.empty(total, np.float64)
+    k = 0
+    first_slot = 0
+    for chunk in range(drawn.shape[0]):
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            items[k] = j
+            keys[k] = depths[j]
+            shelves[j, FIRST_SLOT] += first_slot
+            k += 1
+        first_slot += room[chunk]
+    return items, keys, first_slot
+
+
+@device
+def _tile(position: Lanes, size: int) -> Lanes:
+    """Returns the tile that holds a pixel."""
+    return round_down(position * splat(np.float32(1.0 / size)))
+
+
+@device
+def _spans(
+    at: int,
+    first_row: int,
+    records: NDArray[np.float32],
+    begins: NDArray[np.float32],
+    ends: NDArray[np.float32],
+) -> None:
+    """Writes the first and last tile reached in eight rows of tiles (first > last: none).
+
+    The ends of an ellipse's rows form concave curves. Between two rows of pixels their extremes
+    lie at the ellipse's leftmost and rightmost point or in the row nearest to it.
+    """
+    zero = splat(np.float32(0.0))
+    half = splat(np.float32(0.5))
+    # Pixel centres are at whole numbers here.
+    u = broadcast(records, at + U_WHOLE) + (broadcast(records, at + U_PART) - half)
+    v = broadcast(records, at + V_WHOLE) + (broadcast(records, at + V_PART) - half)
+    slope = broadcast(records, at + SLOPE)
+    row_decay = broadcast(records, at + ROW_DECAY)
+    width = broadcast(records, at + WIDTH)
+    budget = broadcast(records, at + LOG_OPACITY) + splat(SPARE - TOUCH)
+    # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
+    extent_y = square_root(budget / row_decay)
+    lean = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
+    row = ramp() + splat(np.float32(first_row))
+    top = row * splat(np.float32(TILE_HEIGHT))
+    bottom = smaller(top + splat(np.float32(TILE_HEIGHT - 1)), round_down(v + extent_y)) - v
+    top = larger(top, round_up(v - extent_y)) - v
+    left = smaller(larger(zero - lean, top), bottom)
+    right = smaller(larger(lean, top), bottom)
+    left_extent = square_root(larger(fnma(row_decay * left, left, budget) * width, zero))
+    right_extent = square_root(larger(fnma(row_decay * right, right, budget) * width, zero))
+    first = round_up(fma(slope, left, u) - left_extent)
+    last = round_down(fma(slope, right, u) + right_extent)
+    empty = splat(np.float32(-1.0))
+    store(begins, 0, _tile(first, TILE_WIDTH))
+    store(ends, 0, where((top <= bottom) & (first <= last), _tile(last, TILE_WIDTH), empty))
+
+
+@device
+def _find(
+    j: int,
+    tile_columns: int,
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+    first_slot: int,
+    tile_of_slot: NDArray[np.int32],
+    counts: NDArray[np.int32],
+    begins: NDArray[np.float32],
+    ends: NDArray[np.float32],
+) -> int:
+    """Writes the tiles that record j reaches to its slots and counts them; returns their number."""
+    left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
+    slot = first_slot
+    for block in range(boxes[j, 2], boxes[j, 3], LANES):
+        _spans(j * RECORD, block, records, begins, ends)
+        for row in range(min(LANES, boxes[j, 3] - block)):
+            begin = np.intp(max(left, begins[row]))
+            end = np.intp(min(right, ends[row]))
+            for column in range(begin, end + 1):
+                tile = (block + row) * tile_columns + column
+                tile_of_slot[slot] = tile
+                counts[tile] += 1
+                slot += 1
+    return slot - first_slot
+
+
+@parallel_kernel
+def find_tiles(
+    tile_columns: int,
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+    drawn: NDArray[np.int64],
+    shelves: NDArray[np.int32],
+    tile_of_slot: NDArray[np.int32],
+    counts: NDArray[np.int32],
+) -> None:
+    """Finds the tiles that each footprint reaches.
+
+    Args:
+        tile_columns: Tiles in a row of tiles.
+        records: Flat records.
+        boxes: [N, 4] tile boxes per record.
+        drawn: [chunks] records per chunk.
+        shelves: [N, SHELF] per record, completed.
+        tile_of_slot: [slots] written.
+        counts: [PARTS, T] written: entries per part and tile; zero before.
+    """
+    chunks = drawn.shape[0]
+    for part in prange(PARTS):
+        begins = np.empty(LANES, np.float32)
+        ends = np.empty(LANES, np.float32)
+        for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
+            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+                shelves[j, SLOTS] = _find(
+                    j,
+                    tile_columns,
+                    records,
+                    boxes,
+                    np.intp(shelves[j, FIRST_SLOT]),
+                    tile_of_slot,
+                    counts[part],
+                    begins,
+                    ends,
+                )
+                shelves[j, FIRST_ROW] = boxes[j, 2]
+                shelves[j, LAST_ROW] = boxes[j, 3] - 1
+
+
+@kernel
+def start_tiles(
+    counts: NDArray[np.int32], tile_columns: int, bands: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Returns the first entry of each tile [T + 1]; divides the rows of tiles into bands.
+
+    Args:
+        counts: [PARTS, T] entries per part and tile.
+        tile_columns: Tiles in a row of tiles.
+        bands: [bands + 1] written: first row of tiles of each band, so that bands have about
+            equally many entries.
+    """
+    tiles = counts.shape[1]
+    starts = np.zeros(tiles + 1, np.int64)
+    for tile in range(tiles):
+        starts[tile + 1] = starts[tile] + counts[:, tile].sum()
+    rows = tiles // tile_columns
+    last = bands.shape[0] - 1
+    row = 0
+    for band in range(last):
+        bands[band] = row
+        while row < rows and starts[row * tile_columns] * last < starts[tiles] * (band + 1):
+            row += 1
+    bands[last] = rows
+    return starts
+
+
+@parallel_kernel
+def fill_tiles(
+    order: NDArray[np.int32],
+    tile_columns: int,
+    bands: NDArray[np.int64],
+    shelves: NDArray[np.int32],
+    tile_of_slot: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    entry_of_slot: NDArray[np.int32],
+) -> None:
+    """Writes the tile lists, each band of rows of tiles by one job.
+
+    Args:
+        order: [M] records front to back.
+        tile_columns: Tiles in a row of tiles.
+        bands: [bands + 1] first row of tiles of each band.
+        shelves: [N, SHELF] per record.
+        tile_of_slot: [slots] from `find_tiles`.
+        starts: [T + 1] first entry of each tile.
+        entries: [E] written: the record of each entry, tile by tile, front to back.
+        entry_of_slot: [slots] written.
+    """
+    count = order.shape[0]
+    for band in prange(bands.shape[0] - 1):
+        first_tile, end_tile = bands[band] * tile_columns, bands[band + 1] * tile_columns
+        positions = starts[first_tile:end_tile].copy()
+        for rank in range(count):
+            prefetch(shelves, SHELF * np.intp(order[min(rank + _FAR, count - 1)]))
+            ahead = order[min(rank + _NEAR, count - 1)]
+            prefetch(tile_of_slot, np.intp(shelves[ahead, FIRST_SLOT]))
+            prefetch(entry_of_slot, np.intp(shelves[ahead, FIRST_SLOT]))
+            j = order[rank]
+            if shelves[j, LAST_ROW] < bands[band] or shelves[j, FIRST_ROW] >= bands[band + 1]:
+                continue
+            first_slot = np.intp(shelves[j, FIRST_SLOT])
+            for slot in range(first_slot, first_slot + shelves[j, SLOTS]):
+                tile = np.intp(tile_of_slot[slot])
+                if first_tile <= tile < end_tile:
+                    entry = positions[tile - first_tile]
+                    positions[tile - first_tile] = entry + 1
+                    entries[entry] = j
+                    entry_of_slot[slot] = entry

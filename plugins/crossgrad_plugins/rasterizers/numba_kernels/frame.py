@@ -1,0 +1,401 @@
+"""One rendered view as plain arrays: forward, backward, and what the two share."""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.backward import differentiate
+from crossgrad_plugins.rasterizers.numba_kernels.binning import (
+    PARTS,
+    SHELF,
+    collect,
+    fill_tiles,
+    find_tiles,
+    start_tiles,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.constants import vector_constants
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import Pinhole, pinhole
+from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    CHUNK,
+    PARTIAL,
+    RECORD,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.projection import project
+from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
+from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
+from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade, unshade
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """N Gaussians as contiguous float32 arrays; colour is `colors`, or `dc` and `rest`.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4] wxyz, any norm; a zero quaternion is not drawn.
+        scales: [N, 3] linear.
+        opacities: [N].
+        colors: [N, 3] RGB as drawn.
+        dc: [N, 1, 3] harmonics of degree 0.
+        rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
+        degree: Active degree, 0 to 3.
+    """
+
+    means: Float32
+    quats: Float32
+    scales: Float32
+    opacities: Float32
+    colors: Float32 | None = None
+    dc: Float32 | None = None
+    rest: Float32 | None = None
+    degree: int = 0
+
+
+@dataclass(frozen=True)
+class CameraArrays:
+    """A pinhole camera.
+
+    Attributes:
+        viewmat: [4, 4] world to camera.
+        intrinsics: [3, 3] K in pixels, pixel centres at + 0.5.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    viewmat: Float32
+    intrinsics: Float32
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """The rule set's free numbers, and which optional outputs to compute.
+
+    Attributes:
+        max_alpha: Cap of a Gaussian's alpha, below 1.
+        near: Gaussians are drawn if their centre's depth is larger.
+        dilation: Added to both diagonal entries of the 2-D covariance, px^2.
+        antialiased: Lowers opacities by what the dilation adds in area (Mip-Splatting's 2-D filter).
+        depth: Whether to composite the depth.
+        pixels: Whether to count the pixels of each Gaussian.
+    """
+
+    max_alpha: float = 0.99
+    near: float = 1e-3
+    dilation: float = 0.3
+    antialiased: bool = False
+    depth: bool = False
+    pixels: bool = False
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The drawn Gaussians, as records that fill each chunk of Gaussians from its start.
+
+    Attributes:
+        camera: The view.
+        radii: [N] int32, pixels; 0 where no pixel is touched.
+        records: [N * RECORD] float32.
+        owners: [N] int32, the Gaussian of each record.
+        drawn: [chunks] int64, records per chunk.
+    """
+
+    camera: Pinhole
+    radii: Int32
+    records: Float32
+    owners: Int32
+    drawn: Int64
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """The records that reach each tile, front to back.
+
+    Attributes:
+        tiles: [T] int32, the order in which tiles are worked on.
+        starts: [T + 1] int64, first entry of each tile.
+        entries: [E] int32, records.
+        shelves: [N, SHELF] int32, the slots of each record.
+        entry_of_slot: [slots] int32.
+    """
+
+    tiles: Int32
+    starts: Int64
+    entries: Int32
+    shelves: Int32
+    entry_of_slot: Int32
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered view and what its backward pass needs.
+
+    Attributes:
+        image: [H, W, 3] over the background, not clamped.
+        alpha: [H, W].
+        depth: [H, W] sum of weight times depth, None unless asked for.
+        pixels: [N] int32, pixels blended, None unless asked for.
+        gaussians: The input.
+        options: The input.
+        projected: Drawn Gaussians.
+        lists: Tile lists.
+        masks: [E] uint32, segments that each entry was blended into.
+    """
+
+    image: Float32
+    alpha: Float32
+    depth: Float32 | None
+    pixels: Int32 | None
+    gaussians: GaussianArrays
+    options: DrawOptions
+    projected: Projected
+    lists: TileLists
+    masks: NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class GaussianGradients:
+    """Gradients of N Gaussians and their screen statistics, float32.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        colors: [N, 3] by the RGB drawn (after the clamp of harmonics).
+        dc: [N, 1, 3], None without harmonics.
+        rest: [N, B - 1, 3], None without harmonics.
+        centres: [N, 2] by the projected mean, per pixel.
+        absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
+    """
+
+    means: Float32
+    quats: Float32
+    scales: Float32
+    opacities: Float32
+    colors: Float32
+    dc: Float32 | None
+    rest: Float32 | None
+    centres: Float32
+    absolute: Float32 | None
+
+
+def forward(
+    gaussians: GaussianArrays, camera: CameraArrays, background: Float32, options: DrawOptions
+) -> Frame:
+    """Draws the Gaussians over a background [3]."""
+    projected, boxes, shelves, depths, room = _project(gaussians, camera, options)
+    lists = _bin(projected, boxes, shelves, depths, room)
+    shape = (camera.height, camera.width)
+    image = np.empty((*shape, 3), np.float32)
+    alpha = np.empty(shape, np.float32)
+    depth = np.empty(shape, np.float32) if options.depth else None
+    entries = lists.entries.shape[0]
+    counts = np.zeros(entries, np.int32) if options.pixels else None
+    masks = np.zeros(entries, np.uint32)
+    composite(
+        lists.tiles,
+        lists.starts,
+        lists.entries,
+        projected.records,
+        vector_constants(options.max_alpha),
+        np.ascontiguousarray(background, np.float32),
+        image,
+        alpha,
+        depth,
+        counts,
+        masks,
+    )
+    pixels = None if counts is None else _count_pixels(gaussians, projected, lists, counts)
+    return Frame(image, alpha, depth, pixels, gaussians, options, projected, lists, masks)
+
+
+def backward(
+    frame: Frame,
+    v_image: Float32,
+    v_alpha: Float32 | None = None,
+    v_depth: Float32 | None = None,
+    *,
+    absolute: bool = False,
+) -> GaussianGradients:
+    """Returns the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
+
+    Args:
+        frame: From `forward`; with a depth where `v_depth` is given.
+        v_image: [H, W, 3].
+        v_alpha: [H, W] or None.
+        v_depth: [H, W] or None.
+        absolute: Whether to compute the absolute gradients of the projected means.
+    """
+    gaussians, options, projected, lists = (
+        frame.gaussians,
+        frame.options,
+        frame.projected,
+        frame.lists,
+    )
+    partials = np.empty(lists.entries.shape[0] * PARTIAL, np.float32)
+    differentiate(
+        lists.tiles,
+        lists.starts,
+        lists.entries,
+        frame.masks,
+        projected.records,
+        vector_constants(options.max_alpha),
+        frame.image,
+        frame.alpha,
+        frame.depth if v_depth is not None else None,
+        np.ascontiguousarray(v_image, np.float32),
+        None if v_alpha is None else np.ascontiguousarray(v_alpha, np.float32),
+        None if v_depth is None else np.ascontiguousarray(v_depth, np.float32),
+        np.empty(0, np.float32) if absolute else None,
+        partials,
+    )
+    count = gaussians.means.shape[0]
+    gradients = GaussianGradients(
+        means=np.zeros((count, 3), np.float32),
+        quats=np.zeros((count, 4), np.float32),
+        scales=np.zeros((count, 3), np.float32),
+        opacities=np.zeros(count, np.float32),
+        colors=np.zeros((count, 3), np.float32),
+        dc=None if gaussians.dc is None else np.zeros_like(gaussians.dc),
+        rest=None if gaussians.rest is None else np.zeros_like(gaussians.rest),
+        centres=np.zeros((count, 2), np.float32),
+        absolute=np.zeros((count, 2), np.float32) if absolute else None,
+    )
+    unproject(
+        projected.camera,
+        options.dilation,
+        options.antialiased,
+        v_depth is not None,
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        projected.drawn,
+        projected.owners,
+        lists.shelves,
+        lists.entry_of_slot,
+        frame.masks,
+        partials,
+        gradients.means,
+        gradients.quats,
+        gradients.scales,
+        gradients.opacities,
+        gradients.colors,
+        gradients.centres,
+        np.empty((0, 2), np.float32) if gradients.absolute is None else gradients.absolute,
+    )
+    if gradients.dc is not None and gradients.rest is not None and gaussians.rest is not None:
+        unshade(
+            gaussians.degree,
+            projected.camera.eye,
+            gaussians.means,
+            gaussians.rest,
+            projected.drawn,
+            projected.owners,
+            projected.records,
+            gradients.colors,
+            gradients.dc,
+            gradients.rest,
+            gradients.means,
+        )
+    return gradients
+
+
+def _project(
+    gaussians: GaussianArrays, camera: CameraArrays, options: DrawOptions
+) -> tuple[Projected, Int32, Int32, NDArray[np.float64], Int64]:
+    count = gaussians.means.shape[0]
+    chunks = (count + CHUNK - 1) // CHUNK
+    projected = Projected(
+        camera=pinhole(camera.viewmat, camera.intrinsics, camera.width, camera.height),
+        radii=np.empty(count, np.int32),
+        records=np.empty(count * RECORD, np.float32),
+        owners=np.empty(count, np.int32),
+        drawn=np.empty(chunks, np.int64),
+    )
+    boxes = np.empty((count, 4), np.int32)
+    shelves = np.empty((count, SHELF), np.int32)
+    depths = np.empty(count, np.float64)
+    room = np.empty(chunks, np.int64)
+    project(
+        projected.camera,
+        options.near,
+        options.dilation,
+        options.antialiased,
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+        projected.radii,
+        projected.records,
+        depths,
+        boxes,
+        projected.owners,
+        shelves,
+        projected.drawn,
+        room,
+    )
+    if gaussians.dc is not None and gaussians.rest is not None:
+        shade(
+            gaussians.degree,
+            projected.camera.eye,
+            gaussians.means,
+            gaussians.dc,
+            gaussians.rest,
+            projected.drawn,
+            projected.owners,
+            projected.records,
+        )
+    return projected, boxes, shelves, depths, room
+
+
+def _bin(
+    projected: Projected, boxes: Int32, shelves: Int32, depths: NDArray[np.float64], room: Int64
+) -> TileLists:
+    camera = projected.camera
+    columns = (camera.width + TILE_WIDTH - 1) // TILE_WIDTH
+    rows = (camera.height + TILE_HEIGHT - 1) // TILE_HEIGHT
+    items, keys, slots = collect(projected.drawn, room, depths, shelves)
+    order = order_by_depth(keys, items)
+    tile_of_slot = np.empty(slots, np.int32)
+    entry_of_slot = np.empty(slots, np.int32)
+    counts = np.zeros((PARTS, columns * rows), np.int32)
+    find_tiles(columns, projected.records, boxes, projected.drawn, shelves, tile_of_slot, counts)
+    bands = np.empty(numba.get_num_threads() + 1, np.int64)
+    starts = start_tiles(counts, columns, bands)
+    entries = np.empty(int(starts[-1]), np.int32)
+    fill_tiles(
+        order, columns, bands, shelves, tile_of_slot, starts, entries, entry_of_slot
+    )
+    return TileLists(_tile_order(columns, rows), starts, entries, shelves, entry_of_slot)
+
+
+def _tile_order(columns: int, rows: int) -> Int32:
+    """Spreads the rows of tiles so that any run of tiles costs about the same.
+
+    Threads take runs of equal length; the busy tiles of an image lie together.
+    """
+    step = max(1, round(rows * (math.sqrt(5.0) - 1.0) / 2.0))
+    while math.gcd(step, rows) > 1:
+        step += 1
+    spread = (np.arange(rows) * step) % rows
+    return (spread[:, None] * columns + np.arange(columns)).ravel().astype(np.int32)
+
+
+def _count_pixels(
+    gaussians: GaussianArrays, projected: Projected, lists: TileLists, counts: Int32
+) -> Int32:
+    raise NotImplementedError

@@ -1,0 +1,259 @@
+"""Projection of the Gaussians to the image: culling, records of those drawn, tile boxes."""
+
+import math
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
+    Pinhole,
+    clamped,
+    covariance,
+    jacobian_rows,
+    rotation,
+    scaled_axes,
+    to_camera,
+    unit_quaternion,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    BLUE,
+    CHUNK,
+    DECAY,
+    DEPTH,
+    GREEN,
+    LOG2_E,
+    LOG_OPACITY,
+    RECORD,
+    RED,
+    ROW_DECAY,
+    SLOPE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    U_PART,
+    U_WHOLE,
+    V_PART,
+    V_WHOLE,
+    WIDTH,
+)
+
+_LEAST_OPACITY = 1.0 / 255.0
+_LARGEST_RADIUS = 2.0**30
+# Projected values beyond this are dropped; well inside float32.
+_LARGEST = 1e30
+_STEEPEST = 1e15
+# Smallest decay in a record (px^-2): flat over any image, and its inverse is a float32.
+_FLAT = 1e-30
+
+
+@device
+def first_pixel(low: float) -> float:
+    """Returns the first pixel (from 0) whose centre is not before `low`."""
+    return max(np.ceil(low - 0.5), 0.0)
+
+
+@device
+def last_pixel(high: float, size: int) -> float:
+    """Returns the last pixel of `size` whose centre is not beyond `high`."""
+    return min(np.floor(high - 0.5), size - 1.0)
+
+
+@device
+def _row_hits(
+    y: float,
+    u: float,
+    v: float,
+    c: float,
+    slope: float,
+    variance: float,
+    reach: float,
+    width: int,
+) -> bool:
+    """Whether the footprint covers a pixel centre in image row `y`."""
+    dy = y + 0.5 - v
+    left_over = (reach - dy * dy / c) * variance
+    if not left_over >= 0.0:
+        return False
+    extent = math.sqrt(left_over)
+    centre = u + slope * dy
+    return first_pixel(centre - extent) <= last_pixel(centre + extent, width)
+
+
+@device
+def _hits(
+    y0: float,
+    y1: float,
+    u: float,
+    v: float,
+    c: float,
+    slope: float,
+    variance: float,
+    reach: float,
+    width: int,
+) -> bool:
+    """Whether the footprint covers any pixel centre in the image rows y0 to y1."""
+    middle = clamped(np.floor(v), y0, y1)
+    if _row_hits(middle, u, v, c, slope, variance, reach, width):
+        return True
+    y = y0
+    while y <= y1:
+        if _row_hits(y, u, v, c, slope, variance, reach, width):
+            return True
+        y += 1.0
+    return False
+
+
+@device
+def _project_one(
+    i: int,
+    j: int,
+    camera: Pinhole,
+    near: float,
+    dilation: float,
+    antialiased: bool,
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    records: NDArray[np.float32],
+    depths: NDArray[np.float64],
+    boxes: NDArray[np.int32],
+) -> int:
+    """Projects Gaussian i into record j; returns its radius, 0 where it touches no pixel."""
+    opacity = np.float64(opacities[i])
+    if not (opacity >= _LEAST_OPACITY and opacity < math.inf):
+        return 0
+    x, y, z = to_camera(camera, means, i)
+    if not (z > near and z < math.inf):
+        return 0
+    qw, qx, qy, qz, inverse_norm = unit_quaternion(quats, i)
+    inverse_z = 1.0 / z
+    u = camera.fx * x * inverse_z + camera.cx
+    v = camera.fy * y * inverse_z + camera.cy
+    row_x, row_y = jacobian_rows(
+        camera,
+        inverse_z,
+        clamped(x * inverse_z, camera.left, camera.right),
+        clamped(y * inverse_z, camera.top, camera.bottom),
+    )
+    turned = rotation(qw, qx, qy, qz)
+    m = scaled_axes(row_x, turned, scales, i)
+    n = scaled_axes(row_y, turned, scales, i)
+    a, b, c, det, factor = covariance(m, n, dilation, antialiased)
+    slope, variance = b / c, det / c
+    reach = 2.0 * math.log(255.0 * opacity * factor)
+    decay = max(0.5 * LOG2_E / variance, _FLAT)
+    # The sums are NaN or infinite if any term is, and then fail the comparison.
+    if not (
+        inverse_norm > 0.0
+        and det > 0.0
+        and variance > 0.0
+        and reach >= 0.0
+        and a + c + det < math.inf
+        and abs(u) + abs(v) + decay + 1.0 / c < _LARGEST
+        and abs(slope) < _STEEPEST
+    ):
+        return 0
+    extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
+    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, camera.width)
+    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, camera.height)
+    if x0 > x1 or y0 > y1:
+        return 0
+    if not _hits(y0, y1, u, v, c, slope, variance, reach, camera.width):
+        return 0
+    at = j * RECORD
+    records[at + U_WHOLE] = np.floor(u)
+    records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
+    records[at + V_WHOLE] = np.floor(v)
+    records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
+    records[at + SLOPE] = slope
+    records[at + ROW_DECAY] = max(0.5 * LOG2_E / c, _FLAT)
+    records[at + DECAY] = decay
+    records[at + WIDTH] = 1.0 / decay
+    records[at + LOG_OPACITY] = math.log2(opacity * factor)
+    records[at + DEPTH] = z
+    depths[j] = z
+    boxes[j, 0] = np.int32(x0) // TILE_WIDTH
+    boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
+    boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
+    boxes[j, 3] = np.int32(y1) // TILE_HEIGHT + 1
+    return np.int32(max(1.0, np.ceil(min(max(extent_x, extent_y), _LARGEST_RADIUS))))
+
+
+@parallel_kernel
+def project(
+    camera: Pinhole,
+    near: float,
+    dilation: float,
+    antialiased: bool,
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    colors: NDArray[np.float32] | None,
+    radii: NDArray[np.int32],
+    records: NDArray[np.float32],
+    depths: NDArray[np.float64],
+    boxes: NDArray[np.int32],
+    owners: NDArray[np.int32],
+    shelves: NDArray[np.int32],
+    drawn: NDArray[np.int64],
+    room: NDArray[np.int64],
+) -> None:
+    """Projects N Gaussians; those drawn of each chunk take the first records of that chunk.
+
+    Args:
+        camera: The view.
+        near: Least depth.
+        dilation: Added to both variances, px^2.
+        antialiased: Whether opacities are lowered by what the dilation adds in area.
+        means: [N, 3].
+        quats: [N, 4] wxyz, any norm.
+        scales: [N, 3] linear.
+        opacities: [N].
+        colors: [N, 3] RGB; None leaves the records' colours to `shade`.
+        radii: [N] written, pixels; 0 where nothing is touched.
+        records: [N * RECORD] written.
+        depths: [N] written per record.
+        boxes: [N, 4] written per record: tile columns and rows [x0, x1), [y0, y1).
+        owners: [N] written per record: its Gaussian.
+        shelves: [N, SHELF] first slots written per record: tiles of the boxes before it in its
+            chunk.
+        drawn: [chunks] written: records of each chunk.
+        room: [chunks] written: tiles in the boxes of each chunk.
+    """
+    count = means.shape[0]
+    for chunk in prange(drawn.shape[0]):
+        begin = chunk * CHUNK
+        j = begin
+        tiles = 0
+        for i in range(begin, min(begin + CHUNK, count)):
+            radius = _project_one(
+                i,
+                j,
+                camera,
+                near,
+                dilation,
+                antialiased,
+                means,
+                quats,
+                scales,
+                opacities,
+                records,
+                depths,
+                boxes,
+            )
+            radii[i] = radius
+            if radius > 0:
+                if colors is not None:
+                    records[j * RECORD + RED] = colors[i, 0]
+                    records[j * RECORD + GREEN] = colors[i, 1]
+                    records[j * RECORD + BLUE] = colors[i, 2]
+                owners[j] = i
+                shelves[j, FIRST_SLOT] = tiles
+                tiles += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])
+                j += 1
+        drawn[chunk] = j - begin
+        room[chunk] = tiles

@@ -1,0 +1,178 @@
+"""View-dependent colour by real spherical harmonics up to degree 3 (signs and order of 3DGS)."""
+
+import math
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
+
+#: Number of basis functions of all degrees.
+BASIS = 16
+
+_C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
+_C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
+_C2_XY = 1.0925484305920792  # sqrt(15 / (4 pi))
+_C2_ZZ = 0.31539156525252005  # sqrt(5 / (16 pi))
+_C2_XX = 0.5462742152960396  # sqrt(15 / (16 pi))
+_C3_XXX = 0.5900435899266435  # sqrt(35 / (32 pi))
+_C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
+_C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
+_C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
+_C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
+
+
+@device
+def _direction(
+    means: NDArray[np.float32], i: int, eye: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    """Returns the unit vector from the camera to Gaussian i, and the inverse distance."""
+    x = np.float64(means[i, 0]) - eye[0]
+    y = np.float64(means[i, 1]) - eye[1]
+    z = np.float64(means[i, 2]) - eye[2]
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@device
+def _basis(degree: int, x: float, y: float, z: float, basis: NDArray[np.float64]) -> None:
+    """Writes the basis functions of degrees 0 to `degree` for a unit direction."""
+    basis[0] = _C0
+    if degree < 1:
+        return
+    basis[1] = -_C1 * y
+    basis[2] = _C1 * z
+    basis[3] = -_C1 * x
+    if degree < 2:
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    basis[4] = _C2_XY * x * y
+    basis[5] = -_C2_XY * y * z
+    basis[6] = _C2_ZZ * (2.0 * zz - xx - yy)
+    basis[7] = -_C2_XY * x * z
+    basis[8] = _C2_XX * (xx - yy)
+    if degree < 3:
+        return
+    basis[9] = -_C3_XXX * y * (3.0 * xx - yy)
+    basis[10] = _C3_XYZ * x * y * z
+    basis[11] = -_C3_XZZ * y * (4.0 * zz - xx - yy)
+    basis[12] = _C3_ZZZ * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+    basis[13] = -_C3_XZZ * x * (4.0 * zz - xx - yy)
+    basis[14] = _C3_XXZ * z * (xx - yy)
+    basis[15] = -_C3_XXX * x * (xx - 3.0 * yy)
+
+
+@device
+def _direction_gradient(
+    degree: int, x: float, y: float, z: float, v: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Returns the gradient of sum(v * basis) by x, y and z, taken as independent."""
+    if degree < 1:
+        return 0.0, 0.0, 0.0
+    v_x, v_y, v_z = -_C1 * v[3], -_C1 * v[1], _C1 * v[2]
+    if degree < 2:
+        return v_x, v_y, v_z
+    a, b, c, d = _C2_XY * v[4], -_C2_XY * v[5], -_C2_XY * v[7], 2.0 * _C2_XX * v[8]
+    e = 2.0 * _C2_ZZ * v[6]
+    v_x += a * y + c * z + d * x - e * x
+    v_y += a * x + b * z - d * y - e * y
+    v_z += b * y + c * x + 2.0 * e * z
+    if degree < 3:
+        return v_x, v_y, v_z
+    xx, yy, zz = x * x, y * y, z * z
+    f, g, h = -_C3_XXX * v[9], _C3_XYZ * v[10], -_C3_XZZ * v[11]
+    k, m, n = _C3_ZZZ * v[12], -_C3_XZZ * v[13], _C3_XXZ * v[14]
+    p = -_C3_XXX * v[15]
+    v_x += f * 6.0 * x * y + g * y * z - h * 2.0 * x * y - k * 6.0 * x * z
+    v_x += m * (4.0 * zz - 3.0 * xx - yy) + n * 2.0 * x * z + p * 3.0 * (xx - yy)
+    v_y += f * 3.0 * (xx - yy) + g * x * z + h * (4.0 * zz - xx - 3.0 * yy) - k * 6.0 * y * z
+    v_y += -m * 2.0 * x * y - n * 2.0 * y * z - p * 6.0 * x * y
+    v_z += g * x * y + h * 8.0 * y * z + k * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+    v_z += m * 8.0 * x * z + n * (xx - yy)
+    return v_x, v_y, v_z
+
+
+@parallel_kernel
+def shade(
+    degree: int,
+    eye: NDArray[np.float64],
+    means: NDArray[np.float32],
+    dc: NDArray[np.float32],
+    rest: NDArray[np.float32],
+    drawn: NDArray[np.int64],
+    owners: NDArray[np.int32],
+    records: NDArray[np.float32],
+) -> None:
+    """Writes max(0, 1/2 + harmonics(direction)) to the colours of the records.
+
+    Args:
+        degree: Active degree, 0 to 3.
+        eye: [3] camera centre.
+        means: [N, 3].
+        dc: [N, 1, 3] coefficients of degree 0.
+        rest: [N, B - 1, 3] of the higher degrees; only those active are read.
+        drawn, owners: From `project`.
+        records: Flat records, colours written.
+    """
+    count = (degree + 1) * (degree + 1)
+    for chunk in prange(drawn.shape[0]):
+        basis = np.empty(BASIS, np.float64)
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            i = np.intp(owners[j])
+            x, y, z, _ = _direction(means, i, eye)
+            _basis(degree, x, y, z, basis)
+            for channel in range(3):
+                colour = 0.5 + basis[0] * np.float64(dc[i, 0, channel])
+                for k in range(1, count):
+                    colour += basis[k] * np.float64(rest[i, k - 1, channel])
+                records[j * RECORD + RED + channel] = max(colour, 0.0)
+
+
+@parallel_kernel
+def unshade(
+    degree: int,
+    eye: NDArray[np.float64],
+    means: NDArray[np.float32],
+    rest: NDArray[np.float32],
+    drawn: NDArray[np.int64],
+    owners: NDArray[np.int32],
+    records: NDArray[np.float32],
+    v_colors: NDArray[np.float32],
+    v_dc: NDArray[np.float32],
+    v_rest: NDArray[np.float32],
+    v_means: NDArray[np.float32],
+) -> None:
+    """Carries gradients of the colours on to coefficients and centres.
+
+    Args:
+        degree, eye, means, rest, drawn, owners, records: As in `shade`.
+        v_colors: [N, 3] gradients of the clamped colours.
+        v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
+        v_rest: [N, B - 1, 3] likewise, active degrees only.
+        v_means: [N, 3] added to.
+    """
+    count = (degree + 1) * (degree + 1)
+    for chunk in prange(drawn.shape[0]):
+        basis = np.empty(BASIS, np.float64)
+        v_basis = np.empty(BASIS, np.float64)
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            i = np.intp(owners[j])
+            x, y, z, inverse = _direction(means, i, eye)
+            _basis(degree, x, y, z, basis)
+            v_basis[:] = 0.0
+            for channel in range(3):
+                # A channel clamped at 0 has no gradient.
+                if records[j * RECORD + RED + channel] <= np.float32(0.0):
+                    continue
+                v = np.float64(v_colors[i, channel])
+                v_dc[i, 0, channel] = v * basis[0]
+                for k in range(1, count):
+                    v_rest[i, k - 1, channel] = v * basis[k]
+                    v_basis[k] += v * np.float64(rest[i, k - 1, channel])
+            v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_basis)
+            along = x * v_x + y * v_y + z * v_z
+            v_means[i, 0] += (v_x - x * along) * inverse
+            v_means[i, 1] += (v_y - y * along) * inverse
+            v_means[i, 2] += (v_z - z * along) * inverse

@@ -1,0 +1,255 @@
+"""Whole runs on a tiny scene: results, repetition, resuming, failure, scaling."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from crossgrad_core import app
+from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.contexts import Aggregated, Densified, Regularized
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.ply import read_ply
+from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.topology import Edit, NO_EDIT, Rows
+
+QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    write_tiny_scene(folder, views=9)
+    return folder
+
+
+def run(scene, out, **settings):
+    given = {"scene": str(scene), "out": str(out), "steps": 12, "eval_every": 6, **settings}
+    return app.run(given, verbosity=-1)
+
+
+def quality(out):
+    with (out / "metrics.csv").open() as file:
+        return [{name: row[name] for name in QUALITY} for row in csv.DictReader(file)]
+
+
+def parameters(out):
+    return load(latest(out)).parameters
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert run(scene, out) == 0
+    names = {path.name for path in out.iterdir()}
+    assert names >= {
+        "config.yaml", "metrics.csv", "summary.json", "per_view.csv", "curve.png", "renders",
+        "point_cloud.ply", "checkpoints", "log.txt",
+    }  # fmt: skip
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "finished"
+    assert summary["overall"]["psnr"] > 10
+    assert summary["overall"]["lpips"] is None and summary["null"]["lpips"]
+    assert summary["seconds"]["train"] > 0
+    assert any("no separate gradients" in note for note in summary["notes"])
+    assert str(out) in capsys.readouterr().out
+    rows = quality(out)
+    assert [row["step"] for row in rows] == ["6", "12"]
+    assert rows[1]["views"] == "24"
+
+
+def test_training_brings_the_loss_down(scene, tmp_path):
+    run(scene, tmp_path / "short", steps=2, eval_every=1)
+    run(scene, tmp_path / "long", steps=120)
+    first = float(quality(tmp_path / "short")[0]["psnr"])
+    last = float(quality(tmp_path / "long")[-1]["psnr"])
+    assert last > first + 2.0
+
+
+def test_same_seed_same_bits_other_seed_other_bits(scene, tmp_path):
+    run(scene, tmp_path / "a")
+    run(scene, tmp_path / "b")
+    run(scene, tmp_path / "c", seed=1)
+    assert quality(tmp_path / "a") == quality(tmp_path / "b")
+    assert same(parameters(tmp_path / "a"), parameters(tmp_path / "b"))
+    assert not same(parameters(tmp_path / "a"), parameters(tmp_path / "c"))
+
+
+def test_the_written_config_repeats_the_run(scene, tmp_path):
+    run(scene, tmp_path / "a", sampler={"name": "near-far"}, operator={"name": "symmetric"})
+    stored = yaml.safe_load((tmp_path / "a" / "config.yaml").read_text())
+    assert app.run({**stored, "out": str(tmp_path / "b")}, verbosity=-1) == 0
+    assert quality(tmp_path / "a") == quality(tmp_path / "b")
+
+
+@pytest.mark.parametrize("sampler", ["epoch", "random", "near-far"])
+def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
+    # 400 steps densify from step 6 on, every 50: the edit at 50 falls behind the stop.
+    settings = {"steps": 60, "sampler": {"name": sampler}, "schedule": "scaled", "eval_every": 20}
+    run(scene, tmp_path / "whole", **settings)
+    assert run(scene, tmp_path / "parts", stop_after=23, **settings) == 0
+    assert json.loads((tmp_path / "parts/summary.json").read_text())["status"] == "stopped"
+    assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
+    whole, parts = load(latest(tmp_path / "whole")), load(latest(tmp_path / "parts"))
+    assert same(whole.parameters, parts.parameters)
+    assert same(whole.exp_avg, parts.exp_avg) and same(whole.exp_avg_sq, parts.exp_avg_sq)
+    assert whole.generators == parts.generators
+    rows = [row for row in quality(tmp_path / "parts") if row["step"] != "23"]
+    assert rows == quality(tmp_path / "whole")
+
+
+def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):
+    from crossgrad_core.training.setup import Setup
+
+    run(scene, tmp_path / "accumulated", steps=60)
+    monkeypatch.setattr(Setup, "separate", True)
+    run(scene, tmp_path / "apart", steps=60)
+    first, second = (load(latest(tmp_path / name)) for name in ("accumulated", "apart"))
+    assert same(first.parameters, second.parameters)
+    assert same(first.plugins["densifier"].per_primitive, second.plugins["densifier"].per_primitive)
+
+
+def test_joint_backward_agrees_to_rounding_and_counts_one_pass(scene, tmp_path):
+    run(scene, tmp_path / "separate", steps=3, eval_every=3)
+    run(scene, tmp_path / "joint", steps=3, eval_every=3, backward="joint")
+    first, second = parameters(tmp_path / "separate"), parameters(tmp_path / "joint")
+    for name in first:
+        assert torch.allclose(first[name], second[name], rtol=1e-4, atol=1e-5), name
+    with (tmp_path / "joint" / "metrics.csv").open() as file:
+        assert next(csv.DictReader(file))["backward_passes"] == "3"
+
+
+@pytest.mark.parametrize("scale", [1000.0, 0.001])
+def test_the_unit_of_length_does_not_matter(scene, tmp_path, scale):
+    write_tiny_scene(tmp_path / "scaled", views=9, scale=scale)
+    run(scene, tmp_path / "a", steps=40)
+    run(tmp_path / "scaled", tmp_path / "b", steps=40)
+    a, b = quality(tmp_path / "a")[-1], quality(tmp_path / "b")[-1]
+    assert float(a["psnr"]) == pytest.approx(float(b["psnr"]), abs=1e-3)
+    assert a["primitives"] == b["primitives"]
+
+
+def test_far_from_the_origin_nothing_is_lost_and_the_export_is_in_place(scene, tmp_path):
+    offset = (4e5, 5.6e6, 120.0)
+    write_tiny_scene(tmp_path / "utm", views=9, offset=offset)
+    run(scene, tmp_path / "a", steps=40)
+    run(tmp_path / "utm", tmp_path / "b", steps=40)
+    a, b = quality(tmp_path / "a")[-1], quality(tmp_path / "b")[-1]
+    assert float(a["psnr"]) == pytest.approx(float(b["psnr"]), abs=0.05)
+    near = read_ply(tmp_path / "a" / "point_cloud.ply").means
+    far = read_ply(tmp_path / "b" / "point_cloud.ply").means
+    assert np.abs(np.median(far, 0) - np.median(near, 0) - np.array(offset)).max() < 0.05
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+def test_any_number_of_views_on_photos_of_different_sizes(tmp_path, views):
+    write_tiny_scene(tmp_path / "mixed", views=6, mixed=True, folders=("aerial", "street"))
+    assert run(tmp_path / "mixed", tmp_path / "run", views=views) == 0
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert set(summary["regimes"]) == {"aerial", "street"}
+
+
+def test_published_order_differs_and_runs(scene, tmp_path):
+    assert run(scene, tmp_path / "a", preset="inria", steps=60) == 0
+    run(scene, tmp_path / "b", steps=60)
+    assert not same(parameters(tmp_path / "a"), parameters(tmp_path / "b"))
+
+
+def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
+    # Every Gaussian is above a threshold of 1e-12, so the first edit at step 50 wants to double.
+    settings = {"steps": 120, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
+    run(scene, tmp_path / "run", max_gaussians=230, **settings)
+    assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
+    assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()
+
+
+class Poison:
+    """Turns one parameter into NaN by way of an edit, in given steps."""
+
+    def __init__(self, steps):
+        self.steps = set(steps)
+
+    @hookimpl
+    def crossgrad_after_step(self, context):
+        if context.step not in self.steps:
+            return None
+        self.steps.discard(context.step)
+        bad = context.parameters["f_dc"].detach().clone()
+        bad[:] = float("nan")
+        return Densified(Edit(values={"f_dc": Rows(bad)}))
+
+
+def poisoned(monkeypatch, poison):
+    from crossgrad_core.training import assemble
+
+    original = assemble._plugins
+    monkeypatch.setattr(assemble, "_plugins", lambda *args: {**original(*args), "poison": poison})
+
+
+def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
+    poisoned(monkeypatch, Poison([7]))
+    assert run(scene, tmp_path / "run") == 0
+    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
+
+
+def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
+    scene, tmp_path, monkeypatch, capsys
+):
+    poisoned(monkeypatch, Poison([5, 7]))
+    assert run(scene, tmp_path / "run") == 1
+    message = capsys.readouterr().err
+    assert "in step 8" in message or "in step 6" in message
+    assert ".png" in message
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert summary["status"] == "failed" and "not finite" in summary["error"]
+
+
+class Louder:
+    """Wraps all three seams and adds a loss term; counts what it saw."""
+
+    def __init__(self):
+        self.seen = []
+
+    @hookimpl(wrapper=True)
+    def crossgrad_sample_views(self, context):
+        sampled = yield
+        self.seen.append("sample")
+        return sampled
+
+    @hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        aggregated = yield
+        self.seen.append("aggregate")
+        zeroed = {name: None for name in aggregated.gradients}
+        return Aggregated(zeroed, aggregated.counts, states=aggregated.states)
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        densified = yield
+        self.seen.append("densify")
+        return Densified(NO_EDIT, states=densified.states)
+
+    @hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is not None:
+            return None
+        return Regularized(context.parameters["opacities"].sum())
+
+
+def test_wrappers_replace_what_the_seams_answer(scene, tmp_path, monkeypatch):
+    watcher = Louder()
+    poisoned(monkeypatch, watcher)
+    run(scene, tmp_path / "run", steps=4, eval_every=4)
+    run_parameters = load(latest(tmp_path / "run"))
+    assert watcher.seen == ["sample", "aggregate", "densify"] * 4
+    # Only the loss term's gradient is left: nothing but the opacities has moved.
+    assert set(run_parameters.adam_steps) >= {"opacities"}
+    moved = {name for name, steps in run_parameters.adam_steps.items() if steps > 0}
+    assert moved == {"opacities"}

@@ -1,0 +1,63 @@
+"""Files that appear complete or not at all."""
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.files import atomic_file, disk_errors, free_bytes, size_text, write_atomically
+
+
+def test_replaces_the_whole_file(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    write_atomically(path, b"old and long")
+    write_atomically(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
+
+
+def interrupted_write(path: Path) -> None:
+    with atomic_file(path) as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+
+def test_an_error_in_the_block_keeps_the_old_file(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    write_atomically(path, b"old")
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_write(path)
+    assert path.read_bytes() == b"old"
+    assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.ENOSPC, "not enough disk space"),
+        (errno.EDQUOT, "not enough disk space"),
+        (errno.EACCES, "cannot write here"),
+        (errno.EROFS, "cannot write here"),
+    ],
+)
+def test_disk_errors_become_user_errors(tmp_path: Path, number: int, message: str):
+    with pytest.raises(UserError, match=message) as told, disk_errors(tmp_path / "x" / "y", 2**20):
+        raise OSError(number, "as the system says it")
+    assert str(tmp_path / "x" / "y") in str(told.value)
+
+
+def test_other_system_errors_pass(tmp_path: Path):
+    with pytest.raises(IsADirectoryError), disk_errors(tmp_path):
+        tmp_path.write_text("")
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, "0.0 MiB"), (3 * 2**19, "1.5 MiB"), (2**30, "1.0 GiB")]
+)
+def test_sizes_are_readable(count: int, text: str):
+    assert size_text(count) == text
+
+
+def test_free_space_of_a_folder_that_does_not_exist_yet(tmp_path: Path):
+    assert free_bytes(tmp_path / "a" / "b") > 0

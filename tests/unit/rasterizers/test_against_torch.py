@@ -1,0 +1,233 @@
+"""Every other rasterizer that runs on a CPU, held against the float64 reference case by case.
+
+The fast ones compute in float32. How far that may lead off is not guessed but measured: the
+reference is drawn again from inputs (Gaussians and camera) that are off by a few roundings of
+float32, and what that changes is what an algorithm in float32 can be asked for. Each row of each
+result may differ by `ROUNDINGS` times the largest change that it sees in a few such draws.
+
+A decision (touch, cap, stop) that a rounding could turn has no right answer in float32. So pixels
+with a compared value within `MARGIN` of its threshold get no weight in the loss and are left out of
+the comparison, and Gaussians that come so near to a rule of their own are not in the scene.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.registry import build, entries, load
+from crossgrad_core.scene.types import Camera
+from crossgrad_core.testing.brute_force import trace
+from crossgrad_core.testing.gaussians import posed_camera, random_gaussians
+
+REFERENCE = "torch"
+OURS = [name for name, entry in entries("rasterizers").items() if entry.distribution == "crossgrad"]
+FAST = [name for name in OURS if name != REFERENCE and "cpu" in load("rasterizers", name).devices]
+OUTPUTS = frozenset({"depth", "pixels", "abs_gradient"})
+TENSORS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+MARGIN = 2e-4
+ROUNDING = 2.0**-23
+ROUNDINGS = 16
+DRAWS = 3
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, a camera, a background and the rasterizer's options."""
+
+    gaussians: Gaussians
+    camera: Camera
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    options: dict[str, float] = field(default_factory=dict)
+
+
+def case(number=50, size=(40, 28), *, background=(0.0, 0.0, 0.0), dilation=None, **changes):
+    """A random case; `changes` are those of `random_gaussians`, or options of the rasterizer."""
+    options = {k: changes.pop(k) for k in ("max_alpha", "near", "dilation") if k in changes}
+    camera = posed_camera(*size, focal=changes.pop("focal", 40.0))
+    gaussians = random_gaussians(number, camera, **changes)
+    return Case(replace(gaussians, dilation=dilation), camera, background, options)
+
+
+def changed(made, **tensors):
+    """A case with some tensors of its Gaussians mapped by functions."""
+    new = {name: change(getattr(made.gaussians, name)) for name, change in tensors.items()}
+    return replace(made, gaussians=replace(made.gaussians, **new))
+
+
+def behind(made):
+    """The same case with every other Gaussian mirrored to behind the camera."""
+    center = made.camera.center
+    sign = torch.tensor([1.0, -1.0]).double().repeat(len(made.gaussians))[: len(made.gaussians)]
+    return changed(made, means=lambda means: center + sign[:, None] * (means - center))
+
+
+def far_from_the_origin(made):
+    """The same case, 300 units away."""
+    offset = torch.tensor([300.0, -200.0, 100.0]).double()
+    pose = made.camera.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    made = replace(made, camera=replace(made.camera, world_to_camera=pose))
+    return changed(made, means=lambda means: means + offset)
+
+
+def scaled(made, factor):
+    """The same case in other units of length."""
+    pose = made.camera.world_to_camera.clone()
+    pose[:3, 3] *= factor
+    made = replace(made, camera=replace(made.camera, world_to_camera=pose))
+    return changed(made, means=lambda x: x * factor, scales=lambda x: x * factor)
+
+
+CASES = {
+    "usual": lambda: case(120),
+    "one": lambda: case(1, border=-0.3),
+    "none": lambda: case(0, background=(0.1, 0.2, 0.3)),
+    "one pixel": lambda: case(40, (1, 1), focal=2.0),
+    "one row": lambda: case(40, (33, 1)),
+    "one tile": lambda: case(40, (16, 16)),
+    "one pixel more than a tile": lambda: case(40, (17, 17)),
+    "no multiple of a tile": lambda: case(80, (37, 19)),
+    "background": lambda: case(background=(0.3, 1.7, -0.4)),
+    "degree 0": lambda: case(sh_degree=0),
+    "degree 1": lambda: case(sh_degree=1),
+    "degree 2": lambda: case(sh_degree=2),
+    "degree 3": lambda: case(sh_degree=3),
+    "degree 1 of 16 bands": lambda: degree_one_of_three(),
+    "dark harmonics": lambda: changed(case(sh_degree=3), sh_dc=lambda dc: dc - 1.5),
+    "opaque": lambda: changed(case(120), opacities=torch.ones_like),
+    "opaque, high cap": lambda: changed(case(120, max_alpha=0.999), opacities=torch.ones_like),
+    "faint": lambda: case(120, opacities=(0.0, 0.03)),
+    "dense": lambda: case(250, (20, 14), sigmas=(1.0, 6.0), opacities=(0.3, 1.0)),
+    "tiny": lambda: case(150, sigmas=(1e-3, 0.3)),
+    "huge": lambda: case(sigmas=(50.0, 5000.0)),
+    "needles": lambda: case(sigmas=(0.02, 200.0)),
+    "flat": lambda: changed(case(), scales=lambda s: s * torch.tensor([1.0, 1.0, 0.0])),
+    "near": lambda: case(depths=(1.5e-3, 0.05)),
+    "near plane": lambda: case(depths=(0.1, 4.0), near=1.0),
+    "far": lambda: case(depths=(1e3, 1e5)),
+    "near and far": lambda: case(depths=(2e-3, 1e4), sigmas=(0.3, 30.0)),
+    "off the image": lambda: case(120, border=3.0, sigmas=(2.0, 40.0)),
+    "out of sight": lambda: changed(case(), means=lambda means: means + 1e4),
+    "behind the camera": lambda: behind(case()),
+    "far from the origin": lambda: far_from_the_origin(case()),
+    "large units": lambda: scaled(case(), 1e6),
+    "small units": lambda: scaled(case(near=1e-9), 1e-6),
+    "long quaternions": lambda: changed(case(), quats=lambda quats: quats * 1e6),
+    "short quaternions": lambda: changed(case(), quats=lambda quats: quats * 1e-6),
+    "little dilation": lambda: case(dilation=0.1),
+    "no dilation": lambda: case(dilation=0.0, sigmas=(0.5, 4.0)),
+    "antialiased": lambda: case(120, response="antialiased", dilation=0.1),
+    "antialiased, tiny": lambda: case(150, response="antialiased", sigmas=(0.02, 0.5)),
+    "antialiased, needles": lambda: case(response="antialiased", sigmas=(0.02, 200.0)),
+    "analytic": lambda: case(120, response="analytic"),
+    "analytic, tiny": lambda: case(150, response="analytic", sigmas=(0.02, 0.5)),
+    "analytic, huge": lambda: case(response="analytic", sigmas=(50.0, 5000.0)),
+    "analytic, needles": lambda: case(response="analytic", sigmas=(0.05, 50.0)),
+}
+
+
+def degree_one_of_three():
+    made = case(sh_degree=3)
+    return replace(made, gaussians=replace(made.gaussians, sh_degree=1))
+
+
+def mapped(gaussians, change):
+    """The Gaussians with every tensor mapped."""
+    tensors = {name: getattr(gaussians, name) for name in TENSORS}
+    return replace(gaussians, **{n: change(t) for n, t in tensors.items() if t is not None})
+
+
+def settled(made):
+    """The case in numbers that float32 holds, without Gaussians on the verge of a rule; its trace."""
+    made = replace(made, gaussians=mapped(made.gaussians, lambda t: t.float().double()))
+    while True:
+        exact = trace(made.gaussians, made.camera, **made.options)
+        keep = torch.from_numpy(exact.gaussian_gaps > MARGIN)
+        if keep.all():
+            return made, exact
+        made = replace(made, gaussians=mapped(made.gaussians, lambda t, k=keep: t[k]))
+
+
+def shaken(made, seed):
+    """The case with every number off by up to two roundings of float32."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def shake(tensor):
+        noise = 2 * torch.rand(tensor.shape, generator=rng, dtype=torch.float64) - 1
+        return tensor * (1 + 2 * ROUNDING * noise)
+
+    camera = made.camera
+    numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    fx, fy, cx, cy = shake(numbers).tolist()
+    pose = shake(camera.world_to_camera)
+    camera = Camera(camera.width, camera.height, fx, fy, cx, cy, pose)
+    return replace(made, gaussians=mapped(made.gaussians, shake), camera=camera)
+
+
+def draw(name, made, weights, dtype):
+    """Name -> [rows, columns] float64 of all results and gradients; and the screen."""
+    gaussians = mapped(made.gaussians, lambda t: t.detach().to(dtype, copy=True).requires_grad_())
+    background = torch.tensor(made.background, dtype=dtype)
+    rasterizer = build("rasterizers", name, made.options)
+    result = rasterizer.render(gaussians, made.camera, background, OUTPUTS)
+    images = {
+        "image": result.image,
+        "alpha": result.alpha[..., None],
+        "depth": result.depth[..., None],
+    }
+    loss = sum((weights[key] * image).sum() for key, image in images.items())
+    loss.backward()
+    tensors = {name: getattr(gaussians, name) for name in TENSORS}
+    found = {n: t.grad[:, None].flatten(1) for n, t in tensors.items() if t is not None}
+    found |= {key: (image * (weights[key] != 0)).flatten(0, 1) for key, image in images.items()}
+    found |= {"mean_gradient": result.screen.mean_gradient}
+    found |= {"abs_gradient": result.screen.abs_gradient}
+    return {key: value.detach().double() for key, value in found.items()}, result.screen
+
+
+def weighting(made, unsettled):
+    """Random weights of image, alpha and depth; none where a rounding could turn a decision."""
+    rng = torch.Generator().manual_seed(3)
+    shape = (made.camera.height, made.camera.width)
+    settled_pixels = torch.from_numpy(~unsettled)[..., None]
+    channels = {"image": 3, "alpha": 1, "depth": 1}
+    return {
+        key: torch.randn(*shape, count, generator=rng, dtype=torch.float64) * settled_pixels
+        for key, count in channels.items()
+    }
+
+
+@pytest.mark.parametrize("case_name", CASES)
+@pytest.mark.parametrize("name", FAST)
+def test_agrees_with_the_reference(name, case_name):
+    made, exact = settled(CASES[case_name]())
+    unsettled = exact.pixel_gaps <= MARGIN
+    weights = weighting(made, unsettled)
+    expected, screen = draw(REFERENCE, made, weights, torch.float64)
+    found, fast = draw(name, made, weights, torch.float32)
+    shakes = [draw(REFERENCE, shaken(made, s), weights, torch.float64)[0] for s in range(DRAWS)]
+    for key, rows in expected.items():
+        change = torch.stack([(s[key] - rows).norm(dim=-1) for s in shakes]).amax(0)
+        limit = ROUNDINGS * (change + ROUNDING * rows.norm(dim=-1))
+        error = (found[key] - rows).norm(dim=-1)
+        assert (error <= limit).all(), f"{key}: {(error / limit).max():.2f} of what is allowed"
+    assert_same_footprints(screen, fast, exact, unsettled)
+
+
+def assert_same_footprints(screen, fast, exact, unsettled):
+    """Radii and pixels are equal except where a rounding decides."""
+    # Number of unsettled pixels in which each Gaussian may or may not be drawn.
+    slack = ((exact.raw > (1 - MARGIN) / 255) & unsettled).sum((1, 2))
+    pixels = (screen.pixels - fast.pixels).abs().numpy()
+    assert (pixels <= slack).all()
+    radii, found = screen.radii.numpy(), fast.radii.numpy()
+    at_whole_pixel = np.abs(exact.extents - np.rint(exact.extents)) <= MARGIN * exact.extents
+    vanished = (slack > 0) & (np.minimum(radii, found) == 0)
+    assert np.all((radii == found) | vanished | ((np.abs(radii - found) == 1) & at_whole_pixel))
+
+
+def test_the_default_rasterizer_is_among_those_compared():
+    assert "numba" in FAST

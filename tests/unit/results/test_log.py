@@ -1,0 +1,107 @@
+"""Lines about a run under way, and log.txt."""
+
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from crossgrad_core.contexts import EvaluationReport, StepRecord
+from crossgrad_core.manager import make_manager
+from crossgrad_core.results.lines import Pace, duration, evaluation_line, progress_line
+from crossgrad_core.results.log import RunLog
+
+
+def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0.5) -> StepRecord:
+    names = ("a.jpg",) * len(losses)
+    return StepRecord(step, (0,) * len(losses), names, None, losses, 1234, {}, step * seconds)
+
+
+def test_progress_shows_loss_rate_and_time_left():
+    pace = Pace(total=1000)
+    assert progress_line(pace) == ""
+    for step in (1, 2, 3):
+        pace = pace.after(record(step))
+    assert progress_line(pace) == (
+        "step 3/1000 (0 %), loss 0.2000, 1,234 primitives, 2.0 steps/s, 8:18 left"
+    )
+
+
+def test_loss_is_smoothed():
+    pace = Pace(total=10).after(record(1, (1.0,)))
+    assert pace.loss == 1.0
+    assert pace.after(record(2, (0.0,))).loss == pytest.approx(0.95)
+
+
+def test_a_resumed_run_begins_where_it_stopped():
+    pace = Pace(total=1000).after(record(701))
+    assert pace.first == 700
+    assert pace.steps_per_second is None
+    assert "step 701/1000 (70 %)" in progress_line(pace)
+
+
+def test_last_evaluation_is_remembered():
+    pace = Pace(total=10).after(record(1))
+    assert pace.evaluated(EvaluationReport(1, {"psnr": None})).psnr is None
+    assert "PSNR 21.50" in progress_line(pace.evaluated(EvaluationReport(1, {"psnr": 21.5})))
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        (
+            {"psnr": 21.5, "ssim": 0.7, "psnr_far": 20.0, "psnr_near": 23.0, "train_seconds": 3.0},
+            "PSNR 21.50 dB, SSIM 0.7000, PSNR far 20.00, PSNR near 23.00, 3.0 s training",
+        ),
+        (
+            {"psnr": 21.5, "ssim": 0.7, "psnr_far": 21.5, "train_seconds": 3.0},
+            "PSNR 21.50 dB, SSIM 0.7000, 3.0 s training",
+        ),
+        ({"psnr": None, "ssim": None, "train_seconds": 3}, "no PSNR, no SSIM, 3.0 s training"),
+    ],
+)
+def test_evaluation_line(row: dict[str, float | None], expected: str):
+    assert evaluation_line(EvaluationReport(7, row)) == f"evaluated at step 7: {expected}"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1:00"), (11_229, "3:07:09")]
+)
+def test_duration(seconds: float, text: str):
+    assert duration(seconds) == text
+
+
+def test_log_holds_what_the_run_says(tmp_path: Path):
+    log = RunLog(tmp_path, clock=lambda: datetime(2026, 3, 5, 9, 8, 7).astimezone())
+    hook = make_manager({"log": log}).hook
+    run = SimpleNamespace(
+        schedule=SimpleNamespace(total=40),
+        scene=SimpleNamespace(name="boruszyn"),
+        notes=("no masks",),
+    )
+    hook.crossgrad_run_start(run=run)
+    for step in range(1, 5):
+        hook.crossgrad_step_end(record=record(step))
+    hook.crossgrad_message(text="first\n\nthird")
+    hook.crossgrad_evaluation(report=EvaluationReport(4, {"psnr": 20.0, "ssim": 0.5}))
+    hook.crossgrad_run_end(status="stopped")
+    lines = (tmp_path / "log.txt").read_text().splitlines()
+    assert all(line.startswith("09:08:07") for line in lines)
+    assert [line[8:].strip() for line in lines] == [
+        "2026-03-05, scene boruszyn, 40 steps",
+        "no masks",
+        "step 2/40 (5 %), loss 0.2000, 1,234 primitives, 2.0 steps/s, 19 s left",
+        "step 4/40 (10 %), loss 0.2000, 1,234 primitives, 2.0 steps/s, 18 s left",
+        "first",
+        "",
+        "third",
+        "evaluated at step 4: PSNR 20.00 dB, SSIM 0.5000, - s training",
+        "run stopped",
+    ]
+
+
+def test_a_resumed_run_continues_its_log(tmp_path: Path):
+    RunLog(tmp_path).write("first session")
+    RunLog(tmp_path).write("second session")
+    lines = (tmp_path / "log.txt").read_text().splitlines()
+    assert [line[10:] for line in lines] == ["first session", "second session"]

@@ -1,0 +1,115 @@
+"""metrics.csv: columns, exact numbers, and continuing after a resume or a crash."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.results.metrics_csv import (
+    MetricsCsv,
+    columns_for,
+    metrics_row,
+    read_metrics,
+    regimes_of,
+)
+
+HEADER = (
+    "step,views,backward_passes,train_seconds,psnr,ssim,ssim_skimage,lpips,"
+    "psnr_far,ssim_far,psnr_near,ssim_near,primitives,peak_memory_mib,loss"
+)
+
+
+def test_columns_of_a_run_with_regimes():
+    assert ",".join(columns_for(["near", "far"])) == HEADER
+    assert regimes_of(columns_for(["near", "far"])) == ("far", "near")
+    assert regimes_of(columns_for([])) == ()
+
+
+def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table.append(metrics_row(totals, result))
+    lines = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert lines == [
+        HEADER,
+        "700,1400,1400,38.21,24.0,0.7000000000000001,0.7833333333333333,,"
+        "30.0,0.9,21.0,0.6,111785,1523.0,0.06123456789012346",
+    ]
+
+
+def test_numbers_come_back_exactly(tmp_path: Path, result, totals):
+    row = metrics_row(totals, result)
+    MetricsCsv.create(tmp_path, ["near", "far"]).append(row)
+    assert read_metrics(tmp_path) == (row,)
+    assert row["lpips"] is None
+
+
+def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
+    table = MetricsCsv.create(tmp_path, [])
+    table.append(metrics_row(totals, empty))
+    assert (
+        (tmp_path / "metrics.csv")
+        .read_text()
+        .splitlines()[1]
+        .startswith("700,1400,1400,38.21,,,,,")
+    )
+
+
+def test_an_unknown_column_is_a_mistake(tmp_path: Path):
+    with pytest.raises(ValueError, match="typo"):
+        MetricsCsv.create(tmp_path, []).append({"typo": 1})
+
+
+def test_resuming_drops_rows_beyond_the_step(tmp_path: Path, result, totals):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    for step in (100, 200, 300):
+        table.append(metrics_row(replace(totals, step=step), result))
+    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+    resumed.append(metrics_row(replace(totals, step=300, loss=0.5), result))
+    assert [(row["step"], row["loss"]) for row in read_metrics(tmp_path)] == [
+        (100, totals.loss),
+        (200, totals.loss),
+        (300, 0.5),
+    ]
+
+
+def test_resuming_drops_a_row_that_a_crash_cut_short(tmp_path: Path, result, totals):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table.append(metrics_row(replace(totals, step=100), result))
+    with table.path.open("a") as file:
+        file.write("200,400,40")
+    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+    resumed.append(metrics_row(replace(totals, step=300), result))
+    assert [row["step"] for row in read_metrics(tmp_path)] == [100, 300]
+
+
+def test_resuming_without_a_table_starts_one(tmp_path: Path):
+    MetricsCsv.resume(tmp_path, [], step=5)
+    assert read_metrics(tmp_path) == ()
+
+
+@pytest.mark.parametrize("text", ["", "step,psnr\n1,2\n"])
+def test_the_table_of_another_run_is_refused(tmp_path: Path, text: str):
+    (tmp_path / "metrics.csv").write_text(text)
+    with pytest.raises(UserError, match="another run"):
+        MetricsCsv.resume(tmp_path, ["near", "far"], step=5)
+    assert (tmp_path / "metrics.csv").read_text() == text
+
+
+def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
+    regimes = {'a,"b"': result.regimes["far"], "c": result.regimes["near"]}
+    odd = replace(result, regimes=regimes)
+    MetricsCsv.create(tmp_path, list(regimes)).append(metrics_row(totals, odd))
+    assert read_metrics(tmp_path)[0]['psnr_a,"b"'] == 30.0
+
+
+@pytest.mark.parametrize("line", ["1,2", "a,b,c"])
+def test_unreadable_tables_are_explained(tmp_path: Path, line: str):
+    (tmp_path / "metrics.csv").write_text(f"step,psnr,ssim\n{line}\n")
+    with pytest.raises(UserError, match=r"unreadable metrics\.csv"):
+        read_metrics(tmp_path)
+
+
+def test_a_missing_table_is_explained(tmp_path: Path):
+    with pytest.raises(UserError, match=r"no metrics\.csv"):
+        read_metrics(tmp_path)

@@ -1,0 +1,102 @@
+"""Panels: file names, which views get one, and what the pixels show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from crossgrad_core.evaluation import Evaluated, ViewMetrics
+from crossgrad_core.results.panel_names import chosen_views, flat_names
+from crossgrad_core.results.panels import PanelWriter, draw_panel, error_map
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["aerial/0001.jpg", "street/0001.jpg"], ["aerial__0001", "street__0001"]),
+        (["a/b.jpg", "a/b.png", "a__b.jpg", "A/B.jpg"], ["a__b", "a__b-2", "a__b-3", "A__B-4"]),
+        (["../../etc/x y.jpg", "/abs.jpg"], ["etc__x_y", "abs"]),
+        (["...", "Łódź/żółw.jpg"], ["view", "Łódź__żółw"]),
+        (["x" * 300 + ".jpg"], ["x" * 120]),
+    ],
+)
+def test_flat_names_are_unique_and_safe(names: list[str], expected: list[str]):
+    assert list(flat_names(names).values()) == expected
+
+
+def test_views_are_spread_over_regimes_and_within_them(make_view):
+    views = [make_view(f"far/{i:02}", "far") for i in range(10)]
+    views += [make_view(f"near/{i:02}", "near") for i in range(2)]
+    assert [view.name for view in chosen_views(views, 4)] == [
+        "far/02",
+        "far/07",
+        "near/00",
+        "near/01",
+    ]
+    assert [view.name for view in chosen_views(views, 1)] == ["far/05"]
+    assert len(chosen_views(views, 100)) == 12
+    assert chosen_views(views, 0) == ()
+    assert chosen_views([], 4) == ()
+
+
+def make_evaluated(view, render: torch.Tensor, mask: torch.Tensor | None = None) -> Evaluated:
+    metrics = ViewMetrics(view.name, view.regime, 24.3, 0.812, None, None)
+    return Evaluated(view, render, view.photo.image(), mask, metrics)
+
+
+def find_image(canvas: np.ndarray, image: np.ndarray) -> bool:
+    """Whether the canvas contains the image somewhere, pixel for pixel."""
+    height, width = image.shape[:2]
+    corner = (canvas[: 1 - height or None, : 1 - width or None] == image[0, 0]).all(axis=2)
+    return any(
+        np.array_equal(canvas[y : y + height, x : x + width], image)
+        for y, x in zip(*np.nonzero(corner), strict=True)
+    )
+
+
+@pytest.mark.parametrize(("width", "height", "factor"), [(400, 60, 1), (24, 16, 15), (1, 1, 360)])
+def test_shows_photo_render_and_error_pixel_for_pixel(
+    make_view, width: int, height: int, factor: int
+):
+    view = make_view("a.jpg", "all", width, height)
+    render = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
+    canvas = np.asarray(draw_panel(make_evaluated(view, render), step=700))
+    photo = view.photo.image().numpy()
+    for image in (photo, render.numpy(), error_map(photo, render.numpy())):
+        assert find_image(canvas, image.repeat(factor, axis=0).repeat(factor, axis=1))
+
+
+def test_error_colours_are_fixed_and_grow_brighter():
+    photo = np.zeros((1, 4, 3), dtype=np.uint8)
+    render = np.array([0, 20, 64, 255], dtype=np.uint8)[None, :, None].repeat(3, axis=2)
+    colors = error_map(photo, render).astype(int)
+    brightness = colors.sum(axis=2)[0]
+    assert (np.diff(brightness[:3]) > 0).all()
+    assert (colors[0, 2] == colors[0, 3]).all()
+    assert (error_map(render, photo) == colors).all()
+
+
+def test_masked_pixels_are_hatched_in_the_error_only(make_view):
+    view = make_view("a.jpg", "all", 400, 60)
+    render = torch.zeros(60, 400, 3, dtype=torch.uint8)
+    mask = torch.ones(60, 400, dtype=torch.bool)
+    mask[:, 100:] = False
+    canvas = np.asarray(draw_panel(make_evaluated(view, render, mask), step=1))
+    photo = view.photo.image().numpy()
+    assert find_image(canvas, photo)
+    error = error_map(photo, render.numpy())
+    assert find_image(canvas, error[:, :100])
+    assert not find_image(canvas, error[:, :101])
+
+
+def test_writer_writes_the_chosen_views_only(tmp_path: Path, make_view):
+    views = [make_view(name, name[0]) for name in ("a/1.jpg", "a/2.jpg", "b/1.jpg")]
+    writer = PanelWriter.of(tmp_path, 700, views, count=2)
+    for view in views:
+        writer.write(make_evaluated(view, torch.zeros(16, 24, 3, dtype=torch.uint8)))
+    written = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png"))
+    assert written == ["renders/000700/a__2.png", "renders/000700/b__1.png"]
+    with Image.open(tmp_path / written[0]) as image:
+        assert image.mode == "RGB"
