@@ -16,7 +16,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contexts import RunInfo
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import write_atomically
-from crossgrad_core.results.folder import RunName, create_run_folder, expected_bytes
+from crossgrad_core.results.folder import RunName, check_out, create_run_folder, expected_bytes
 from crossgrad_core.results.log import RunLog
 from crossgrad_core.results.summary import Status
 from crossgrad_core.results.table import final_table
@@ -64,6 +64,7 @@ def run(
     if resume is not None:
         return _resume(resume, settings, verbosity)
     config = with_defaults(parsed(settings))
+    check_out(config.out)
     setup, load_seconds = _setup(config, verbosity)
     if dry_run:
         _print_dry_run(setup)

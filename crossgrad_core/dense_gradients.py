@@ -102,7 +102,7 @@ class DenseViewGradients(ViewGradients):
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
         gramians, present = self.gramians(granularity), self.present(granularity)
         # Gradients with a product share an element; only pairs without one need a look.
-        shared = gramians != 0
+        shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
         for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():
             found = self._overlap(granularity, i, j, doubtful[:, i, j])

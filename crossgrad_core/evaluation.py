@@ -14,7 +14,7 @@ from torch import Tensor
 from crossgrad_core.scene.types import View
 
 NO_VIEWS = "no held-out views: the split keeps every view for training"
-NO_LPIPS = "LPIPS was not asked for"
+ALL_MASKED = "every pixel is masked"
 
 #: [H, W, 3] render, [H, W, 3] photo, both in [0, 1] -> LPIPS.
 Lpips = Callable[[Tensor, Tensor], float]
@@ -30,7 +30,7 @@ class ViewMetrics:
         psnr: dB, over all channels.
         ssim: 3DGS form: zero-padded 11 x 11 window, sigma 1.5.
         ssim_skimage: scikit-image with Gaussian weights, sigma 1.5, no sample covariance.
-        lpips: None unless asked for.
+        lpips: None unless given a function that computes it.
     """
 
     name: str
@@ -98,7 +98,7 @@ def evaluate(
 
     Args:
         views: The held-out views; none gives metrics that are null, with the reason.
-        render_one: [H, W, 3] linear image of a view, on any device, need not be clamped.
+        render_one: [H, W, 3] float image of a view, on any device, need not be clamped.
         lpips: Computes LPIPS; None leaves it out.
         on_view: Told each view with its render, for panels.
     """
@@ -124,18 +124,17 @@ def _evaluated(view: View, render: Tensor, lpips: Lpips | None) -> Evaluated:
     from crossgrad_core.metrics import psnr, quantise, ssim, ssim_skimage
 
     photo, mask = view.photo.image(), view.photo.mask()
-    image = quantise(render.detach().cpu().float())
-    reference = photo.float() / 255.0
+    image = (quantise(render.detach().cpu()) * 255.0).round().to(torch.uint8)
     counts = mask is None or bool(mask.any())
     metrics = ViewMetrics(
         name=view.name,
         regime=view.regime,
-        psnr=psnr(image, reference, mask) if counts else None,
-        ssim=ssim(image, reference, mask) if counts else None,
-        ssim_skimage=ssim_skimage(image, reference, mask) if counts else None,
-        lpips=lpips(image, reference) if lpips is not None and counts else None,
+        psnr=psnr(image, photo, mask),
+        ssim=ssim(image, photo, mask),
+        ssim_skimage=ssim_skimage(image, photo, mask),
+        lpips=lpips(image / 255.0, photo / 255.0) if lpips is not None and counts else None,
     )
-    return Evaluated(view, (image * 255.0).round().to(torch.uint8), photo, mask, metrics)
+    return Evaluated(view, image, photo, mask, metrics)
 
 
 def _means(views: Sequence[ViewMetrics]) -> Means:
@@ -154,11 +153,15 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _reasons(views: Sequence[ViewMetrics], overall: Means) -> dict[str, str]:
+    from crossgrad_core.metrics import SSIM_SKIMAGE_TOO_SMALL, lpips_unavailable_reason
+
     if not views:
         return dict.fromkeys(("psnr", "ssim", "ssim_skimage", "lpips"), NO_VIEWS)
     reasons = {}
     if overall.psnr is None:
-        reasons = dict.fromkeys(("psnr", "ssim", "ssim_skimage"), "every pixel is masked")
+        reasons = dict.fromkeys(("psnr", "ssim", "ssim_skimage"), ALL_MASKED)
+    elif overall.ssim_skimage is None:
+        reasons["ssim_skimage"] = SSIM_SKIMAGE_TOO_SMALL
     if overall.lpips is None:
-        reasons["lpips"] = NO_LPIPS
+        reasons["lpips"] = lpips_unavailable_reason()
     return reasons

@@ -57,6 +57,8 @@ class Operator(Component):
         separate: Whether it needs the views' gradients apart. Where not, the backward passes
             accumulate into one gradient: same bits, no copies.
         views: For which K the operator has a meaning.
+        elementwise: Whether it works on elements instead of Gramians; such an operator cannot be a
+            link of a chain or serve single blocks.
         granularity: What one Gramian covers: each block's tensors, all geometry / all appearance
             blocks, everything, or each Gaussian's row of a block.
     """
@@ -64,6 +66,7 @@ class Operator(Component):
     slot: ClassVar[str] = "operators"
     separate: ClassVar[bool] = True
     views: ClassVar[ViewCounts] = ViewCounts()
+    elementwise: ClassVar[bool] = False
 
     granularity: Granularity = Field("tensor", description="what one Gramian covers")
 

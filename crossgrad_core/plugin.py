@@ -29,7 +29,7 @@ from crossgrad_core.densifier import Densifier
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.gradients import ViewGradients
-from crossgrad_core.grouping import Grouping
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.observer import Observer
 from crossgrad_core.operator import Granularity, Operator, OperatorContext
@@ -61,9 +61,11 @@ __all__ = [
     "EvaluationReport",
     "Field",
     "Gaussians",
+    "GradientProbe",
     "Granularity",
     "Grouping",
     "IncompatibleSelectionError",
+    "Labelling",
     "LearningRate",
     "NoEdit",
     "Observer",

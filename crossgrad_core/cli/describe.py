@@ -1,8 +1,10 @@
 """A plugin in words: docstring, options, bounds, origin. Imports the plugin."""
 
 import inspect
+import json
 from textwrap import fill, indent
-from typing import Any, Literal, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
@@ -12,6 +14,8 @@ from crossgrad_core.wording import listed, singular
 
 _WIDTH = 80
 _MARGIN = "  "
+#: Sections of docstrings that say nothing to users: options are listed with their bounds.
+_SECTIONS = ("Attributes:", "Args:", "Returns:", "Raises:")
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 _LENGTHS = {"min_length": "at least", "max_length": "at most"}
 #: Class attributes that say what a component needs or gives, with their label.
@@ -35,32 +39,39 @@ def describe(entry: registry.Entry) -> str:
     """
     component = registry.load_entry(entry)
     parts = [
-        f"{singular(entry.slot)} {entry.name}\n{_MARGIN}{entry.origin}",
-        indent(_rewrapped(inspect.getdoc(component) or "No description."), _MARGIN),
+        f"{singular(entry.slot)} {entry.name}, from {entry.distribution} {entry.version}\n"
+        f"{_MARGIN}{entry.value}",
+        indent(_prose(inspect.getdoc(component) or "No description."), _MARGIN),
         "\n".join(f"{_MARGIN}{label}: {text}" for label, text in _traits(component)),
         _options(entry, component),
     ]
     return "\n\n".join(part for part in parts if part)
 
 
-def _rewrapped(docstring: str) -> str:
-    """The docstring with its plain paragraphs filled to the width; lists stay as they are."""
-    blocks = docstring.split("\n\n")
-    return "\n\n".join(block if "\n " in block else _filled(block) for block in blocks)
+def _prose(docstring: str) -> str:
+    """The docstring in lines that fit; without sections for readers of the code."""
+    blocks = [block for block in docstring.split("\n\n") if not block.startswith(_SECTIONS)]
+    return "\n\n".join(_filled(block) for block in blocks)
 
 
-def _filled(text: str) -> str:
-    return fill(" ".join(text.split()), _WIDTH - len(_MARGIN))
+def _filled(block: str) -> str:
+    """A paragraph filled to the width; where lines are indented, each of them by itself."""
+    lines = block.splitlines() if "\n " in block else [" ".join(block.split())]
+    width = _WIDTH - len(_MARGIN)
+    return "\n".join(
+        fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip())))
+        for line in lines
+    )
 
 
-def _traits(component: type[Component]) -> list[tuple[str, str]]:
-    found = []
+def _traits(component: type[Component]) -> list[tuple[str, object]]:
+    found: list[tuple[str, object]] = []
     for attribute, label in _TRAITS.items():
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
-            many = isinstance(value, frozenset | tuple)
+            value = sorted(value) if isinstance(value, frozenset) else value
             if value:
-                found.append((label, listed(sorted(value)) if many else str(value)))
+                found.append((label, listed(value) if isinstance(value, list | tuple) else value))
     return found
 
 
@@ -75,16 +86,32 @@ def _options(entry: registry.Entry, component: type[Component]) -> str:
 
 
 def _option(name: str, field: FieldInfo) -> str:
-    default = "required" if field.is_required() else f"default {field.default}"
+    default = "required" if field.is_required() else f"default {_value(field.default)}"
     facts = ", ".join([_type_name(field.annotation), default, *_bounds(field.metadata)])
-    text = fill(field.description or "no description", _WIDTH - 8)
-    return f"{_MARGIN * 2}{name}  ({facts})\n{indent(text, _MARGIN * 4)}"
+    text = field.description or "no description"
+    rows = (f"{_MARGIN * 2}{name}  ({facts})", f"{_MARGIN * 4}{text}")
+    return "\n".join(fill(row, _WIDTH, subsequent_indent=_MARGIN * 4) for row in rows)
+
+
+def _value(default: object) -> str:
+    """A value as one would write it after `--set KEY=`."""
+    return default if isinstance(default, str) else json.dumps(default, default=str)
 
 
 def _type_name(annotation: object) -> str:
-    if get_origin(annotation) is Literal:
-        return " | ".join(str(choice) for choice in get_args(annotation))
-    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    """The type as a user would say it: choices and unions by a bar, constraints left out."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _type_name(arguments[0])
+    if origin is Literal:
+        return " | ".join(str(choice) for choice in arguments)
+    names = [_type_name(each) for each in arguments if each is not Ellipsis]
+    if origin in (Union, UnionType):
+        return " | ".join(names)
+    if annotation is type(None):
+        return "null"
+    word = getattr(origin or annotation, "__name__", str(annotation))
+    return f"{word} of {', '.join(names)}" if names else word
 
 
 def _bounds(constraints: list[Any]) -> list[str]:

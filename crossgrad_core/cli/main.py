@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import typer
+from typer.main import get_command
 
 from crossgrad_core import __version__
 from crossgrad_core.cli import evaluate, export, plugins, render, run
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: What the user typed after `crossgrad`; `sys.argv[1:]` by default.
     """
     try:
-        app(args=arguments, prog_name="crossgrad")
+        # Not `app()`, which would replace `sys.excepthook`.
+        get_command(app)(args=arguments, prog_name="crossgrad")
     except UserError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(BAD_INPUT)

@@ -43,12 +43,12 @@ def _compact(
 @njit(cache=True)
 def _noise(x: Floats, cosines: Floats) -> bool:
     largest = np.abs(x).max()
-    return form(x, cosines, x) <= 2.0 * OPPOSITE * largest * largest
+    return bool(form(x, cosines, x) <= 2.0 * OPPOSITE * largest * largest)
 
 
 @njit(cache=True)
 def _equal_projections(norms: Floats, cosines: Floats) -> Floats:
-    """v with G v = (|g_k|); the shortest least-squares solution where G is singular."""
+    """Solves G v = (|g_k|); the shortest least-squares solution where G is singular."""
     n = norms.size
     vectors = np.empty((n, n))
     values = eigen(cosines.copy(), vectors)
@@ -107,15 +107,16 @@ def imtl_g(gramians: Floats, present: Flags) -> Floats:
 
 @njit(cache=True)
 def _bargain(cosines: Floats) -> Floats:
-    """beta > 0 with C beta = 1 / beta, by damped Newton on 1/2 beta^T C beta - sum log beta.
+    """Solves C beta = 1 / beta for beta > 0 by damped Newton.
 
-    The objective is self-concordant, so that steps of 1 / (1 + decrement) converge from anywhere.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so that steps of 1 / (1 + decrement) converge from anywhere.
     """
     n = cosines.shape[0]
     beta = np.full(n, 1.0 / np.sqrt(cosines.sum() / n)) if cosines.sum() > 0.5 else np.ones(n)
     everyone = np.arange(n)
     matrix = np.empty((n, n))
     right, step = np.empty(n), np.zeros(n)
+    last = np.inf
     for _ in range(STEPS):
         # In units of beta the Hessian is B C B + 1, whose unit diagonal plus one never degenerates.
         for i in range(n):
@@ -133,8 +134,11 @@ def _bargain(cosines: Floats) -> Floats:
         damping = 1.0 / (1.0 + decrement) if decrement > 0.25 else 1.0
         for i in range(n):
             beta[i] *= 1.0 + damping * step[i]
-        if decrement <= DECREMENT or beta.max() > 1e8:
+        # Close to the minimum the decrement squares itself, until rounding stops it.
+        stuck = decrement <= 0.25 and decrement > 0.5 * last
+        if decrement <= DECREMENT or stuck or beta.max() > 1e8:
             break
+        last = decrement
     return beta
 
 

@@ -83,7 +83,7 @@ def eigen(matrix: Floats, vectors: Floats) -> Floats:
                 matrix[p, q] = 0.0
                 matrix[q, p] = 0.0
                 for k in range(n):
-                    if k != p and k != q:
+                    if k not in (p, q):
                         akp, akq = matrix[k, p], matrix[k, q]
                         matrix[k, p] = c * akp - s * akq
                         matrix[p, k] = matrix[k, p]

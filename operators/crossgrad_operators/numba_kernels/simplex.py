@@ -31,10 +31,10 @@ TOLERANCE = 1e-14
 
 @njit(cache=True)
 def _value(cosines: Floats, q: Floats, rho: float, x: Floats) -> float:
-    square = max(form(x, cosines, x), 0.0)
+    square: float = max(form(x, cosines, x), 0.0)
     if rho < 0.0:
         return square
-    total = rho * np.sqrt(square)
+    total: float = rho * np.sqrt(square)
     for k in range(x.size):
         total += q[k] * x[k]
     return total
@@ -230,7 +230,7 @@ def _minimum(
 @njit(cache=True)
 def _is_noise(cosines: Floats, x: Floats) -> bool:
     largest = np.abs(x).max()
-    return form(x, cosines, x) <= 2.0 * OPPOSITE * largest * largest
+    return bool(form(x, cosines, x) <= 2.0 * OPPOSITE * largest * largest)
 
 
 @njit(cache=True)
@@ -321,12 +321,12 @@ def cagrad(gramians: Floats, present: Flags, c: float) -> Floats:
                 result[b, i] = result[b, j] = max(1.0 - c, 0.0) / views
                 continue
             n1, n2 = norms[i] / longest, norms[j] / longest
-            x, length, mean = _cagrad_pair(n1, n2, cosines[i, j], c)
+            share, length, mean = _cagrad_pair(n1, n2, cosines[i, j], c)
             if length > 0.0:
                 # The mean is over K views; that over the two present ones is K / 2 times longer.
                 factor = c * mean / length
-                result[b, i] = (0.5 + factor * x) * 2.0 / views
-                result[b, j] = (0.5 + factor * (1.0 - x)) * 2.0 / views
+                result[b, i] = (0.5 + factor * share) * 2.0 / views
+                result[b, j] = (0.5 + factor * (1.0 - share)) * 2.0 / views
             continue
         lengths = norms / longest / count
         for k in range(views):

@@ -105,7 +105,9 @@ def test_lpips_only_where_asked_for():
     def brightness(image: Tensor, photo: Tensor) -> float:
         return float((photo - image).mean() * 255.0)
 
-    assert evaluate(views, flat(100)).reasons == {"lpips": "LPIPS was not asked for"}
+    without = evaluate(views, flat(100))
+    assert without.overall.lpips is None
+    assert list(without.reasons) == ["lpips"]
     result = evaluate(views, flat(100), lpips=brightness)
     assert result.overall.lpips == pytest.approx(10.0, abs=1e-4)
     assert result.reasons == {}
@@ -120,6 +122,15 @@ def test_panels_are_offered_what_was_compared():
     assert offered[1].render.dtype == torch.uint8
     assert offered[1].render.unique().tolist() == [100]
     assert offered[1].photo.unique().tolist() == [9]
+
+
+def test_an_image_too_small_for_one_metric_keeps_the_others():
+    border = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    border[5:-5, 5:-5] = False  # scikit-image's SSIM leaves out just these five pixels
+    result = evaluate([make_view("a", "x", 110, border)], flat(100))
+    assert result.overall.psnr == pytest.approx(decibel(10), abs=1e-4)
+    assert result.overall.ssim_skimage is None
+    assert "scikit-image" in result.reasons["ssim_skimage"]
 
 
 def test_nothing_is_recorded_for_gradients():

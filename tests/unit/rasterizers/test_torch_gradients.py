@@ -150,3 +150,18 @@ def test_drawing_tiles_twice_changes_no_bit(response, monkeypatch):
     monkeypatch.setattr(compositing, "REMEMBERED_ENTRIES", 0)
     for once, twice in zip(remembered, everything(), strict=True):
         assert torch.equal(once, twice)
+
+
+def test_same_input_gives_the_same_bits():
+    camera = posed_camera(64, 48)
+    gaussians = random_gaussians(500, camera)
+    single = {n: getattr(gaussians, n).float() for n in ("means", "quats", "scales", "opacities")}
+    gaussians = replace(gaussians, **single, colors=gaussians.colors.float())
+
+    def gradients():
+        scene, tensors = leaves(gaussians)
+        render(scene, camera).image.square().sum().backward()
+        return [tensor.grad for tensor in tensors]
+
+    for first, second in zip(gradients(), gradients(), strict=True):
+        assert torch.equal(first, second)

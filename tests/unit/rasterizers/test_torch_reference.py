@@ -15,6 +15,7 @@ from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 EVERYTHING = frozenset({"depth", "pixels", "abs_gradient"})
+FIELDS = ("means", "quats", "scales", "opacities", "colors")
 RESPONSES = ("plain", "antialiased", "analytic")
 
 
@@ -228,9 +229,6 @@ def test_what_cannot_be_drawn_leaves_no_trace(field, value, response):
     assert (good.colors.grad[kept] != 0).any()
 
 
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
-
-
 def test_a_flat_gaussian_seen_edge_on_is_dropped_without_dilation():
     gaussians = stack([2.0], [0.9], dilation=0.0)
     gaussians.scales[0, 0] = 0.0
@@ -298,3 +296,20 @@ def test_optional_outputs_come_only_when_asked_for():
     assert result.depth is None
     assert result.screen.pixels is None
     assert result.screen.abs_gradient is None
+
+
+def test_gaussians_without_any_colour_are_refused():
+    with pytest.raises(ValueError, match="`colors` or `sh_dc`"):
+        render(stack([2.0], [0.5], colors=None), frontal())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("response", RESPONSES)
+def test_cuda_draws_what_the_cpu_draws(response):
+    camera = posed_camera(37, 21)
+    gaussians = random_gaussians(30, camera, response=response)
+    moved = replace(gaussians, **{n: getattr(gaussians, n).cuda() for n in FIELDS})
+    expected, result = render(gaussians, camera), render(moved, camera)
+    torch.testing.assert_close(result.image.cpu(), expected.image)
+    assert torch.equal(result.screen.pixels.cpu(), expected.screen.pixels)

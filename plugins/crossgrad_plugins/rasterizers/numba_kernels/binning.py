@@ -114,7 +114,7 @@ def _spans(
     slope = broadcast(records, at + SLOPE)
     row_decay = broadcast(records, at + ROW_DECAY)
     width = broadcast(records, at + WIDTH)
-    budget = broadcast(records, at + LOG_OPACITY) + splat(SPARE - TOUCH)
+    budget = broadcast(records, at + LOG_OPACITY) + splat(np.float32(SPARE - TOUCH))
     # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
     extent_y = square_root(budget / row_decay)
     lean = slope * extent_y / square_root(fma(row_decay, width, slope * slope))

@@ -45,9 +45,9 @@ def exp2(power: Lanes, constants: NDArray[np.float32]) -> Lanes:
     rounder = load(constants, 0)
     shifted = power + rounder
     fraction = power - (shifted - rounder)
-    value = fma(load(constants, EXP2 + 5 * LANES), fraction, load(constants, EXP2 + 4 * LANES))
-    value = fma(value, fraction, load(constants, EXP2 + 3 * LANES))
-    value = fma(value, fraction, load(constants, EXP2 + 2 * LANES))
-    value = fma(value, fraction, load(constants, EXP2 + LANES))
-    value = fma(value, fraction, load(constants, EXP2))
+    square = fraction * fraction
+    high = fma(load(constants, EXP2 + 5 * LANES), fraction, load(constants, EXP2 + 4 * LANES))
+    middle = fma(load(constants, EXP2 + 3 * LANES), fraction, load(constants, EXP2 + 2 * LANES))
+    low = fma(load(constants, EXP2 + LANES), fraction, load(constants, EXP2))
+    value = fma(fma(high, square, middle), square, low)
     return scale_by_power(value, shifted)

@@ -65,7 +65,7 @@ def fill_rows(
     row_decay = broadcast(records, record + ROW_DECAY)
     width = broadcast(records, record + WIDTH)
     log_opacity = broadcast(records, record + LOG_OPACITY)
-    spare = splat(SPARE - TOUCH)
+    spare = splat(np.float32(SPARE - TOUCH))
     reached = np.uint64(0)
     for block in range(0, TILE_HEIGHT, LANES):
         dy = (ramp() + splat(np.float32(block))) - v

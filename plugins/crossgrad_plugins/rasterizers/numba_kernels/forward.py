@@ -171,7 +171,7 @@ def _composite(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
-    masks: NDArray[np.uint32],
+    masks: NDArray[np.uint64],
 ) -> None:
     """Composites one tile and leaves in `masks` the segments that each entry was blended into."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
@@ -191,7 +191,7 @@ def _composite(
             reached = live & fill_rows(
                 records, record, np.float32(left), np.float32(top), rows, filled * ROWS
             )
-            masks[k] = np.uint32(reached)
+            masks[k] = np.uint64(reached)
             batch[filled] = k
             # No branch: an entry that reaches nothing is overwritten by the next one.
             filled += np.intp(reached != np.uint64(0))
@@ -220,7 +220,7 @@ def composite(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
-    masks: NDArray[np.uint32],
+    masks: NDArray[np.uint64],
 ) -> None:
     """Composites the tiles in the given order.
 

@@ -150,7 +150,7 @@ class Frame:
         options: The input.
         projected: Drawn Gaussians.
         lists: Tile lists.
-        masks: [E] uint32, segments that each entry was blended into.
+        masks: [E] uint64, segments that each entry was blended into.
     """
 
     image: Float32
@@ -161,7 +161,7 @@ class Frame:
     options: DrawOptions
     projected: Projected
     lists: TileLists
-    masks: NDArray[np.uint32]
+    masks: NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def forward(
     depth = np.empty(shape, np.float32) if options.depth else None
     entries = lists.entries.shape[0]
     counts = np.zeros(entries, np.int32) if options.pixels else None
-    masks = np.zeros(entries, np.uint32)
+    masks = np.zeros(entries, np.uint64)
     composite(
         lists.tiles,
         lists.starts,
@@ -244,7 +244,8 @@ def backward(
         frame.projected,
         frame.lists,
     )
-    partials = np.empty(lists.entries.shape[0] * PARTIAL, np.float32)
+    partials = np.empty((lists.entries.shape[0] + 1) * PARTIAL, np.float32)
+    partials[-PARTIAL:] = 0.0
     differentiate(
         lists.tiles,
         lists.starts,

@@ -10,8 +10,6 @@ so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of 
 
 import math
 
-import numpy as np
-
 #: Pixels of a tile, a multiple of eight on both sides.
 TILE_WIDTH = 16
 TILE_HEIGHT = 16
@@ -36,7 +34,7 @@ RED, GREEN, BLUE = 9, 10, 11
 DEPTH = 12
 
 #: Sums over pixels that the backward pass leaves per drawn Gaussian and tile.
-PARTIAL = 12
+PARTIAL = 16
 SUM_1, SUM_D, SUM_DD, SUM_Y, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
 SUM_RED, SUM_GREEN, SUM_BLUE = 6, 7, 8
 SUM_DEPTH = 9
@@ -44,8 +42,8 @@ SUM_ABS_X, SUM_ABS_Y = 10, 11
 
 LOG2_E = 1.0 / math.log(2.0)
 #: A pixel is touched where the exponent plus log2 of the opacity reaches this.
-TOUCH = np.float32(-math.log2(255.0))
+TOUCH = -math.log2(255.0)
 #: Row extents are computed with this much to spare, so that rounding loses no touched pixel.
-SPARE = np.float32(1e-4)
+SPARE = 1e-4
 #: Compositing stops before a blend that would bring the transmittance below this.
-STOP = np.float32(1e-4)
+STOP = 1e-4

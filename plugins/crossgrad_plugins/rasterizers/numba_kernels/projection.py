@@ -32,6 +32,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
+    TOUCH,
     U_PART,
     U_WHOLE,
     V_PART,
@@ -65,7 +66,7 @@ def _row_hits(
     y: float,
     u: float,
     v: float,
-    c: float,
+    inverse_c: float,
     slope: float,
     variance: float,
     reach: float,
@@ -73,7 +74,7 @@ def _row_hits(
 ) -> bool:
     """Whether the footprint covers a pixel centre in image row `y`."""
     dy = y + 0.5 - v
-    left_over = (reach - dy * dy / c) * variance
+    left_over = (reach - dy * dy * inverse_c) * variance
     if not left_over >= 0.0:
         return False
     extent = math.sqrt(left_over)
@@ -87,7 +88,7 @@ def _hits(
     y1: float,
     u: float,
     v: float,
-    c: float,
+    inverse_c: float,
     slope: float,
     variance: float,
     reach: float,
@@ -95,11 +96,11 @@ def _hits(
 ) -> bool:
     """Whether the footprint covers any pixel centre in the image rows y0 to y1."""
     middle = clamped(np.floor(v), y0, y1)
-    if _row_hits(middle, u, v, c, slope, variance, reach, width):
+    if _row_hits(middle, u, v, inverse_c, slope, variance, reach, width):
         return True
     y = y0
     while y <= y1:
-        if _row_hits(y, u, v, c, slope, variance, reach, width):
+        if _row_hits(y, u, v, inverse_c, slope, variance, reach, width):
             return True
         y += 1.0
     return False
@@ -142,9 +143,11 @@ def _project_one(
     m = scaled_axes(row_x, turned, scales, i)
     n = scaled_axes(row_y, turned, scales, i)
     a, b, c, det, factor = covariance(m, n, dilation, antialiased)
-    slope, variance = b / c, det / c
-    reach = 2.0 * math.log(255.0 * opacity * factor)
-    decay = max(0.5 * LOG2_E / variance, _FLAT)
+    inverse_c = 1.0 / c
+    slope, variance = b * inverse_c, det * inverse_c
+    log_opacity = math.log2(opacity * factor)
+    reach = 2.0 / LOG2_E * (log_opacity - TOUCH)  # largest squared distance in standard deviations
+    decay = 0.5 * LOG2_E / variance
     # The sums are NaN or infinite if any term is, and then fail the comparison.
     if not (
         inverse_norm > 0.0
@@ -152,7 +155,7 @@ def _project_one(
         and variance > 0.0
         and reach >= 0.0
         and a + c + det < math.inf
-        and abs(u) + abs(v) + decay + 1.0 / c < _LARGEST
+        and abs(u) + abs(v) + decay + inverse_c < _LARGEST
         and abs(slope) < _STEEPEST
     ):
         return 0
@@ -161,7 +164,7 @@ def _project_one(
     y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, camera.height)
     if x0 > x1 or y0 > y1:
         return 0
-    if not _hits(y0, y1, u, v, c, slope, variance, reach, camera.width):
+    if not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, camera.width):
         return 0
     at = j * RECORD
     records[at + U_WHOLE] = np.floor(u)
@@ -169,10 +172,10 @@ def _project_one(
     records[at + V_WHOLE] = np.floor(v)
     records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
     records[at + SLOPE] = slope
-    records[at + ROW_DECAY] = max(0.5 * LOG2_E / c, _FLAT)
-    records[at + DECAY] = decay
-    records[at + WIDTH] = 1.0 / decay
-    records[at + LOG_OPACITY] = math.log2(opacity * factor)
+    records[at + ROW_DECAY] = max(0.5 * LOG2_E * inverse_c, _FLAT)
+    records[at + DECAY] = max(decay, _FLAT)
+    records[at + WIDTH] = min(2.0 / LOG2_E * variance, 1.0 / _FLAT)
+    records[at + LOG_OPACITY] = log_opacity
     records[at + DEPTH] = z
     depths[j] = z
     boxes[j, 0] = np.int32(x0) // TILE_WIDTH

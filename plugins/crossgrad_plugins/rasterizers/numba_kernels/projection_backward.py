@@ -36,7 +36,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SUM_Y,
     SUM_YY,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.simd import prefetch
+from crossgrad_plugins.rasterizers.numba_kernels.simd import (
+    LANES,
+    load,
+    prefetch,
+    splat,
+    store,
+)
 
 #: Slots ahead for which memory is asked.
 _AHEAD = 24
@@ -47,22 +53,30 @@ def _add_up(
     first: int,
     count: int,
     entry_of_slot: NDArray[np.int32],
-    masks: NDArray[np.uint32],
+    masks: NDArray[np.uint64],
     partials: NDArray[np.float32],
-    sums: NDArray[np.float64],
+    sums: NDArray[np.float32],
 ) -> bool:
-    """Adds up the sums of one record's entries; returns whether there were any."""
-    sums[:] = 0.0
+    """Adds up the sums of one record's entries; returns whether there were any.
+
+    `partials` ends with a row of zeros.
+    """
+    zeros = masks.shape[0]
+    low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
     found = False
     for slot in range(first, first + count):
         ahead = np.intp(entry_of_slot[min(slot + _AHEAD, entry_of_slot.shape[0] - 1)])
         prefetch(masks, ahead)
         prefetch(partials, ahead * PARTIAL)
         entry = np.intp(entry_of_slot[slot])
-        if masks[entry] != 0:
-            found = True
-            for k in range(sums.shape[0]):
-                sums[k] += np.float64(partials[entry * PARTIAL + k])
+        blended = masks[entry] != 0
+        # Rows of entries without a mask were never written.
+        row = (entry if blended else zeros) * PARTIAL
+        found |= blended
+        low = low + load(partials, row)
+        high = high + load(partials, row + LANES)
+    store(sums, 0, low)
+    store(sums, LANES, high)
     return found
 
 
@@ -76,16 +90,18 @@ def _outer_sum(
 
 @device
 def _covariance_gradient(
-    b: float, c: float, det: float, sums: NDArray[np.float64]
+    b: float, c: float, det: float, sums: NDArray[np.float32]
 ) -> tuple[float, float, float]:
     """Returns the gradients of A, B (as one number) and C of the dilated covariance."""
-    slope, inverse_variance = b / c, c / det
-    v_variance = 0.5 * inverse_variance * inverse_variance * sums[SUM_DD]
-    v_slope = inverse_variance * sums[SUM_DY]
+    inverse_c = 1.0 / c
+    slope, inverse_variance = b * inverse_c, c / det
+    v_variance = 0.5 * inverse_variance * inverse_variance * np.float64(sums[SUM_DD])
+    v_slope = inverse_variance * inverse_c * np.float64(sums[SUM_DY])
+    v_decay = 0.5 * inverse_c * inverse_c * np.float64(sums[SUM_YY])
     return (
         v_variance,
-        v_slope / c - 2.0 * slope * v_variance,
-        0.5 * sums[SUM_YY] / (c * c) - slope * v_slope / c + slope * slope * v_variance,
+        v_slope - 2.0 * slope * v_variance,
+        v_decay - slope * v_slope + slope * slope * v_variance,
     )
 
 
@@ -171,7 +187,7 @@ def _unproject_one(
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
     opacities: NDArray[np.float32],
-    sums: NDArray[np.float64],
+    sums: NDArray[np.float32],
     v_depth: float,
     v_means: NDArray[np.float32],
     v_quats: NDArray[np.float32],
@@ -197,7 +213,7 @@ def _unproject_one(
 
     v_a, v_b, v_c = _covariance_gradient(b, c, det, sums)
     if antialiased:
-        add_a, add_b, add_c = _factor_gradient(m, n, dilation, det, factor, sums[SUM_1])
+        add_a, add_b, add_c = _factor_gradient(m, n, dilation, det, factor, np.float64(sums[SUM_1]))
         v_a += add_a
         v_b += add_b
         v_c += add_c
@@ -217,14 +233,16 @@ def _unproject_one(
     )
     v_quats[i, 0], v_quats[i, 1], v_quats[i, 2], v_quats[i, 3] = v_quat
 
-    v_u = c / det * sums[SUM_D]
-    v_v = sums[SUM_Y] / c - b / det * sums[SUM_D]
+    inverse_det = 1.0 / det
+    sum_d = np.float64(sums[SUM_D])
+    v_u = c * inverse_det * sum_d
+    v_v = np.float64(sums[SUM_Y]) / c - b * inverse_det * sum_d
     v_centres[i, 0] = v_u
     v_centres[i, 1] = v_v
     if v_absolute.shape[0] > 0:
         # The sums are in units of the records' decays, log2(e) / 2 of the inverse variances.
-        v_absolute[i, 0] = c / det * sums[SUM_ABS_X]
-        v_absolute[i, 1] = 2.0 * math.log(2.0) * sums[SUM_ABS_Y]
+        v_absolute[i, 0] = c * inverse_det * np.float64(sums[SUM_ABS_X])
+        v_absolute[i, 1] = 2.0 * math.log(2.0) * np.float64(sums[SUM_ABS_Y])
 
     # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
     pose = camera.pose
@@ -247,7 +265,7 @@ def _unproject_one(
     v_z = v_depth - inverse_z * inverse_z * v_inverse_z
     for k in range(3):
         v_means[i, k] = pose[0, k] * v_x + pose[1, k] * v_y + pose[2, k] * v_z
-    v_opacities[i] = sums[SUM_1] / np.float64(opacities[i])
+    v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
 
 
 @parallel_kernel
@@ -264,7 +282,7 @@ def unproject(
     owners: NDArray[np.int32],
     shelves: NDArray[np.int32],
     entry_of_slot: NDArray[np.int32],
-    masks: NDArray[np.uint32],
+    masks: NDArray[np.uint64],
     partials: NDArray[np.float32],
     v_means: NDArray[np.float32],
     v_quats: NDArray[np.float32],
@@ -283,7 +301,7 @@ def unproject(
         drawn, owners: From `project`.
         shelves, entry_of_slot: From binning.
         masks: [E] from compositing.
-        partials: [E * PARTIAL] from `differentiate`.
+        partials: [(E + 1) * PARTIAL] from `differentiate`, the last row zero.
         v_means: [N, 3] written for Gaussians with entries, zero before; and so on:
         v_quats: [N, 4].
         v_scales: [N, 3].
@@ -292,13 +310,8 @@ def unproject(
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
-    used = SUM_DEPTH
-    if with_depth:
-        used = SUM_DEPTH + 1
-    if v_absolute.shape[0] > 0:
-        used = PARTIAL
     for chunk in prange(drawn.shape[0]):
-        sums = np.empty(used, np.float64)
+        sums = np.empty(PARTIAL, np.float32)
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
             if not _add_up(first, count, entry_of_slot, masks, partials, sums):
@@ -309,7 +322,7 @@ def unproject(
             v_colors[i, 2] = sums[SUM_BLUE]
             v_depth = 0.0
             if with_depth:
-                v_depth = sums[SUM_DEPTH]
+                v_depth = np.float64(sums[SUM_DEPTH])
             _unproject_one(
                 i,
                 camera,

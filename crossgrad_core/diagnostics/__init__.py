@@ -1,0 +1,1 @@
+"""Statistics of per-view gradients at frozen parameters, all from Gramians; and their report."""

@@ -1,0 +1,58 @@
+"""Sarle's bimodality coefficient."""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Smallest sample with a finite-sample kurtosis.
+_SMALLEST = 4
+
+
+@dataclass(frozen=True)
+class Bimodality:
+    """Sarle's coefficient of one sample.
+
+    For orientation: 1/3 for a normal law, 5/9 for a uniform one, 1 for any law on two points. Skew
+    alone reaches 5/9 (exponential law), and the finite-sample form stays below 1: two equally
+    populated points give 0.566 at n = 10 and 0.951 at n = 100, so n belongs to the figure.
+
+    Attributes:
+        sample: Finite-sample form with Fisher's G1 and G2; NaN where undefined.
+        population: Form with plain moments, (g1^2 + 1) / (g2 + 3); NaN where undefined.
+        size: n.
+        reason: Why a form is NaN; empty where both are defined.
+    """
+
+    sample: float
+    population: float
+    size: int
+    reason: str = ""
+
+
+def bimodality(values: NDArray[np.float64]) -> Bimodality:
+    """Sarle's coefficient of the values [n] in both forms.
+
+    Source: SAS/STAT user's guide, CLUSTER procedure (Sarle); Pfister et al. 2013.
+    """
+    size = len(values)
+    if size < _SMALLEST:
+        reason = f"{size} values; the coefficient needs {_SMALLEST}"
+        return Bimodality(float("nan"), float("nan"), size, reason)
+    deviations = values - values.mean()
+    spread = float(np.abs(deviations).max())
+    # Rounding of the mean leaves deviations of its own size where all values are equal.
+    if spread <= 4.0 * np.finfo(np.float64).eps * float(np.abs(values).max()):
+        return Bimodality(float("nan"), float("nan"), size, "all values are equal")
+    scaled = deviations / spread
+    m2, m3, m4 = (float((scaled**power).mean()) for power in (2, 3, 4))
+    g1, g2 = m3 / m2**1.5, m4 / m2**2 - 3.0
+    population = (g1**2 + 1.0) / (g2 + 3.0)
+    return Bimodality(_finite_sample(g1, g2, size), population, size)
+
+
+def _finite_sample(g1: float, g2: float, n: int) -> float:
+    skewness = g1 * sqrt(n * (n - 1.0)) / (n - 2.0)
+    kurtosis = (n - 1.0) * ((n + 1.0) * g2 + 6.0) / ((n - 2.0) * (n - 3.0))
+    return (skewness**2 + 1.0) / (kurtosis + 3.0 * (n - 1.0) ** 2 / ((n - 2.0) * (n - 3.0)))

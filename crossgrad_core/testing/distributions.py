@@ -1,0 +1,32 @@
+"""Installed packages made up on the spot, for tests of what offers plugins."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+
+def write_distribution(
+    folder: Path,
+    name: str,
+    plugins: Mapping[str, Mapping[str, str]],
+    modules: Mapping[str, str] | None = None,
+    version: str = "1.0",
+) -> None:
+    """Writes a package into a folder as an installer would; put the folder on `sys.path` to see it.
+
+    Args:
+        folder: Where to, as if it were site-packages; made where it is missing.
+        name: Name of the distribution.
+        plugins: Slot -> plugin name -> `module:Class`.
+        modules: Name of a top-level module -> its source.
+        version: Version of the distribution.
+    """
+    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    sections = [
+        "\n".join([f"[crossgrad.{slot}]", *(f"{key} = {value}" for key, value in each.items())])
+        for slot, each in plugins.items()
+    ]
+    (info / "entry_points.txt").write_text("\n\n".join(sections) + "\n")
+    for module, source in (modules or {}).items():
+        (folder / f"{module}.py").write_text(source)

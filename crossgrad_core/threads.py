@@ -1,0 +1,94 @@
+"""How many threads run, decided in one place for Numba and torch."""
+
+import math
+import os
+from pathlib import Path
+
+import torch
+
+from crossgrad_core.errors import UserError
+
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+
+
+def configure_threads(n: int | None = None) -> int:
+    """Gives Numba's kernels and torch's operators the same number of threads.
+
+    The threading layer of Numba is set to OpenMP where it can be loaded, else TBB, else Numba's own
+    "workqueue", unless the environment names one (`NUMBA_THREADING_LAYER`,
+    `NUMBA_THREADING_LAYER_PRIORITY`) or a parallel kernel has run already. Reasons, measured on two
+    cores with the wheels of torch and Numba for Linux:
+
+    - OpenMP wakes its threads in about 3 microseconds, workqueue in 40 to 80.
+    - torch brings its own copy of libgomp and Numba loads the system's, so there are two pools, and
+      idle threads of a pool spin for a while before they sleep. Numba's and torch's parallel operators
+      in turn take as long as the two apart when both are OpenMP. With workqueue, whose threads have to
+      be woken by the scheduler while torch's spin, the same loop takes up to twice as long.
+      `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per parallel call,
+      which small operators feel more than large ones gain: the default is left alone.
+    - workqueue ends the process when two Python threads enter parallel kernels at once; OpenMP and TBB
+      do not. OpenMP (GNU) in turn forbids parallel kernels in a forked child: start worker processes
+      with the "spawn" or "forkserver" method if they are to run any.
+
+    On the CPU torch runs backward passes in the thread that calls `backward`, so a parallel kernel
+    inside `torch.autograd.Function` meets the same pool as everywhere else. Numba's number of threads
+    belongs to the calling thread: a second thread that runs kernels has to call this function too.
+
+    Args:
+        n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else the
+            cores that this process may use (its affinity and, in a container, its CPU quota).
+
+    Returns:
+        The number of threads in force.
+
+    Raises:
+        UserError: If `n` is below 1 or above what Numba was started with.
+    """
+    import numba
+
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    if n is None:
+        n = min(_default_threads(), most)
+    if not 1 <= n <= most:
+        raise UserError(
+            "number of threads out of range",
+            where="threads",
+            expected=f"1 to {most}",
+            found=str(n),
+            todo=f"set NUMBA_NUM_THREADS={n} before the start to allow more" if n > most else "",
+        )
+    _prefer_openmp()
+    numba.set_num_threads(n)
+    torch.set_num_threads(n)
+    return n
+
+
+def _prefer_openmp() -> None:
+    """Puts OpenMP first among the threading layers; no effect once a layer runs."""
+    import numba
+
+    if not {"NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER_PRIORITY"} & os.environ.keys():
+        numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+
+
+def _default_threads() -> int:
+    for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+        value = os.environ.get(variable, "")
+        if value.isdecimal() and int(value) > 0:
+            return int(value)
+    return available_cores()
+
+
+def available_cores() -> int:
+    """Cores this process may use: its affinity, and at most its container's CPU quota, rounded up."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
+
+
+def _quota(limit: Path) -> int:
+    """CPU quota of a cgroup-v2 `cpu.max` file ("quota period" or "max period"), in whole cores."""
+    try:
+        quota, period = limit.read_text(encoding="ascii").split()
+        return max(1, math.ceil(int(quota) / int(period)))
+    except (OSError, ValueError):
+        return os.cpu_count() or 1

@@ -1,0 +1,99 @@
+"""Operators made of operators: by name, in configurations, and with their states side by side."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any, TypeAlias, cast
+
+from pydantic import BeforeValidator, PlainSerializer
+
+from crossgrad_core.component import Selection
+from crossgrad_core.operator import Operator
+from crossgrad_core.registry import build, entries
+from crossgrad_core.state import PluginState
+
+STATE_SEPARATOR = "/"
+
+
+def operator_of(value: object) -> Operator:
+    """An operator from itself, from its name, or from `{name: ..., option: ...}`."""
+    if isinstance(value, Operator):
+        return _checked(value)
+    if isinstance(value, str):
+        value = {"name": value}
+    if not isinstance(value, Mapping) or "name" not in value:
+        raise ValueError("must be an operator's name, or a name with options")
+    options = {key: option for key, option in value.items() if key != "name"}
+    return _checked(cast("Operator", build("operators", str(value["name"]), options)))
+
+
+def _checked(operator: Operator) -> Operator:
+    if operator.elementwise:
+        raise ValueError(
+            f"{name_of(operator)} works on elements, not on Gramians, and can only stand alone"
+        )
+    if operator.granularity != "tensor":
+        raise ValueError(
+            f"{name_of(operator)} cannot have a granularity of its own here; set it on the whole"
+        )
+    return operator
+
+
+def name_of(operator: Operator) -> str:
+    """The name under which an operator is installed, else that of its class."""
+    kind = type(operator)
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    found = [name for name, entry in entries("operators").items() if entry.value == value]
+    return found[0] if found else kind.__name__
+
+
+def plain(operator: Operator) -> dict[str, Any]:
+    """Name and options that were set, as `operator_of` reads them."""
+    return {"name": name_of(operator), **operator.model_dump(mode="json", exclude_defaults=True)}
+
+
+#: A field that holds an operator and is written as its name with its options.
+OperatorField: TypeAlias = Annotated[Operator, BeforeValidator(operator_of), PlainSerializer(plain)]
+
+
+def inner_state(state: PluginState, key: str) -> PluginState:
+    """The part of a state that belongs to the inner operator of that key."""
+    start = key + STATE_SEPARATOR
+    return PluginState(
+        values=_inner(state.values, start),
+        tensors=_inner(state.tensors, start),
+        per_primitive=_inner(state.per_primitive, start),
+    )
+
+
+def outer_state(states: Mapping[str, PluginState]) -> PluginState:
+    """One state from those of all inner operators, by key."""
+    return PluginState(
+        values=_outer({key: state.values for key, state in states.items()}),
+        tensors=_outer({key: state.tensors for key, state in states.items()}),
+        per_primitive=_outer({key: state.per_primitive for key, state in states.items()}),
+    )
+
+
+def inner_objections(selection: Selection, operator: Operator) -> list[str]:
+    """What an inner operator objects to in a selection."""
+    name = name_of(operator)
+    seen = replace(
+        selection,
+        components={**selection.components, "operator": operator},
+        names={**selection.names, "operator": name},
+    )
+    return list(operator.crossgrad_objections(seen) or ())
+
+
+def _inner(values: Mapping[str, Any], start: str) -> dict[str, Any]:
+    return {
+        name.removeprefix(start): value for name, value in values.items() if name.startswith(start)
+    }
+
+
+def _outer(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    return {
+        f"{key}{STATE_SEPARATOR}{name}": value
+        for key, values in parts.items()
+        for name, value in values.items()
+    }

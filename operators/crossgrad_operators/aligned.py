@@ -1,0 +1,30 @@
+"""Aligned-MTL (Senushkin et al. 2023, "Independent component alignment")."""
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+
+class Aligned(Operator):
+    """All singular values of the gradient matrix are brought down to its smallest one.
+
+    G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
+    K eps l_max. Where an eigenvalue falls below that, u jumps: the direction is left out and l_min
+    is the next one.
+    """
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.balance import aligned
+
+        return weighting(aligned(gramians, context.present)), state

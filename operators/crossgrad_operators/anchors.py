@@ -1,0 +1,47 @@
+"""Projection between anchor views only (arXiv 2605.00052, appendix on operator variants)."""
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import Selection, ViewCounts
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._labels import label_objections, labels_of
+from crossgrad_operators._pairs import project, slot_order
+
+
+class Anchors(Operator):
+    """`symmetric` between a nearest and a farthest view, `sum` between any others.
+
+    Meant for the sampler `anchors-30`: the nearest and the farthest 30 % of the cameras are
+    anchors, the middle contributes plain photometric gradients.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(2, 2)
+
+    near: str = Field("near", description="label of the near anchors")
+    far: str = Field("far", description="label of the far anchors")
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        pair = set(labels_of(context, "anchors")) == {self.near, self.far}
+        gates = np.full(gramians.shape, pair)
+        return project(gramians, context, slot_order(gramians.shape[1]), gates=gates), state
+
+    @hookimpl
+    @override
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Refuses other than two views, and samplers whose views carry no labels."""
+        counts = Operator.crossgrad_objections(self, selection)
+        return counts + label_objections(selection, (self.near, self.far))

@@ -1,0 +1,40 @@
+"""CAGrad (Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning")."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+
+class CAGrad(Operator):
+    """The direction near the mean that serves the worst-off view best.
+
+    max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
+    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views, all supports for up
+    to four, an active-set method above. With a single view it is that view's gradient.
+    """
+
+    c: float = Field(0.5, ge=0, description="radius of the search, as a share of |g_0|")
+    rescale: Literal["none", "1+c", "1+c^2"] = Field(
+        "none", description="what the direction is divided by"
+    )
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.simplex import cagrad
+
+        weights = cagrad(gramians, context.present, self.c)
+        scale = {"none": 1.0, "1+c": 1.0 / (1.0 + self.c), "1+c^2": 1.0 / (1.0 + self.c**2)}
+        return weighting(weights * scale[self.rescale]), state

@@ -1,0 +1,84 @@
+"""Operators one after the other: `a+b` on the command line."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.component import Selection
+from crossgrad_core.errors import UserError
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._nested import (
+    OperatorField,
+    inner_objections,
+    inner_state,
+    name_of,
+    outer_state,
+)
+
+#: Rows of a product that are shorter than this share of their terms are rounding noise.
+_NOISE = 1e-14
+
+
+class Chain(Operator):
+    """Each link works on what the one before made of the gradients; the last rows are added.
+
+    The chain's matrix is the product of its links' matrices; each link sees M Gram M^T, so that no
+    link touches anything of parameter size. Without links it is `sum`.
+    """
+
+    links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        blocks, views, _ = gramians.shape
+        product = np.tile(np.eye(views), (blocks, 1, 1))
+        seen, seen_context = gramians, context
+        states = {}
+        for place, link in enumerate(self.links):
+            if seen.shape[1] != views:
+                raise _reshaped(self.links[place - 1], seen.shape[1], views)
+            key = str(place)
+            matrices, states[key] = link.transform(seen, seen_context, inner_state(state, key), rng)
+            product = matrices @ product
+            seen = product @ gramians @ product.swapaxes(1, 2)
+            empty = _noise(seen, product, gramians)
+            product = np.where(empty[:, :, None], 0.0, product)
+            seen = np.where(empty[:, :, None] | empty[:, None, :], 0.0, seen)
+            seen_context = replace(context, present=~empty)
+        return product, outer_state(states)
+
+    @hookimpl
+    @override
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """What any link objects to."""
+        return [reason for link in self.links for reason in inner_objections(selection, link)]
+
+
+def _noise(
+    seen: NDArray[np.float64], product: NDArray[np.float64], gramians: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """[B, R] rows of M G that are zero, or what rounding left of terms that cancel."""
+    norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2))
+    terms = np.abs(product) @ norms[:, :, None]
+    empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2
+    return empty
+
+
+def _reshaped(link: Operator, rows: int, views: int) -> UserError:
+    return UserError(
+        f"operator {name_of(link)} cannot be followed by another one",
+        expected=f"as many directions as views, {views}",
+        found=str(rows),
+        todo="put it last in the chain",
+    )

@@ -1,0 +1,147 @@
+"""A different operator for each block (arXiv 2605.00052, appendix on operator variants)."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from typing_extensions import override
+
+from crossgrad_core.blocks import BlockKind
+from crossgrad_core.component import Selection
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._nested import (
+    OperatorField,
+    inner_objections,
+    inner_state,
+    outer_state,
+    plain,
+)
+from crossgrad_operators.confgate import ConfGate
+from crossgrad_operators.sum import Sum
+from crossgrad_operators.symmetric import Symmetric
+
+_KINDS = ("geometry", "appearance", "neutral")
+_OPACITY = frozenset({"opacity", "opacities"})
+
+
+class Rule(BaseModel):
+    """One block, or all blocks of a kind, and their operator."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    block: str
+    operator: OperatorField
+
+
+def _rules(value: object) -> object:
+    if isinstance(value, Mapping):
+        return tuple({"block": block, "operator": operator} for block, operator in value.items())
+    return value
+
+
+def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
+    return {rule.block: plain(rule.operator) for rule in rules}
+
+
+class Dispatch(Operator):
+    """Each block goes to the operator of its own rule, else of its kind's, else of the preset.
+
+    Presets (the paper's two variants): `geometry-confgate` gates the geometry and adds the
+    appearance; `geometry-projection` projects the geometry and gates the appearance.
+    """
+
+    preset: Literal["geometry-confgate", "geometry-projection"] = Field(
+        "geometry-confgate", description="what serves blocks without a rule"
+    )
+    rules: Annotated[tuple[Rule, ...], BeforeValidator(_rules), PlainSerializer(_as_mapping)] = (
+        Field((), description="block or kind (geometry, appearance, neutral) -> operator")
+    )
+    opacity: Literal["appearance", "geometry"] = Field(
+        "appearance", description="which kind the opacity block is of"
+    )
+    neutral: Literal["appearance", "geometry"] = Field(
+        "appearance", description="the kind whose preset serves blocks of neither kind"
+    )
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        served = self._served(context)
+        operators = self._operators()
+        matrices = np.zeros(gramians.shape)
+        states = {}
+        for key in dict.fromkeys(served.tolist()):
+            part = np.flatnonzero(served == key)
+            found, states[key] = operators[key].transform(
+                gramians[part], _part(context, part), inner_state(state, key), rng
+            )
+            # Rows are added in the end, so that fewer or more of them make no difference here.
+            if found.shape[1] != gramians.shape[1]:
+                found = _in_first_row(found, gramians.shape[1])
+            matrices[part] = found
+        return matrices, outer_state(states)
+
+    @hookimpl
+    @override
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """What any of the operators objects to, and rules for blocks that do not exist."""
+        reasons = [
+            reason
+            for operator in self._operators().values()
+            for reason in inner_objections(selection, operator)
+        ]
+        blocks = [block.name for block in selection.backbone.blocks()]
+        for rule in self.rules:
+            if rule.block not in (*_KINDS, *blocks):
+                known = ", ".join((*_KINDS, *blocks))
+                reasons.append(f"dispatch has a rule for {rule.block!r}; there are {known}")
+        return reasons
+
+    def _operators(self) -> dict[str, Operator]:
+        """Key of a rule -> operator."""
+        presets: dict[str, dict[str, Operator]] = {
+            "geometry-confgate": {"geometry": ConfGate(), "appearance": Sum()},
+            "geometry-projection": {"geometry": Symmetric(), "appearance": ConfGate()},
+        }
+        chosen = presets[self.preset]
+        chosen["neutral"] = chosen[self.neutral]
+        return chosen | {rule.block: rule.operator for rule in self.rules}
+
+    def _served(self, context: OperatorContext) -> NDArray[np.str_]:
+        """[B] key of the rule that serves each Gramian."""
+        ruled = {rule.block for rule in self.rules}
+        kind_of = {
+            name: self._key(name, kind, ruled)
+            for name, kind in dict(zip(context.blocks, context.kinds, strict=True)).items()
+        }
+        return np.array([kind_of[name] for name in context.blocks])
+
+    def _key(self, name: str, kind: BlockKind, ruled: set[str]) -> str:
+        if name in ruled:
+            return name
+        return self.opacity if name in _OPACITY else kind
+
+
+def _part(context: OperatorContext, part: NDArray[np.int64]) -> OperatorContext:
+    return replace(
+        context,
+        blocks=tuple(context.blocks[b] for b in part),
+        kinds=tuple(context.kinds[b] for b in part),
+        present=context.present[part],
+    )
+
+
+def _in_first_row(matrices: NDArray[np.float64], views: int) -> NDArray[np.float64]:
+    result = np.zeros((len(matrices), views, views))
+    result[:, 0] = matrices.sum(axis=1)
+    return result

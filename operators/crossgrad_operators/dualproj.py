@@ -1,0 +1,29 @@
+"""DualProj (Lopez-Paz and Ranzato 2017; weighting of the same name in TorchJD)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+
+class DualProj(Operator):
+    """The mean gradient, projected on the cone that conflicts with no gradient.
+
+    v = argmin v^T G v subject to v >= 1/K; u = v G. All active sets for up to four views, Lawson
+    and Hanson's method above.
+    """
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.cone import dualproj
+
+        return weighting(dualproj(gramians, context.present)), state

@@ -1,0 +1,83 @@
+"""GradDrop (Chen et al. 2020, "Just pick a sign")."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contexts import AggregateContext, Aggregated
+from crossgrad_core.errors import UserError
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+
+
+class GradDrop(Operator):
+    """In every element either the positive or the negative gradients are kept, by chance.
+
+    With p the sum of the positive and n that of the negative magnitudes, the positive ones are kept
+    with probability p / (p + n), else the negative ones; one uniform number per element serves all
+    views. The expectation is `sum`. Works on elements, so that granularity means nothing here.
+    """
+
+    elementwise: ClassVar[bool] = True
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        """Refused: signs of elements cannot be told from a Gramian.
+
+        Raises:
+            UserError: Always.
+        """
+        raise UserError(
+            "operator graddrop works on elements, not on Gramians",
+            todo="use it alone, not in a chain or for single blocks",
+        )
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[Aggregated, PluginState]:
+        gradients = context.gradients
+        finite, present = gradients.finite("tensor"), gradients.present("tensor")
+        seed = int(context.rng.integers(2**63))
+        generators: dict[torch.device, torch.Generator] = {}
+
+        def drop(_name: str, views: Sequence[Tensor | None]) -> Tensor | None:
+            given = [g for g in views if g is not None]
+            if not given:
+                return None
+            device = given[0].device
+            if device not in generators:
+                generators[device] = torch.Generator(device).manual_seed(seed)
+            return _one_sign(given, generators[device])
+
+        counts = {
+            "zero": int((finite & ~present).any(axis=1).sum()),
+            "dropped": int((~finite).any(axis=1).sum()),
+        }
+        return Aggregated(gradients.elementwise(drop), counts), state
+
+
+def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
+    """The sum of the positive or of the negative elements in each place."""
+    first = views[0]
+    dtype = torch.promote_types(first.dtype, torch.float32)
+    positive = torch.zeros_like(first, dtype=dtype)
+    negative = torch.zeros_like(first, dtype=dtype)
+    for gradient in views:
+        positive += gradient.clamp(min=0)
+        negative -= gradient.clamp(max=0)
+    draws = torch.rand(first.shape, generator=generator, dtype=dtype, device=first.device)
+    # 1 / (1 + n / p) is p / (p + n) without an overflow of p + n; 0 / 0 keeps the zero.
+    keep = draws < 1 / (1 + negative / positive)
+    return torch.where(keep, positive, -negative).to(first.dtype)

@@ -1,0 +1,38 @@
+"""GradVac (Wang et al. 2021, "Gradient vaccine")."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._memory import recall, remember
+from crossgrad_operators._pairs import random_order
+
+
+class GradVac(Operator):
+    """Each gradient is turned towards its partners until their usual cosine is met; u is the sum.
+
+    For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of
+    g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, kept within
+    +-0.999. The targets start at 0, where the rule is PCGrad's; i and j are slots, not cameras.
+    """
+
+    beta: float = Field(0.5, ge=0, le=1, description="weight of the newest cosine in the target")
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.projection import aligned_to_targets
+
+        views = gramians.shape[1]
+        targets = recall(state, context, "target", (views, views))
+        order = random_order(views, rng)
+        matrices = aligned_to_targets(gramians, context.present, order, targets, self.beta)
+        return matrices, remember(state, context, "target", targets)

@@ -1,0 +1,41 @@
+"""The mean of the views' gradients."""
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.contexts import AggregateContext, Aggregated
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators.sum import Sum
+
+
+class Mean(Operator):
+    """u = (1/K) sum of g_k; K counts all views of the step, also those without a gradient.
+
+    Under Adam the same as `sum` up to the optimizer's eps. Needs no separate gradients.
+    """
+
+    separate: ClassVar[bool] = False
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        blocks, views, _ = gramians.shape
+        return np.tile(np.eye(views) / views, (blocks, 1, 1)), state
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[Aggregated, PluginState]:
+        total, state = Sum().aggregate(context, state)
+        views = context.gradients.views
+        gradients = {name: None if g is None else g / views for name, g in total.gradients.items()}
+        return Aggregated(gradients, total.counts), state

@@ -1,0 +1,30 @@
+"""Nash-MTL (Navon et al. 2022, "Multi-task learning as a bargaining game")."""
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+
+class Nash(Operator):
+    """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
+
+    Closed form for two views, damped Newton above (decrement 1e-13). |u| would always be sqrt(K);
+    it is multiplied by the geometric mean of the norms, so that u scales with the gradients and a
+    single view stays as it is. Zero where the gradients oppose each other exactly.
+    """
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.balance import nash
+
+        return weighting(nash(gramians, context.present)), state

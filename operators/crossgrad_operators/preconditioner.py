@@ -1,0 +1,45 @@
+"""Magnitude-only distance preconditioner (arXiv 2605.00052, equation preconditioner)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+#: Bounds of r / r_ref: a camera at the centroid must not lose all weight.
+_BOUNDS = (1e-2, 1e2)
+
+
+class Preconditioner(Operator):
+    """g_k is multiplied by (r_k / r_ref)^d; then the gradients are added.
+
+    r_k is the distance of the camera from the mean training camera, r_ref the median of these, and
+    their ratio is kept within [1e-2, 1e2]. The exponent depends on the kind of the block. Gradients
+    of far views grow, those of near views shrink. No Gramian is looked at.
+    """
+
+    geometry: float = Field(2.0, description="exponent d for means, scales and rotations")
+    appearance: float = Field(1.0, description="exponent d for opacity and colour")
+    neutral: float = Field(1.0, description="exponent d for blocks of neither kind")
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        ratios = np.ones(gramians.shape[1])
+        if context.reference_distance > 0:
+            ratios = np.clip(context.distances / context.reference_distance, *_BOUNDS)
+        powers = {
+            "geometry": ratios**self.geometry,
+            "appearance": ratios**self.appearance,
+            "neutral": ratios**self.neutral,
+        }
+        weights = np.array([powers[kind] for kind in context.kinds])
+        return weighting(weights.reshape(gramians.shape[:2])), state

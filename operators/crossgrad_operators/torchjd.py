@@ -1,0 +1,96 @@
+"""Any stateless Gramian weighting of TorchJD by name (optional extra `torchjd`)."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.operator import Operator, OperatorContext
+from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import weighting
+
+_Value: TypeAlias = bool | int | float | str
+
+
+def _pairs(value: object) -> object:
+    return tuple(value.items()) if isinstance(value, Mapping) else value
+
+
+class TorchJD(Operator):
+    """w = Weighting(G / trace G), for the weighting classes of torchjd.aggregation.
+
+    G is divided by its trace because TorchJD compares it with absolute thresholds; views without a
+    gradient are left out of it. Weightings that remember earlier steps are refused: what they
+    remember could not be resumed.
+    """
+
+    weighting: str = Field(
+        "AlignedMTL", description="name of a TorchJD weighting, with or without `Weighting`"
+    )
+    options: Annotated[
+        tuple[tuple[str, _Value], ...], BeforeValidator(_pairs), PlainSerializer(dict)
+    ] = Field((), description="the weighting's own arguments")
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        import torch
+
+        weights = np.zeros(gramians.shape[:2])
+        rule = self._built()
+        # TorchJD draws from the global generator, which must come out of here unchanged.
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            torch.manual_seed(int(rng.integers(2**63)))
+            for block, present in enumerate(context.present):
+                chosen = np.flatnonzero(present)
+                if chosen.size:
+                    part = gramians[block][np.ix_(chosen, chosen)]
+                    found = rule(torch.from_numpy(part / np.trace(part)))
+                    weights[block, chosen] = found.double().numpy()
+        return weighting(weights), state
+
+    def _built(self) -> Any:  # noqa: ANN401 - TorchJD may be absent
+        try:
+            from torchjd import aggregation
+        except ImportError:
+            raise UserError(
+                "operator torchjd needs the package torchjd",
+                todo='install it: pip install "crossgrad[torchjd]"',
+            ) from None
+        name = self.weighting.removesuffix("Weighting") + "Weighting"
+        found = getattr(aggregation, name, None)
+        if found is None:
+            known = sorted(
+                n.removesuffix("Weighting") for n in dir(aggregation) if "Weighting" in n
+            )
+            raise UserError(
+                f"TorchJD has no weighting named {self.weighting!r}",
+                where="operator.weighting",
+                expected=f"one of {', '.join(filter(None, known))}",
+            )
+        if hasattr(found, "reset"):
+            raise UserError(
+                f"TorchJD's {name} remembers earlier steps and could not be resumed",
+                where="operator.weighting",
+                todo="use crossgrad's own operator of that name, or another weighting",
+            )
+        return self._called(found)
+
+    def _called(self, kind: Any) -> Any:  # noqa: ANN401
+        try:
+            return kind(**dict(self.options))
+        except (ImportError, TypeError, ValueError) as error:
+            raise UserError(
+                f"TorchJD's {kind.__name__} cannot be made",
+                where="operator.options",
+                found=str(error),
+            ) from error

@@ -1,0 +1,123 @@
+"""The CPU rasterizer: tiles, hand-written backward pass, all cores, the same bits on any number."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.gaussians import Gaussians, Render, Screen
+from crossgrad_core.rasterizer import Rasterizer
+from crossgrad_core.scene.types import Camera
+from crossgrad_plugins.rasterizers.numba_kernels.frame import (
+    CameraArrays,
+    DrawOptions,
+    Frame,
+    GaussianArrays,
+    backward,
+    forward,
+)
+
+#: The differentiable inputs in the order in which autograd sees them.
+_INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+
+
+class NumbaRasterizer(Rasterizer):
+    """Draws float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+
+    @override
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        options = DrawOptions(
+            max_alpha=self.max_alpha,
+            near=self.near,
+            dilation=self.dilation if gaussians.dilation is None else gaussians.dilation,
+            antialiased=gaussians.response == "antialiased",
+            depth="depth" in outputs,
+            pixels="pixels" in outputs,
+        )
+        screen = Screen(radii=torch.empty(0, dtype=torch.int32))
+        call = _Call(gaussians.sh_degree, camera, background, options, screen, outputs)
+        tensors = [getattr(gaussians, name) for name in _INPUTS]
+        image, alpha, depth = _Draw.apply(call, *tensors)  # type: ignore[no-untyped-call]
+        return Render(image, alpha, screen, depth)
+
+
+class _Call:
+    """What autograd must carry besides tensors."""
+
+    def __init__(
+        self,
+        degree: int,
+        camera: Camera,
+        background: Tensor,
+        options: DrawOptions,
+        screen: Screen,
+        outputs: frozenset[str],
+    ) -> None:
+        self.degree = degree
+        self.camera = camera
+        self.background = background
+        self.options = options
+        self.screen = screen
+        self.absolute = "abs_gradient" in outputs
+        self.frame: Frame | None = None
+
+
+def _array(tensor: Tensor | None) -> Any:
+    return None if tensor is None else np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+
+
+def _gaussians(degree: int, tensors: tuple[Tensor | None, ...]) -> GaussianArrays:
+    means, quats, scales, opacities, colors, dc, rest = (_array(tensor) for tensor in tensors)
+    if dc is not None and rest is None:
+        rest = np.empty((dc.shape[0], 0, 3), np.float32)
+    return GaussianArrays(means, quats, scales, opacities, colors, dc, rest, degree)
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> Any:
+        camera = call.camera
+        frame = forward(
+            _gaussians(call.degree, tensors),
+            CameraArrays(
+                camera.world_to_camera.numpy().astype(np.float32),
+                camera.matrix.numpy().astype(np.float32),
+                camera.width,
+                camera.height,
+            ),
+            _array(call.background),
+            call.options,
+        )
+        call.frame = frame
+        call.screen.radii = torch.from_numpy(frame.projected.radii)
+        call.screen.pixels = None if frame.pixels is None else torch.from_numpy(frame.pixels)
+        ctx.call = call
+        ctx.set_materialize_grads(False)
+        depth = None if frame.depth is None else torch.from_numpy(frame.depth)
+        return torch.from_numpy(frame.image), torch.from_numpy(frame.alpha), depth
+
+    @staticmethod
+    def backward(ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, v_depth: Any) -> Any:
+        call: _Call = ctx.call
+        frame = call.frame
+        if frame is None:
+            raise RuntimeError("the forward pass did not run")
+        v = np.zeros_like(frame.image) if v_image is None else _array(v_image)
+        found = backward(frame, v, _array(v_alpha), _array(v_depth), absolute=call.absolute)
+        call.screen.mean_gradient = torch.from_numpy(found.centres)
+        if found.absolute is not None:
+            call.screen.abs_gradient = torch.from_numpy(found.absolute)
+        colors = found.colors if frame.gaussians.colors is not None else None
+        rest = found.rest if found.rest is not None and found.rest.shape[1] else None
+        arrays = (found.means, found.quats, found.scales, found.opacities, colors, found.dc, rest)
+        return None, *(None if array is None else torch.from_numpy(array) for array in arrays)

@@ -1,0 +1,245 @@
+"""`crossgrad plugins`, help texts and exit codes."""
+
+import sys
+
+import pytest
+
+from crossgrad_core import __version__, registry
+from crossgrad_core.cli import main as command
+from crossgrad_core.cli.main import main
+from crossgrad_core.slots import GROUPS
+from crossgrad_core.testing.distributions import write_distribution
+
+OPERATOR = """
+import numpy as np
+from pydantic import Field
+from crossgrad_core.plugin import Operator, ViewCounts
+
+class Halving(Operator):
+    '''Adds half of every gradient.'''
+
+    views = ViewCounts(2, 4)
+    share: float = Field(0.5, gt=0, le=1, description="what is left of each gradient")
+
+    def transform(self, gramians, context, state, rng):
+        weights = np.where(context.present, self.share, 0.0)
+        return weights[:, None, :], state
+
+class Absolute(Halving):
+    def transform(self, gramians, context, state, rng):
+        weights = 1.0 / np.sqrt(1e-8 + np.einsum("bkk->bk", gramians))
+        return np.where(context.present, weights, 0.0)[:, None, :], state
+"""
+
+
+@pytest.fixture(autouse=True)
+def narrow(monkeypatch):
+    """A terminal of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "dumb")
+
+
+@pytest.fixture
+def ran(capsys):
+    """Runs a command; gives its exit code and what it printed."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        printed = capsys.readouterr()
+        return ended.value.code, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture
+def third_party(tmp_path, monkeypatch):
+    operators = {"halving": "made_up_cli:Halving", "absolute": "made_up_cli:Absolute"}
+    write_distribution(
+        tmp_path / "good", "half-package", {"operators": {"halving": operators["halving"]}}
+    )
+    write_distribution(
+        tmp_path / "bad", "bad-package", {"operators": operators | {"lost": "made_up_lost:A"}}
+    )
+    (tmp_path / "good" / "made_up_cli.py").write_text(OPERATOR)
+    monkeypatch.syspath_prepend(tmp_path / "good")
+    yield tmp_path / "bad"
+    sys.modules.pop("made_up_cli", None)
+
+
+def test_version(ran):
+    assert ran("--version") == (0, f"crossgrad {__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("--help",),
+        ("run", "--help"),
+        ("eval", "--help"),
+        ("render", "-h"),
+        ("export", "-h"),
+        ("plugins", "--help"),
+        ("plugins", "list", "-h"),
+        ("plugins", "show", "-h"),
+        ("plugins", "check", "-h"),
+    ],
+    ids=" ".join,
+)
+def test_help_fits_the_terminal(ran, arguments):
+    code, out, err = ran(*arguments)
+    assert (code, err) == (0, "")
+    assert out.startswith("Usage: crossgrad")
+    assert max(map(len, out.splitlines())) <= 80
+    assert "..." not in out.partition("Commands:")[2]
+
+
+def test_help_of_run_is_grouped(ran):
+    out = ran("run", "--help")[1]
+    titles = ["Arguments:", "Configuration:", "Components", "Training:", "Scene:", "Results:"]
+    places = [out.index(title) for title in titles]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("arguments", [("plugins",), ("plugins", "list")], ids=" ".join)
+def test_the_list_names_every_plugin_with_its_package(ran, arguments):
+    code, out, _ = ran(*arguments)
+    assert code == 0
+    for slot in GROUPS:
+        assert f"\n{slot}\n" in f"\n{out}"
+        for entry in registry.offers(slot):
+            assert f"  {entry.name} " in out
+            assert f"{entry.distribution} {entry.version}" in out
+
+
+@pytest.mark.parametrize("slot", ["operators", "operator"])
+def test_the_list_of_one_slot(ran, slot):
+    out = ran("plugins", "list", "--slot", slot)[1]
+    assert "symmetric" in out
+    assert "samplers" not in out
+
+
+def test_a_name_offered_twice_is_marked_in_the_list(ran, third_party, monkeypatch):
+    monkeypatch.syspath_prepend(third_party)
+    rows = [row for row in ran("plugins")[1].splitlines() if row.startswith("  halving ")]
+    assert len(rows) == 2
+    assert all("offered twice" in row for row in rows)
+
+
+def test_an_unknown_slot_is_refused(ran):
+    code, out, err = ran("plugins", "list", "--slot", "oprators")
+    assert (code, out) == (2, "")
+    assert "did you mean 'operators'?" in err
+
+
+def test_show_tells_options_bounds_docstring_and_package(ran, third_party):
+    code, out, _ = ran("plugins", "show", "halving")
+    assert code == 0
+    for words in (
+        "operator halving, from half-package 1.0",
+        "made_up_cli:Halving",
+        "Adds half of every gradient.",
+        "views per step: 2 <= K <= 4",
+        "--set operator.OPTION=VALUE",
+        "share  (float, default 0.5, > 0, <= 1)",
+        "what is left of each gradient",
+        "granularity  (tensor | group | global | gaussian, default tensor)",
+    ):
+        assert words in out
+
+
+@pytest.mark.parametrize("slot", list(GROUPS))
+def test_every_plugin_of_ours_can_be_shown_in_80_columns(ran, slot):
+    for entry in registry.offers(slot):
+        if entry.distribution == "crossgrad":
+            code, out, err = ran("plugins", "show", entry.name, "--slot", slot)
+            assert (code, err) == (0, ""), entry
+            assert max(map(len, out.splitlines())) <= 80, entry
+
+
+def test_an_unknown_plugin_is_refused(ran):
+    code, _, err = ran("plugins", "show", "symetric")
+    assert code == 2
+    assert "did you mean 'symmetric'?" in err
+
+
+@pytest.mark.parametrize("package", ["half-package", "half_package", "Half.Package", "made_up_cli"])
+def test_check_passes_a_good_package(ran, third_party, package):
+    code, out, _ = ran("plugins", "check", package)
+    assert code == 0
+    assert "half-package 1.0" in out
+    assert "operator halving  pass" in out
+    assert "1 of 1 plugins keep the contract" in out
+
+
+def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatch):
+    monkeypatch.syspath_prepend(third_party)
+    code, out, err = ran("plugins", "check", "bad-package")
+    flat = " ".join(out.split())
+    assert (code, err) == (1, "")
+    assert "operator halving pass" in flat
+    assert "operator absolute FAIL" in flat
+    assert "scales with the gradients" in flat
+    assert "compare lengths with each other" in flat
+    assert "it can be loaded: ModuleNotFoundError: No module named 'made_up_lost'" in flat
+    assert "1 of 3 plugins keep the contract" in flat
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("package", "words"),
+    [
+        ("numpy", "package 'numpy' offers no plugins"),
+        ("crossgrda", "did you mean 'crossgrad'?"),
+        ("", "there is no installed package"),
+        ("..", "there is no installed package"),
+    ],
+)
+def test_check_refuses_what_offers_nothing(ran, package, words):
+    code, out, err = ran("plugins", "check", package)
+    assert (code, out) == (2, "")
+    assert words in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("runn",),
+        ("run", "--operater", "sum"),
+        ("run", "--steps"),
+        ("run", "--steps", "many"),
+        ("run", "a", "b"),
+        ("plugins", "show"),
+        ("eval",),
+        ("render", "run", "--split", "both"),
+        ("export", "run", "--format", "obj"),
+    ],
+    ids=" ".join,
+)
+def test_bad_usage_ends_with_one_message_and_code_2(ran, arguments):
+    code, out, err = ran(*arguments)
+    assert (code, out) == (2, "")
+    assert err.count("Error: ") == 1
+    assert "Traceback" not in err
+    assert "─" not in err
+
+
+def test_an_interrupt_ends_with_130(ran, monkeypatch):
+    def interrupted(slot):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(registry, "offers", interrupted)
+    code, _, err = ran("plugins", "list")
+    assert (code, err) == (130, "interrupted\n")
+
+
+def test_our_own_mistakes_keep_their_traceback(monkeypatch):
+    def broken(slot):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(registry, "offers", broken)
+    before = sys.excepthook
+    with pytest.raises(RuntimeError, match="a bug"):
+        command.main(["plugins", "list"])
+    assert sys.excepthook is before

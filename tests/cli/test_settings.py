@@ -1,0 +1,212 @@
+"""File < options < --set, and what a choice of components keeps and drops."""
+
+import pytest
+
+from crossgrad_core.cli.settings import merged
+from crossgrad_core.errors import UserError
+
+CONFIG = """
+steps: 100
+operator: {name: cagrad, c: 0.4}
+observers: [progress, {name: rate, every: 10}]
+reading: {max_size: 640}
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(CONFIG)
+    return path
+
+
+def written(tmp_path, text):
+    path = tmp_path / "other.yaml"
+    path.write_text(text)
+    return path
+
+
+def refusal(*arguments):
+    with pytest.raises(UserError) as caught:
+        merged(*arguments)
+    return caught.value
+
+
+def test_nothing_given_sets_nothing():
+    assert merged(None, {"steps": None, "observe": None, "scene": None}, []) == {}
+
+
+def test_a_file_is_read_with_choices_in_their_long_form(config):
+    assert merged(config, {}, []) == {
+        "steps": 100,
+        "operator": {"name": "cagrad", "c": 0.4},
+        "observers": [{"name": "progress"}, {"name": "rate", "every": 10}],
+        "reading": {"max_size": 640},
+    }
+
+
+def test_options_win_over_the_file_and_assignments_over_both(config):
+    assert merged(config, {"steps": 200}, [])["steps"] == 200
+    assert merged(config, {"steps": 200}, ["steps=300"])["steps"] == 300
+
+
+def test_unset_options_leave_the_file_alone(config):
+    assert merged(config, {"steps": None, "observe": []}, []) == merged(config, {}, [])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "place"),
+    [
+        ("max_size", 320, ("reading", "max_size")),
+        ("split", "none", ("reading", "split")),
+        ("test_every", 4, ("reading", "test_every")),
+        ("init", "random", ("reading", "init")),
+    ],
+)
+def test_options_about_the_scene_have_a_group_of_their_own(name, value, place):
+    assert merged(None, {name: value}, []) == {place[0]: {place[1]: value}}
+
+
+def test_paths_become_text(tmp_path):
+    assert merged(None, {"scene": tmp_path, "out": tmp_path}, []) == {
+        "scene": str(tmp_path),
+        "out": str(tmp_path),
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.4", 0.4),
+        ("1e-3", 1e-3),
+        ("3E5", 3e5),
+        ("-2", -2),
+        ("010", 10),
+        ("true", True),
+        ("no", "no"),
+        ("12:30", "12:30"),
+        ("2024-01-01", "2024-01-01"),
+        ("null", None),
+        ("word", "word"),
+        ("'7'", "7"),
+        ("[1, 2.5]", [1, 2.5]),
+        ("a=b", "a=b"),
+    ],
+)
+def test_values_are_typed_as_users_mean_them(text, value):
+    found = merged(None, {}, [f"operator.c={text}"])["operator"]["c"]
+    assert found == value
+    assert type(found) is type(value)
+
+
+def test_infinity_is_a_number():
+    assert merged(None, {}, ["operator.c=.inf"])["operator"]["c"] == float("inf")
+
+
+@pytest.mark.parametrize("how", [({"operator": "pcgrad"}, []), ({}, ["operator=pcgrad"])])
+def test_another_component_drops_the_options_of_the_old_one(config, how):
+    assert merged(config, *how)["operator"] == {"name": "pcgrad"}
+
+
+def test_the_same_component_keeps_its_options(config):
+    assert merged(config, {"operator": "cagrad"}, [])["operator"] == {"name": "cagrad", "c": 0.4}
+
+
+@pytest.mark.parametrize(
+    "assignments",
+    [["operator.name=pcgrad", "operator.x=1"], ["operator.x=1", "operator.name=pcgrad"]],
+)
+def test_the_order_of_assignments_does_not_matter(config, assignments):
+    assert merged(config, {}, assignments)["operator"] == {"name": "pcgrad", "x": 1}
+
+
+def test_options_alone_belong_to_the_component_that_is_taken_by_default():
+    settings = merged(None, {}, ["rasterizer.max_alpha=0.999", "sampler.order=epoch"])
+    assert settings["rasterizer"] == {"name": "auto", "max_alpha": 0.999}
+    assert settings["sampler"] == {"name": "random", "order": "epoch"}
+
+
+def test_options_alone_in_a_file_belong_to_what_is_chosen_later(tmp_path):
+    path = written(tmp_path, "operator: {c: 0.3}")
+    assert merged(path, {"operator": "cagrad"}, [])["operator"] == {"name": "cagrad", "c": 0.3}
+
+
+def test_a_chain_is_a_list_of_choices():
+    links = [{"name": "preconditioner"}, {"name": "symmetric"}]
+    assert merged(None, {"operator": "preconditioner+symmetric"}, [])["operator"] == links
+
+
+def test_options_of_a_link_are_found_by_its_name():
+    settings = merged(None, {"operator": "a+b"}, ["operator.b.c=1"])
+    assert settings["operator"] == [{"name": "a"}, {"name": "b", "c": 1}]
+
+
+def test_a_link_keeps_its_options_in_another_chain(config):
+    links = [{"name": "preconditioner"}, {"name": "cagrad", "c": 0.4}]
+    assert merged(config, {"operator": "preconditioner+cagrad"}, [])["operator"] == links
+
+
+def test_an_option_of_a_chain_must_say_whose_it_is():
+    error = refusal(None, {"operator": "a+b"}, ["operator.c=1"])
+    assert error.expected == "operator.a.c, operator.b.c"
+
+
+def test_observers_are_added_and_their_options_found_by_name(config):
+    settings = merged(config, {"observe": ["clip", "progress"]}, ["observers.clip.max_norm=0.1"])
+    assert settings["observers"] == [
+        {"name": "progress"},
+        {"name": "rate", "every": 10},
+        {"name": "clip", "max_norm": 0.1},
+    ]
+
+
+def test_observers_may_be_written_as_a_mapping(tmp_path):
+    path = written(tmp_path, "observers: {clip: {max_norm: 0.1}, rate: }")
+    expected = [{"name": "clip", "max_norm": 0.1}, {"name": "rate"}]
+    assert merged(path, {}, [])["observers"] == expected
+
+
+def test_options_of_an_observer_that_is_not_there_are_refused():
+    assert "--observe NAME" in refusal(None, {}, ["observers.clip.max_norm=1"]).todo
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("steps", "KEY=VALUE"),
+        ("=3", "KEY=VALUE"),
+        ("operator..c=3", "KEY=VALUE"),
+        ("operator.c=[1", "not valid YAML"),
+        ("steps.c=1", "plain setting"),
+        ("steps.c.d=1", "plain setting"),
+    ],
+)
+def test_assignments_that_make_no_sense_are_refused(config, assignment, words):
+    assert words in str(refusal(config, {}, [assignment]))
+
+
+def test_unknown_keys_are_left_to_the_validation():
+    assert merged(None, {}, ["stepps=3", "a.b=1"]) == {"stepps": 3, "a": {"b": 1}}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("steps: [1\n", "line 2"),
+        ("- a\n- b\n", "holds no settings"),
+        ("steps: 1\nsteps: 2\n", "'steps' occurs twice"),
+    ],
+)
+def test_broken_files_are_refused_with_the_place(tmp_path, text, words):
+    path = written(tmp_path, text)
+    error = refusal(path, {}, [])
+    assert error.where == str(path)
+    assert words in str(error)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    assert "cannot be read" in refusal(tmp_path / "gone.yaml", {}, []).what
+
+
+def test_an_empty_file_sets_nothing(tmp_path):
+    assert merged(written(tmp_path, "# nothing yet\n"), {}, []) == {}

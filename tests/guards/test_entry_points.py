@@ -1,0 +1,55 @@
+"""Each entry point loads, and each component that ships has an entry point."""
+
+import inspect
+import pkgutil
+from importlib import import_module
+from importlib.util import find_spec
+
+import pytest
+
+from crossgrad_core import registry
+from crossgrad_core.component import Component
+from crossgrad_core.slots import GROUPS
+
+SHELVES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
+OURS = [
+    entry for slot in GROUPS for entry in registry.offers(slot) if entry.distribution == "crossgrad"
+]
+
+
+@pytest.mark.parametrize("entry", OURS, ids=lambda entry: f"{entry.slot}-{entry.name}")
+def test_each_entry_point_loads(entry):
+    component = registry.load(entry.slot, entry.name)
+    assert component.__doc__
+    assert component.__module__.partition(".")[0] in SHELVES
+
+
+@pytest.mark.parametrize("entry", OURS, ids=lambda entry: f"{entry.slot}-{entry.name}")
+def test_each_name_is_easy_to_type(entry):
+    assert entry.name.replace("-", "").isalnum()
+    assert entry.name == entry.name.lower()
+
+
+@pytest.mark.parametrize("shelf", SHELVES)
+def test_each_component_has_an_entry_point(shelf):
+    offered = {entry.value for entry in OURS}
+    for module in modules_of(shelf):
+        for name, kind in inspect.getmembers(import_module(module), is_component):
+            if kind.__module__ == module:
+                assert f"{module}:{name}" in offered
+
+
+def modules_of(package):
+    spec = find_spec(package)
+    places = spec.submodule_search_locations
+    return [info.name for info in pkgutil.walk_packages(places, f"{package}.") if not info.ispkg]
+
+
+def is_component(found):
+    """A concrete component; bases that components share are abstract or private."""
+    return (
+        inspect.isclass(found)
+        and issubclass(found, Component)
+        and not inspect.isabstract(found)
+        and not found.__name__.startswith("_")
+    )

@@ -1,0 +1,32 @@
+"""Help and lists must be instant: they import no plugin and none of the heavy libraries."""
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "numba", "numpy", "scipy", "PIL", "pycolmap", "matplotlib", "yaml", "rich")
+OURS = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
+PROGRAM = """
+import sys
+from crossgrad_core.cli.main import main
+try:
+    main(sys.argv[1:])
+except SystemExit as ended:
+    assert not ended.code, ended.code
+print("\\n".join(sorted(sys.modules)), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--help",), ("--version",), ("run", "--help"), ("plugins", "list"), ("plugins",)],
+    ids=" ".join,
+)
+def test_nothing_heavy_is_imported(arguments):
+    ended = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True
+    )
+    imported = {module.partition(".")[0] for module in ended.stderr.splitlines()}
+    assert "typer" in imported
+    assert imported.isdisjoint({*HEAVY, *OURS})

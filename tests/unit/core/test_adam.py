@@ -1,0 +1,168 @@
+"""Adam's fused kernel, its torch reference and torch.optim.Adam against one another."""
+
+import numba
+import pytest
+import torch
+
+from crossgrad_core.optimizer import AdamState, adam_step
+from crossgrad_core.optimizer.adam import LARGEST, Coefficients, update_reference, update_tensor
+
+SHAPES = {"means": (50, 3), "f_rest": (50, 15, 3), "opacities": (50,), "empty": (0, 3)}
+RATES = {"means": 1e-2, "f_rest": 1e-3, "opacities": 5e-2, "empty": 1.0}
+
+
+def tensors(seed, scale=1.0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: (scale * torch.randn(shape, generator=generator)).to(dtype)
+        for name, shape in SHAPES.items()
+    }
+
+
+def coefficients(step=3, lr=1e-2, eps=1e-15):
+    return Coefficients(
+        beta1=0.9,
+        beta2=0.999,
+        step_size=lr / (1 - 0.9**step),
+        root_scale=(1 - 0.999**step) ** -0.5,
+        eps=eps,
+        square_floor=(2.0**-126 / 1e-3) ** 0.5,
+    )
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-7, 1e-12, 1e12])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_agrees_with_torch(dtype, scale):
+    params, state = tensors(0, dtype=dtype), AdamState()
+    theirs = {name: tensor.clone().requires_grad_() for name, tensor in params.items()}
+    groups = [{"params": [theirs[name]], "lr": RATES[name]} for name in theirs]
+    oracle = torch.optim.Adam(groups, eps=1e-15)
+    for step in range(30):
+        grads = tensors(step + 1, scale, dtype)
+        if step % 3 == 2:
+            grads["f_rest"] = None
+        for name, grad in grads.items():
+            theirs[name].grad = grad
+        oracle.step()
+        adam_step(params, grads, state, RATES)
+    for name, param in params.items():
+        torch.testing.assert_close(param, theirs[name].detach(), rtol=1e-5, atol=1e-6)
+    assert state.steps == {"means": 30, "f_rest": 20, "opacities": 30, "empty": 30}
+
+
+@pytest.mark.parametrize("magnitude", [1e-45, 1e-32, 1e-22, 1e-19, 3e-18, 1e-10, 1.0, 1e15, 1e30])
+def test_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
+    generator = torch.Generator().manual_seed(4)
+    size = 70_003  # more than one chunk, and a remainder
+    grad = magnitude * torch.randn(size, generator=generator)
+    param = torch.randn(size, generator=generator)
+    ours = [param.clone(), 0.3 * grad, (0.5 * grad).square()]
+    theirs = [tensor.clone() for tensor in ours]
+    for step in range(1, 4):
+        update_tensor(ours[0], grad, ours[1], ours[2], coefficients(step))
+        update_reference(theirs[0], grad, theirs[1], theirs[2], coefficients(step))
+    for mine, reference in zip(ours, theirs, strict=True):
+        assert torch.isfinite(mine).all()
+        torch.testing.assert_close(mine, reference, rtol=1e-6, atol=0)
+
+
+def test_no_gradient_leaves_everything_alone():
+    params, state = tensors(5), AdamState()
+    adam_step(params, tensors(6), state, RATES)
+    before = {name: tensor.clone() for name, tensor in params.items()}
+    moments = {name: tensor.clone() for name, tensor in state.exp_avg.items()}
+    adam_step(params, {"means": None}, state, RATES)
+    assert set(state.steps.values()) == {1}
+    for name, param in params.items():
+        assert torch.equal(param, before[name])
+        assert torch.equal(state.exp_avg[name], moments[name])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_zero_gradient_from_zero_moments_moves_nothing(dtype):
+    params, state = tensors(7, dtype=dtype), AdamState()
+    before = {name: tensor.clone() for name, tensor in params.items()}
+    for _ in range(3):
+        grads = {name: torch.zeros_like(tensor) for name, tensor in params.items()}
+        adam_step(params, grads, state, RATES)
+    for name, param in params.items():
+        assert torch.equal(param, before[name])
+
+
+@pytest.mark.parametrize("size", [1e-45, 1e-38, 1e-30, 1e-25, 1e-23, 1e-20, 1e-17, 1e-15, 1e-10])
+def test_a_small_gradient_never_moves_further_than_a_large_one(size):
+    params, state = {"x": torch.zeros(8)}, AdamState()
+    adam_step(params, {"x": torch.full((8,), size)}, state, {"x": 1e-2})
+    assert torch.isfinite(params["x"]).all()
+    assert params["x"].abs().max() <= 1.0001e-2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_moments_of_an_unseen_primitive_end_in_zero_not_in_subnormals(dtype):
+    params, state = {"x": torch.ones(100, dtype=dtype)}, AdamState()
+    adam_step(params, {"x": torch.full((100,), 1e-16, dtype=dtype)}, state, {"x": 1e-3})
+    for _ in range(400):
+        adam_step(params, {"x": torch.zeros(100, dtype=dtype)}, state, {"x": 1e-3})
+    assert not state.exp_avg["x"].any()
+    normal = (state.exp_avg_sq["x"] == 0) | (state.exp_avg_sq["x"] >= 2.0**-126)
+    assert normal.all()
+
+
+def test_a_huge_gradient_does_not_stop_its_parameter_for_good():
+    params, state = {"x": torch.zeros(1)}, AdamState()
+    adam_step(params, {"x": torch.tensor([torch.inf])}, state, {"x": 1e-2})
+    assert params["x"].item() == pytest.approx(-1e-2)
+    assert state.exp_avg_sq["x"].item() == pytest.approx(1e-3 * LARGEST**2, rel=1e-5)
+
+
+def test_nan_spreads_to_its_element_only():
+    params, state = {"x": torch.zeros(3)}, AdamState()
+    adam_step(params, {"x": torch.tensor([1.0, torch.nan, 1.0])}, state, {"x": 1e-2})
+    assert torch.isnan(params["x"]).tolist() == [False, True, False]
+
+
+def test_bits_do_not_depend_on_the_number_of_threads():
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):
+            numba.set_num_threads(threads)
+            params = {"x": torch.linspace(-1, 1, 200_001)}
+            state = AdamState()
+            for k in range(3):
+                adam_step(params, {"x": torch.cos(k + params["x"])}, state, {"x": 1e-2})
+            results.append(params["x"])
+    finally:
+        numba.set_num_threads(before)
+    assert all(torch.equal(result, results[0]) for result in results)
+
+
+def test_strided_and_trained_tensors():
+    strided = torch.randn(3, 40, generator=torch.Generator().manual_seed(8)).T
+    dense = strided.clone(memory_format=torch.contiguous_format).requires_grad_()
+    grad = torch.ones(3, 40).T
+    for param in (strided, dense):
+        adam_step({"x": param}, {"x": grad}, AdamState(), {"x": 1e-2})
+    torch.testing.assert_close(strided, dense.detach())
+
+
+def test_a_graph_over_old_values_notices_the_step():
+    param = torch.ones(3, requires_grad=True)
+    loss = (param * param).sum()
+    adam_step({"x": param}, {"x": torch.ones(3)}, AdamState(), {"x": 1e-2})
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.parametrize(
+    ("grad", "options"),
+    [
+        (torch.ones(4), {}),
+        (torch.ones(3).double(), {}),
+        (torch.ones(3), {"eps": 0.0}),
+        (torch.ones(3), {"betas": (0.9, 1.0)}),
+    ],
+)
+def test_wrong_arguments_are_refused(grad, options):
+    with pytest.raises(ValueError, match="must"):
+        adam_step({"x": torch.ones(3)}, {"x": grad}, AdamState(), {"x": 1e-2}, **options)

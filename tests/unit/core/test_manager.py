@@ -1,0 +1,203 @@
+"""One manager per run; hooks that pluggy would silently never call; seams that must answer."""
+
+import types
+
+import pytest
+from pydantic import BaseModel, ConfigDict
+
+from crossgrad_core.contexts import Densified, Draw, Sampled
+from crossgrad_core.errors import UserError
+from crossgrad_core.manager import call_seam, make_manager
+from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
+
+
+class Densifier:
+    def __init__(self, answer):
+        self.answer = answer
+
+    @hookimpl
+    def crossgrad_densify(self, context):
+        return self.answer
+
+
+class Recorder:
+    """Wraps the seam and notes the order of events."""
+
+    def __init__(self, name, events):
+        self.name, self.events = name, events
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        self.events.append(f"{self.name} before")
+        answer = yield
+        self.events.append(f"{self.name} after")
+        return answer
+
+
+class Forgetful:
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        yield
+
+
+def refusal(**plugins):
+    with pytest.raises(UserError) as caught:
+        make_manager(plugins)
+    return caught.value
+
+
+def test_each_manager_is_fresh():
+    one, other = make_manager({"a": Densifier(1)}), make_manager({})
+    assert one.get_plugin("a") is not None
+    assert other.get_plugin("a") is None
+
+
+def test_a_misspelt_hook_is_refused_with_a_suggestion():
+    class Misspelt:
+        @hookimpl
+        def crossgrad_densfy(self, context):
+            return None
+
+    error = refusal(grow=Misspelt())
+    assert "plugin grow implements the hook crossgrad_densfy" in error.what
+    assert "did you mean 'crossgrad_densify'?" in error.todo
+    assert "Misspelt" in error.where
+
+
+def test_a_hook_with_another_prefix_is_refused():
+    class Other:
+        @hookimpl
+        def densify(self, context):
+            return None
+
+    assert "the hook densify, which does not exist" in refusal(other=Other()).what
+
+
+def test_a_forgotten_mark_is_refused():
+    class Unmarked:
+        def crossgrad_step_end(self, record):
+            return None
+
+    error = refusal(silent=Unmarked())
+    assert "crossgrad_step_end that would never be called" in error.what
+    assert "forgot @hookimpl?" in error.todo
+
+
+def test_a_method_that_only_looks_like_a_hook_is_refused():
+    class Unmarked:
+        @classmethod
+        def crossgrad_step_ended(cls):
+            return None
+
+    assert "did you mean 'crossgrad_step_end'?" in refusal(silent=Unmarked()).todo
+
+
+def test_a_hook_under_another_name_and_a_hook_of_the_future_are_welcome():
+    class Modern:
+        @hookimpl(specname="crossgrad_message")
+        def say(self, text):
+            return None
+
+        @hookimpl(optionalhook=True)
+        def crossgrad_of_tomorrow(self, anything):
+            return None
+
+    assert make_manager({"modern": Modern()}).hook.crossgrad_message.get_hookimpls()
+
+
+def test_wrong_arguments_are_refused_with_the_signature():
+    class Wrong:
+        @hookimpl
+        def crossgrad_message(self, message):
+            return None
+
+    error = refusal(wrong=Wrong())
+    assert error.what == "plugin wrong cannot be registered"
+    assert "crossgrad_message" in error.found
+    assert "message" in error.found
+
+
+def test_two_answers_to_one_seam_are_refused_with_both_names():
+    error = refusal(selected=Densifier(1), intruder=Densifier(2))
+    assert "crossgrad_densify: selected, intruder" in error.what
+    assert "wrapper=True" in error.todo
+
+
+def test_many_plugins_may_watch_an_event():
+    class Watcher:
+        @hookimpl
+        def crossgrad_message(self, text):
+            return None
+
+    manager = make_manager({"one": Watcher(), "two": Watcher()})
+    assert len(manager.hook.crossgrad_message.get_hookimpls()) == 2
+
+
+def test_a_module_that_imports_us_is_no_misspelt_hook():
+    module = types.ModuleType("a_plugin")
+    exec("import crossgrad_core\ncrossgrad_version = '1'", module.__dict__)
+    assert make_manager({"module": module}).get_plugin("module") is module
+
+
+def test_properties_are_not_evaluated():
+    class Careful(BaseModel):
+        model_config = ConfigDict(frozen=True)
+
+        @property
+        def crossgrad_price(self):
+            raise RuntimeError("too expensive")
+
+    make_manager({"careful": Careful()})
+
+
+def test_later_wrappers_are_outer_wrappers():
+    events = []
+    answer = Densified(NO_EDIT)
+    manager = make_manager(
+        {
+            "densifier": Densifier(answer),
+            "first": Recorder("first", events),
+            "second": Recorder("second", events),
+        }
+    )
+    assert call_seam(manager.hook.crossgrad_densify, None, Densified) is answer
+    assert events == ["second before", "first before", "first after", "second after"]
+
+
+@pytest.mark.parametrize("answer", [Densified(NO_EDIT), Densified(Edit())])
+def test_a_seam_gives_its_answer(answer):
+    hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
+    assert call_seam(hook, None, Densified) is answer
+
+
+@pytest.mark.parametrize("answer", [None, NO_EDIT, Densified(None), Sampled(Draw((0,)))], ids=str)
+def test_a_seam_that_is_not_answered_is_an_error(answer):
+    hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
+    with pytest.raises(UserError, match="a seam must answer") as caught:
+        call_seam(hook, None, Densified)
+    assert caught.value.where == "plugins densifier"
+    assert "NO_EDIT" in caught.value.todo
+
+
+def test_a_draw_of_nothing_is_no_answer():
+    class Sampler:
+        @hookimpl
+        def crossgrad_sample_views(self, context):
+            return Sampled(None)
+
+    hook = make_manager({"sampler": Sampler()}).hook.crossgrad_sample_views
+    with pytest.raises(UserError, match="crossgrad_sample_views"):
+        call_seam(hook, None, Sampled)
+
+
+def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
+    plugins = {"densifier": Densifier(Densified(NO_EDIT)), "forgetful": Forgetful()}
+    with pytest.raises(UserError, match="was not answered") as caught:
+        call_seam(make_manager(plugins).hook.crossgrad_densify, None, Densified)
+    assert "forgetful" in caught.value.where
+    assert "yield" in caught.value.todo
+
+
+def test_a_seam_without_plugins_is_an_error():
+    with pytest.raises(UserError, match="plugins none"):
+        call_seam(make_manager({}).hook.crossgrad_densify, None, Densified)

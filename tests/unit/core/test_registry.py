@@ -1,0 +1,213 @@
+"""Listing without importing, and loud loading."""
+
+import sys
+
+import pytest
+
+from crossgrad_core import registry
+from crossgrad_core.errors import UserError
+from crossgrad_core.grouping import Grouping
+from crossgrad_core.slots import GROUPS
+from crossgrad_core.testing.distributions import write_distribution
+
+GOOD = """
+from pydantic import Field
+from crossgrad_core.plugin import Labelling, Grouping
+
+class Good(Grouping):
+    share: float = Field(0.5, gt=0, lt=1, description="share of near views")
+    seed: int = Field(3, ge=0, description="seed")
+
+    def label(self, scene, views, rng, probe=None):
+        return Labelling(("near",) * len(views))
+
+class Demanding(Good):
+    file: str = Field(description="a file")
+
+class Unfinished(Grouping):
+    pass
+
+something = 7
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Puts made-up distributions on the path; forgets their modules afterwards."""
+    before = set(sys.modules)
+
+    def put(name, plugins, modules=None, version="1.0"):
+        folder = tmp_path / f"{name}-{version}"
+        write_distribution(folder, name, plugins, modules, version)
+        monkeypatch.syspath_prepend(folder)
+
+    yield put
+    for module in set(sys.modules) - before:
+        if module.startswith("made_up"):
+            del sys.modules[module]
+
+
+@pytest.fixture
+def good(install):
+    plugins = {
+        "good": "made_up:Good",
+        "demanding": "made_up:Demanding",
+        "unfinished": "made_up:Unfinished",
+        "seven": "made_up:something",
+        "gone": "made_up:Gone",
+        "lost": "made_up_lost:Lost",
+    }
+    install("made-up", {"groupings": plugins}, {"made_up": GOOD})
+
+
+def refusal(slot, name, options=None):
+    with pytest.raises(UserError) as caught:
+        registry.build(slot, name, options or {})
+    return caught.value
+
+
+def test_every_slot_lists_our_components():
+    for slot in GROUPS:
+        ours = [
+            each for each in registry.entries(slot).values() if each.distribution == "crossgrad"
+        ]
+        assert ours, slot
+        assert all(each.slot == slot and ":" in each.value for each in ours)
+
+
+def test_entries_are_sorted_and_carry_their_origin(install):
+    install("made-up", {"observers": {"zz": "m:A", "aa": "m:B"}}, version="2.5")
+    names = list(registry.entries("observers"))
+    assert names == sorted(names)
+    entry = registry.entries("observers")["aa"]
+    assert entry == registry.Entry("aa", "observers", "m:B", "made-up", "2.5")
+    assert entry.origin == "m:B, from made-up 2.5"
+
+
+def test_a_distribution_that_comes_later_is_seen(install):
+    assert "later" not in registry.entries("observers")
+    install("made-up", {"observers": {"later": "m:A"}})
+    assert "later" in registry.entries("observers")
+
+
+def test_listing_imports_no_plugin(good):
+    registry.entries("groupings")
+    assert "made_up" not in sys.modules
+
+
+def test_an_unknown_slot_is_our_own_mistake():
+    with pytest.raises(KeyError):
+        registry.entries("operator")
+
+
+def test_a_good_plugin_is_built_with_its_options(good):
+    component = registry.build("groupings", "good", {"share": 0.25})
+    assert isinstance(component, Grouping)
+    assert component.model_dump() == {"share": 0.25, "seed": 3}
+
+
+def test_an_unknown_name_is_refused_with_a_suggestion(good):
+    error = refusal("groupings", "god")
+    assert "no grouping named 'god'" in error.what
+    assert "good" in error.expected
+    assert "radial" in error.expected
+    assert "did you mean 'good'?" in error.todo
+
+
+def test_a_name_of_another_slot_is_recognised():
+    assert "radial is a grouping" in refusal("operators", "radial").todo
+
+
+def test_a_name_that_two_packages_offer_is_refused_with_both(good, install):
+    install("other-made-up", {"groupings": {"good": "elsewhere:Good"}}, version="3.0")
+    error = refusal("groupings", "good")
+    assert "2 installed packages offer a grouping named 'good'" in error.what
+    assert "made-up 1.0" in error.found
+    assert "other-made-up 3.0" in error.found
+
+
+def test_of_two_copies_of_a_package_the_one_on_the_path_first_counts(install):
+    install("made-up", {"observers": {"copy": "old:A"}}, version="1.0")
+    install("made_up", {"observers": {"copy": "new:A"}}, version="1.1")
+    assert registry.find("observers", "copy").value == "new:A"
+
+
+@pytest.mark.parametrize(
+    ("name", "original"),
+    [
+        ("lost", "ModuleNotFoundError: No module named 'made_up_lost'"),
+        ("gone", "AttributeError: module 'made_up' has no attribute 'Gone'"),
+    ],
+)
+def test_a_plugin_that_cannot_be_imported_is_named(good, name, original):
+    error = refusal("groupings", name)
+    assert f"grouping {name} cannot be imported" in error.what
+    assert "from made-up 1.0" in error.where
+    assert error.found == original
+    assert isinstance(error.__cause__, Exception)
+
+
+def test_a_broken_plugin_breaks_only_runs_that_ask_for_it(good):
+    refusal("groupings", "lost")
+    assert registry.build("groupings", "good", {})
+
+
+def test_an_error_of_many_lines_is_told_in_one(install):
+    source = 'raise RuntimeError("first\\n  second")'
+    install("made-up", {"observers": {"noisy": "made_up_noisy:A"}}, {"made_up_noisy": source})
+    assert refusal("observers", "noisy").found == "RuntimeError: first second"
+
+
+def test_a_plugin_may_say_itself_what_is_missing(install):
+    source = (
+        "from crossgrad_core.errors import UserError\n"
+        "raise UserError('gpu needs CUDA', todo='install it')"
+    )
+    install("made-up", {"observers": {"gpu": "made_up_gpu:A"}}, {"made_up_gpu": source})
+    assert refusal("observers", "gpu").what == "gpu needs CUDA"
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("seven", "7"), ("unfinished", "Unfinished without the methods label")]
+)
+def test_what_is_no_component_is_refused(good, name, found):
+    error = refusal("groupings", name)
+    assert error.expected == "a complete subclass of crossgrad_core.plugin.Grouping"
+    assert error.found == found
+
+
+def test_a_component_of_another_slot_is_refused(install):
+    install("made-up", {"observers": {"wrong": "made_up:Good"}}, {"made_up": GOOD})
+    assert "crossgrad_core.plugin.Observer" in refusal("observers", "wrong").expected
+
+
+def test_an_unknown_option_is_refused_with_a_suggestion(good):
+    error = refusal("groupings", "good", {"shar": 0.5})
+    assert error.what == "grouping good has no option 'shar'"
+    assert error.where == "grouping.shar"
+    assert error.expected == "one of share, seed"
+    assert "did you mean 'share'?" in error.todo
+    assert "crossgrad plugins show good" in error.todo
+
+
+def test_a_value_out_of_bounds_is_refused_with_what_was_found(good):
+    error = refusal("groupings", "good", {"share": 1.5})
+    assert error.what == "option share of grouping good is not valid"
+    assert error.expected == "less than 1"
+    assert error.found == "1.5 (float)"
+
+
+def test_a_missing_option_is_named(good):
+    error = refusal("groupings", "demanding")
+    assert error.where == "grouping.file"
+    assert error.found == "nothing"
+
+
+def test_further_wrong_options_are_named_as_well(good):
+    error = refusal("groupings", "good", {"share": 1.5, "seed": -1})
+    assert "also wrong: seed" in error.todo
+
+
+def test_options_of_observers_are_found_below_their_name():
+    error = refusal("observers", "progress", {"intervall": 3})
+    assert error.where == "observers.progress.intervall"

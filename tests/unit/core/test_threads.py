@@ -1,0 +1,104 @@
+"""One number of threads for Numba and torch."""
+
+import subprocess
+import sys
+import threading
+
+import numba
+import pytest
+import torch
+
+from crossgrad_core import threads
+from crossgrad_core.errors import UserError
+from crossgrad_core.threads import available_cores, configure_threads
+
+
+@pytest.fixture(autouse=True)
+def _restored():
+    before = numba.get_num_threads(), torch.get_num_threads()
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
+
+
+@pytest.mark.parametrize("n", range(1, numba.config.NUMBA_NUM_THREADS + 1))
+def test_sets_both_libraries(n):
+    assert configure_threads(n) == n
+    assert numba.get_num_threads() == n
+    assert torch.get_num_threads() == n
+
+
+@pytest.mark.parametrize("n", [-1, 0, 10**6])
+def test_refuses_what_cannot_be(n):
+    with pytest.raises(UserError, match="number of threads out of range"):
+        configure_threads(n)
+
+
+@pytest.mark.parametrize(
+    ("numba_value", "omp_value", "expected"),
+    [("1", "", 1), ("", "1", 1), ("1", "9", 1), ("", "1,1", None), ("", "", None)],
+)
+def test_default_comes_from_the_environment_or_the_cores(
+    monkeypatch, numba_value, omp_value, expected
+):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", numba_value)
+    monkeypatch.setenv("OMP_NUM_THREADS", omp_value)
+    most = numba.config.NUMBA_NUM_THREADS
+    assert configure_threads(None) == (expected or min(available_cores(), most))
+
+
+@pytest.mark.parametrize(
+    ("content", "cores"), [("150000 100000", 2), ("50000 100000", 1), ("100000 100000", 1)]
+)
+def test_a_container_quota_limits_the_cores(monkeypatch, tmp_path, content, cores):
+    limit = tmp_path / "cpu.max"
+    limit.write_text(content)
+    monkeypatch.setattr(threads, "_CGROUP_LIMIT", limit)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert available_cores() == cores
+
+
+@pytest.mark.parametrize("content", ["max 100000", "", None])
+def test_no_quota_means_the_affinity(monkeypatch, tmp_path, content):
+    limit = tmp_path / "cpu.max"
+    if content is not None:
+        limit.write_text(content)
+    monkeypatch.setattr(threads, "_CGROUP_LIMIT", limit)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
+    assert available_cores() == 1
+
+
+LAYER = """
+import numba
+from crossgrad_core.threads import configure_threads
+configure_threads()
+print(numba.config.THREADING_LAYER_PRIORITY[0])
+"""
+
+
+@pytest.mark.parametrize(("wish", "first"), [(None, "omp"), ("workqueue omp tbb", "workqueue")])
+def test_openmp_is_preferred_unless_the_environment_says_otherwise(monkeypatch, wish, first):
+    monkeypatch.delenv("NUMBA_THREADING_LAYER", raising=False)
+    monkeypatch.delenv("NUMBA_THREADING_LAYER_PRIORITY", raising=False)
+    if wish is not None:
+        monkeypatch.setenv("NUMBA_THREADING_LAYER_PRIORITY", wish)
+    command = [sys.executable, "-c", LAYER]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == first
+
+
+def test_backward_on_the_cpu_runs_in_the_calling_thread():
+    seen = []
+
+    class Probe(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, gradient):
+            seen.append(threading.get_ident())
+            return gradient
+
+    Probe.apply(torch.ones(2, requires_grad=True)).sum().backward()
+    assert seen == [threading.get_ident()]

@@ -1,0 +1,63 @@
+"""Validation errors of nested configurations."""
+
+import pytest
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+
+from crossgrad_core.validation import as_user_error
+
+
+class Inner(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    size: int = 1
+
+
+class Outer(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    inner: Inner = Inner()
+    color: str = "black"
+
+    @field_validator("color")
+    @classmethod
+    def _known(cls, value):
+        if value != "black":
+            raise ValueError("must be black")
+        return value
+
+
+class Empty(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+def explained(model, values):
+    with pytest.raises(ValidationError) as caught:
+        model.model_validate(values)
+    return as_user_error(caught.value, model, subject="a run", todo="read the help")
+
+
+def test_an_unknown_key_deep_inside_suggests_keys_from_there():
+    error = explained(Outer, {"inner": {"sise": 2}})
+    assert error.where == "inner.sise"
+    assert error.expected == "one of size"
+    assert error.todo == "did you mean 'size'?; read the help"
+
+
+def test_a_model_without_options_says_so():
+    assert explained(Empty, {"a": 1}).expected == "no options; it has none"
+
+
+def test_words_of_a_validator_are_kept():
+    error = explained(Outer, {"color": "red"})
+    assert error.expected == "must be black"
+    assert error.found == "'red' (str)"
+
+
+def test_a_value_that_is_no_group_of_settings_is_told_with_its_type():
+    error = explained(Outer, {"inner": 3})
+    assert error.where == "inner"
+    assert error.found == "3 (int)"
+
+
+def test_an_error_of_the_whole_names_the_whole():
+    assert explained(Outer, "text").what == "a run is not valid"
