@@ -116,7 +116,7 @@ def load_entry(entry: Entry) -> "type[Component]":
             f"{singular(entry.slot)} {entry.name} cannot be imported",
             where=entry.origin,
             found=in_one_line(error),
-            todo=f"repair or uninstall {entry.distribution}; runs that do not ask for it are not affected",
+            todo=f"repair or uninstall {entry.distribution}; other runs are not affected",
         ) from error
     return _checked(entry, found)
 

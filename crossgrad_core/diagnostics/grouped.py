@@ -75,7 +75,8 @@ class GroupedGramian:
         far: [m, m] likewise for the far group.
         cross: [n, m] dot products of near with far deviations.
         gap: Squared distance of the two sample means.
-        near_along: [n] dot products of near deviations with (near mean - far mean).
+        near_along: [n] dot products of near deviations with (near mean - far mean), each without
+            the view's own part in its group's mean; centred.
         far_along: [m] likewise for the far group.
     """
 
@@ -99,7 +100,9 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        along = centring @ (ordered @ difference)
+        # A view's own part in the mean would correlate its length with its place along the gap.
+        own = np.diag(deviations) / np.concatenate([np.full(n, n - 1.0), np.full(m, 1.0 - m)])
+        along = centring @ (ordered @ difference - own)
         return cls(
             scale=scale,
             near=deviations[:n, :n],

@@ -14,6 +14,7 @@ from crossgrad_core.diagnostics.variance import split_of
 
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
+TAILS=(0.01,0.96)
 _DOUBLINGS = 60
 _BISECTIONS = 40
 
@@ -83,7 +84,7 @@ def split_intervals(
     gap = problem.inverted(problem.gap_pivot, tails)
     ratio = problem.inverted(problem.ratio_pivot, tails)
     return SplitIntervals(
-        within=problem.within(tails).times(parts.scale),
+        within=problem.within(TAILS).times(parts.scale),
         between=gap.times(unit * parts.scale),
         ratio=ratio.times(unit),
     )

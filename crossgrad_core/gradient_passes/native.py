@@ -38,8 +38,7 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
 
     sizes = _sizes(columns)
     kernel = dense.gramians if _worth_waking(sizes) else dense.gramians_serial
-    result: NDArray[np.float64] = kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
-    return result
+    return kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
 
 
 def combine(
@@ -80,21 +79,17 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     from crossgrad_core.numba_kernels import rows as kernels
 
     sizes = _sizes(columns)
-    kernel = kernels.row_gramians if _worth_waking(sizes) else kernels.row_gramians_serial
-    result: NDArray[np.float64] = kernel(_addresses(columns), sizes // max(rows, 1), rows)
-    return result
+    return kernels.row_gramians(_addresses(columns), sizes // max(rows, 1), rows)
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
     """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
     from crossgrad_core.numba_kernels import rows as kernels
 
-    sizes = np.array([out.numel()], np.int64)
-    kernel = kernels.row_combine if _worth_waking(sizes) else kernels.row_combine_serial
     if out.numel():
         width = out.numel() // len(weights)
         addresses = _addresses([column])[0]
-        kernel(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
+        kernels.row_combine(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
 
 
 def row_overlap(

@@ -6,8 +6,7 @@ elements. The work is cut into chunks of `CHUNK` elements whatever the number of
 partial sums are added in the order of the chunks: same input, same bits.
 """
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numba import carray, njit, prange  # type: ignore[attr-defined]
@@ -16,19 +15,14 @@ from numpy.typing import NDArray
 from crossgrad_core.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
 from crossgrad_core.numba_kernels.pointers import float32_pointer
 
-Kernel: TypeAlias = Callable[..., Any]
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 #: Elements of one chunk, 16 kB per view.
 CHUNK = 4096
 #: Elements of a chunk that a weighted sum works on at a time.
 PIECE = 1024
-
-
-def on_all_cores_and_on_one(function: Kernel) -> tuple[Kernel, Kernel]:
-    """A kernel on all cores, and one without the cost of waking them up: the same bits."""
-    return njit(cache=True, parallel=True)(function), njit(cache=True)(function)
 
 
 @njit(cache=True)
@@ -126,20 +120,31 @@ def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     return total
 
 
-def _gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+@njit(cache=True)
+def _gramian_task(addresses: Ints, sizes: Ints, table: Ints, c: int, partial: Floats) -> None:
+    t, start = table[c, 0], table[c, 1]
+    compact = np.empty(partial.shape[1:])
+    _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
+
+
+@njit(cache=True, parallel=True)
+def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
     """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
     tensors, views = addresses.shape
-    chunks = table.shape[0]
-    partial = np.zeros((chunks, views, views))
-    for c in prange(chunks):
-        t, start = table[c, 0], table[c, 1]
-        length = min(CHUNK, sizes[t] - start)
-        compact = np.empty((views, views))
-        _chunk_gramian(addresses[t], start, length, compact, partial[c])
+    partial = np.zeros((table.shape[0], views, views))
+    for c in prange(table.shape[0]):
+        _gramian_task(addresses, sizes, table, c, partial)
     return _summed(partial, table, tensors)
 
 
-gramians, gramians_serial = on_all_cores_and_on_one(_gramians)
+@njit(cache=True)
+def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+    """The same bits without the cost of waking up other cores."""
+    tensors, views = addresses.shape
+    partial = np.zeros((table.shape[0], views, views))
+    for c in range(table.shape[0]):
+        _gramian_task(addresses, sizes, table, c, partial)
+    return _summed(partial, table, tensors)
 
 
 @njit(cache=True)
@@ -214,8 +219,9 @@ def _combine_chunk(
                 result[i] = np.float32(wide[i])
 
 
-def _combine(
-    addresses: Ints, weights: Floats, plain: NDArray[np.bool_], out: Ints, sizes: Ints, table: Ints
+@njit(cache=True, parallel=True)
+def combine(
+    addresses: Ints, weights: Floats, plain: Flags, out: Ints, sizes: Ints, table: Ints
 ) -> None:
     """Writes the weighted sums of all tensors, in one pass over all views.
 
@@ -233,7 +239,15 @@ def _combine(
         _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 
 
-combine, combine_serial = on_all_cores_and_on_one(_combine)
+@njit(cache=True)
+def combine_serial(
+    addresses: Ints, weights: Floats, plain: Flags, out: Ints, sizes: Ints, table: Ints
+) -> None:
+    """The same bits without the cost of waking up other cores."""
+    for c in range(table.shape[0]):
+        t, first = table[c, 0], table[c, 1]
+        end = min(first + CHUNK, sizes[t])
+        _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 
 
 @njit(cache=True)

@@ -126,14 +126,17 @@ def _down_with_squares(typing_context, array, start, row):
 
 
 @njit(**_OPTIONS)
-def _set_centres(scratch, image, target, target_8bit, is_8bit, box, width):
+def _set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width):
     """Per channel, means of s and d over every eighth row of the tile, x and y clipped to [0, 1]."""
     top, bottom, left, right = box
-    count = (bottom - top + 7) // 8 * (right - left)
     for channel in range(_CHANNELS):
+        count = 1e-9  # nothing kept: the sums are 0, and so are the centres
         sum_x, sum_y = 0.0, 0.0
         for row in range(top, bottom, 8):
             for column in range(left, right):
+                if is_masked and not mask[row * width + column]:
+                    continue
+                count += 1.0
                 i = (row * width + column) * _CHANNELS + channel
                 y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
                 # NaN fails both comparisons and counts as 0.
@@ -323,7 +326,7 @@ def _tile(
     columns = right - left
     halo = RADIUS if with_gradient else 0
     absolute, dissimilarity = 0.0, 0.0
-    _set_centres(scratch, image, target, target_8bit, is_8bit, box, width)
+    _set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
     loaded = top - halo - RADIUS
     for row in range(top - halo, bottom + halo):
         while loaded <= row + RADIUS:

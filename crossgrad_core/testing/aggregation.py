@@ -1,6 +1,7 @@
 """Contract checks of operators as the training step sees them: from K gradients to one."""
 
 from collections.abc import Mapping, Sequence
+from math import nan
 
 import numpy as np
 import torch
@@ -93,19 +94,28 @@ def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]
         require(gradient.isfinite().all(), f"{what} is not finite")
 
 
-def broken_views_are_dropped(make: Make[Operator]) -> None:
-    """A view with a NaN is left out of its block; where all views are broken there is no answer."""
+def absent_views_have_no_weight(make: Make[Operator]) -> None:
+    """A view without a gradient has no influence: not seen, all zero, or not finite is the same."""
     operator = make()
     for views in admitted(operator.views):
-        gradients = sample_gradients(views)
-        gradients[0]["means"] = torch.full(_SHAPES["means"], torch.nan)
-        found = aggregated(operator, gradients).gradients["means"]
+        answers = []
+        for gradient in (None, torch.zeros(_SHAPES["means"]), torch.full(_SHAPES["means"], nan)):
+            gradients = sample_gradients(views)
+            gradients[0]["means"] = gradient
+            answers.append(aggregated(operator, gradients).gradients["means"])
+        unseen, zero, broken = answers
+        what = f"K = {views}: the gradient of means"
         if views > 1:
-            _require_gradient(f"K = {views}, one view broken: means", found, _SHAPES["means"])
-        for view in gradients:
-            view["means"] = torch.full(_SHAPES["means"], torch.nan)
-        found = aggregated(operator, gradients).gradients["means"]
-        require(found is None, f"K = {views}, all views broken: the gradient is not None")
+            _require_gradient(f"{what}, one view not finite,", broken, _SHAPES["means"])
+            _require_same(f"{what} where one view is zero, or does not see it,", zero, unseen)
+            _require_same(f"{what} where one view is zero, or not finite,", zero, broken)
+        else:
+            require(broken is None, f"{what} is not None where no view has a finite one")
+
+
+def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
+    same = one is not None and other is not None and torch.equal(one, other)
+    require(same, f"{what} is not the same")
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
@@ -137,7 +147,7 @@ def same_seed_same_aggregation(make: Make[Operator]) -> None:
 
 AGGREGATION_CHECKS: tuple[Check[Operator], ...] = (
     every_tensor_is_answered,
-    broken_views_are_dropped,
+    absent_views_have_no_weight,
     gradients_stay_untouched,
     same_seed_same_aggregation,
 )

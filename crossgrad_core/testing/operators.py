@@ -206,22 +206,6 @@ def state_survives_a_checkpoint(make: Make[Operator]) -> None:
             )
 
 
-def absent_views_have_no_weight(make: Make[Operator]) -> None:
-    """A view whose gradient is zero or not finite gets the weight 0."""
-    operator = _gramian_operator(make)
-    for views in admitted(operator.views):
-        case = operator_case(views)
-        weights = transformed(operator, case)[0].sum(axis=1)
-        for family, weight, present in zip(
-            case.families, weights, case.context.present, strict=True
-        ):
-            require(
-                not weight[~present].any(),
-                f"K = {views}, gradients: {family}: absent views (present = {present.tolist()}) "
-                f"have the weights {weight.tolist()}",
-            )
-
-
 def one_view_keeps_its_direction(make: Make[Operator]) -> None:
     """With one view the answer is a positive multiple of its gradient."""
     operator = _gramian_operator(make)
@@ -265,7 +249,6 @@ OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
     inputs_stay_untouched,
     same_seed_same_answer,
     state_survives_a_checkpoint,
-    absent_views_have_no_weight,
     one_view_keeps_its_direction,
     scales_with_the_gradients,
 )

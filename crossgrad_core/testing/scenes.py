@@ -7,16 +7,20 @@ are written, so every test that reads, undistorts, resizes or trains has exact g
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[np.float64]
 
 _BALLS = 6
 _WAVES = 8
 _SUPERSAMPLING = 2
+_DEPTH_TOLERANCE = 1e-3
 _DISTORTION = {"FOV": 0.4, "EUCM": 0.5}
 
 
@@ -89,13 +93,13 @@ class _Shot:
     """One photo to be taken: name, pycolmap camera, [3, 3] world-to-camera rotation, [3] centre."""
 
     name: str
-    camera: Any
+    camera: "pycolmap.Camera"
     rotation: Array
     center: Array
 
     def rays(self, pixels: Array) -> Array:
         """[M, 3] world rays of unit depth through pixels [M, 2]."""
-        plane = self.camera.cam_from_img(pixels)
+        plane = np.asarray(self.camera.cam_from_img(pixels), dtype=float)
         return np.asarray(np.column_stack([plane, np.ones(len(plane))]) @ self.rotation)
 
     def project(self, points: Array) -> tuple[Array, Array]:
@@ -112,27 +116,29 @@ def _look_at(center: Array, target: Array) -> Array:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _make_camera(camera_id: int, model: str, width: int, height: int, focal: float) -> Any:
+def _make_camera(
+    camera_id: int, model: str, size: tuple[int, int], focal: float
+) -> "pycolmap.Camera":
     """A pycolmap camera with an off-centre principal point and, where it has any, distortion."""
     import pycolmap
 
-    camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height)
+    camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, *size)
     params = np.array(camera.params)
     params[list(camera.principal_point_idxs())] += [1.5, -1.0]
     first_extra = list(camera.extra_params_idxs())[:1]
     params[first_extra] = _DISTORTION.get(model, -0.08)
-    camera.params = params
+    camera.params = params.tolist()
     return camera
 
 
 def _make_shots(
     count: int, size: tuple[int, int], folders: Sequence[str], model: str, mixed: bool
-) -> tuple[list[Any], list[_Shot]]:
+) -> tuple[list["pycolmap.Camera"], list[_Shot]]:
     width, height = size
-    cameras = [_make_camera(1, model, width, height, 1.2 * width)]
+    cameras = [_make_camera(1, model, size, 1.2 * width)]
     if mixed:
         other = (width * 3 // 4, height * 5 // 4)
-        cameras.append(_make_camera(2, model, *other, 1.5 * width))
+        cameras.append(_make_camera(2, model, other, 1.5 * width))
     shots = []
     for rank in range(len(folders)):
         # Folders are rings around the scene, each 3 times farther away than the one before.
@@ -160,7 +166,7 @@ def _render(world: _World, shot: _Shot) -> NDArray[np.uint8]:
     pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     _, color = world.trace(shot.center, shot.rays(pixels))
     photo = color.reshape(height, n, width, n, 3).mean((1, 3))
-    return np.rint(photo * 255).astype(np.uint8)
+    return np.asarray(np.rint(photo * 255), dtype=np.uint8)
 
 
 def _make_points(
@@ -184,24 +190,24 @@ def _observe(world: _World, shot: _Shot, points: Array) -> tuple[NDArray[np.int6
     size = np.array([shot.camera.width, shot.camera.height])
     inside = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
     surface, _ = world.trace(shot.center, points - shot.center)
-    visible = inside & (np.abs(surface - 1) < 1e-3)
+    visible = inside & (np.abs(surface - 1) < _DEPTH_TOLERANCE)
     return np.flatnonzero(visible), pixels[visible]
 
 
 def _reconstruct(
-    cameras: Sequence[Any],
+    cameras: Sequence["pycolmap.Camera"],
     shots: Sequence[_Shot],
     points: tuple[Array, NDArray[np.uint8]],
     seen: Sequence[tuple[NDArray[np.int64], Array]],
     suffix: str,
-) -> Any:
+) -> "pycolmap.Reconstruction":
     """The pycolmap reconstruction: poses, points, and the tracks that `seen` describes."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
     for camera in cameras:
         model.add_camera_with_trivial_rig(camera)
-    tracks: list[list[Any]] = [[] for _ in points[0]]
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in points[0]]
     for image_id, (shot, (indices, pixels)) in enumerate(zip(shots, seen, strict=True), 1):
         image = pycolmap.Image(
             name=shot.name + suffix,
@@ -270,8 +276,8 @@ def write_tiny_scene(  # noqa: PLR0913 - a table of independent switches, all ke
     for shot in shots:
         path = folder / "images" / (shot.name + suffix)
         path.parent.mkdir(parents=True, exist_ok=True)
-        quality = {"quality": 95, "subsampling": 0} if suffix == ".jpg" else {}
-        Image.fromarray(_render(world, shot)).save(path, **quality)
+        # Formats other than JPEG ignore these two.
+        Image.fromarray(_render(world, shot)).save(path, quality=95, subsampling=0)
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
     reconstruction = _reconstruct(cameras, shots, cloud, seen, suffix)

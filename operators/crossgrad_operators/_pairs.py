@@ -41,10 +41,3 @@ def project(
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
     return projected(gramians, context.present, order, gates, threshold, strength)
-
-
-def cosines(gramians: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """[B, K, K] cosines; 0 where a view is not present."""
-    norms = np.sqrt(np.where(present, np.diagonal(gramians, axis1=1, axis2=2), 1.0))
-    found: NDArray[np.float64] = gramians / norms[:, :, None] / norms[:, None, :]
-    return np.clip(found, -1.0, 1.0)

@@ -16,8 +16,8 @@ class CAGrad(Operator):
     """The direction near the mean that serves the worst-off view best.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
-    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views, all supports for up
-    to four, an active-set method above. With a single view it is that view's gradient.
+    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views, all
+    supports for up to four, an active-set method above. A single view is left as it is.
     """
 
     c: float = Field(0.5, ge=0, description="radius of the search, as a share of |g_0|")
@@ -36,5 +36,6 @@ class CAGrad(Operator):
         from crossgrad_operators.numba_kernels.simplex import cagrad
 
         weights = cagrad(gramians, context.present, self.c)
+        several = context.present.sum(axis=1, keepdims=True) > 1
         scale = {"none": 1.0, "1+c": 1.0 / (1.0 + self.c), "1+c^2": 1.0 / (1.0 + self.c**2)}
-        return weighting(weights * scale[self.rescale]), state
+        return weighting(weights * np.where(several, scale[self.rescale], 1.0)), state

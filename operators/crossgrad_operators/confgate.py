@@ -11,7 +11,7 @@ from typing_extensions import override
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._memory import recall, remember
-from crossgrad_operators._pairs import cosines, project, slot_order
+from crossgrad_operators._pairs import project, slot_order
 
 _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
@@ -21,7 +21,8 @@ class ConfGate(Operator):
 
     Mean mu and variance v of the block's cosine are exponential averages (bias-corrected) with
     n_eff = (1 + beta) / (1 - beta) effective samples, and
-    P(conflict) = Phi(-mu / sqrt(v / n_eff + 1e-12)). `symmetric` where m < 0 and P >= tau, else `sum`. The first `warmup` updates of a pair never
+    P(conflict) = Phi(-mu / sqrt(v / n_eff + 1e-12)).
+    `symmetric` where m < 0 and P >= tau, else `sum`. The first `warmup` updates of a pair never
     project; pairs with a zero gradient or without a common element (m = 0) are not counted.
     """
 
@@ -40,33 +41,12 @@ class ConfGate(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.gates import confident
+
         views = gramians.shape[1]
-        moments = recall(state, context, "moments", (3, views, views))
-        self._update(moments, gramians, cosines(gramians, context.present))
-        matrices = project(gramians, context, slot_order(views), gates=self._confident(moments))
-        return matrices, remember(state, context, "moments", moments)
-
-    def _update(
-        self,
-        moments: NDArray[np.float64],
-        gramians: NDArray[np.float64],
-        cosine: NDArray[np.float64],
-    ) -> None:
-        """Adds a step to the raw averages of cos and cos^2 and to the number of updates."""
-        counted = gramians != 0
-        for place, value in enumerate((cosine, cosine**2)):
-            changed = self.beta * moments[:, place] + (1 - self.beta) * value
-            moments[:, place] = np.where(counted, changed, moments[:, place])
-        moments[:, 2] += counted
-
-    def _confident(self, moments: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[B, K, K] pairs whose probability of conflict reaches tau."""
         tau = _THRESHOLDS[self.preset] if self.tau is None else self.tau
-        updates = moments[:, 2]
-        missing = np.where(updates > 0, 1.0 - self.beta**updates, 1.0)
-        mean = moments[:, 0] / missing
-        variance = np.maximum(moments[:, 1] / missing - mean**2, 0.0)
-        effective = (1 + self.beta) / (1 - self.beta)
-        score = -mean / np.sqrt(variance / effective + 1e-12)
-        confident: NDArray[np.bool_] = score >= NormalDist().inv_cdf(tau)
-        return confident & (updates > self.warmup)
+        score = NormalDist().inv_cdf(tau)
+        moments = recall(state, context, "moments", (3, views, views))
+        gates = confident(moments, gramians, context.present, self.beta, score, self.warmup)
+        matrices = project(gramians, context, slot_order(views), gates=gates)
+        return matrices, remember(state, context, "moments", moments)

@@ -41,20 +41,17 @@ class GradNorm(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.gates import follow_losses
+
         labels = labels_of(context, "gradnorm")
         losses = self._followed(cast("_Losses", state.values.get("losses", {})), labels, context)
-        groups = tuple(losses)
-        of_view = np.array([groups.index(label) for label in labels])
-        members = (of_view[None, :] == np.arange(len(groups))[:, None]).astype(np.float64)
-        norms = _group_norms(gramians, members)
+        groups = list(losses)
+        group = np.array([groups.index(label) for label in labels])
         logs = recall(state, context, "log_weight", (len(groups),))
-        weights = _scaled(logs, norms > 0)
-        state = PluginState(
-            {**state.values, "losses": cast("Json", losses)}, state.tensors, state.per_primitive
-        )
-        logs = self._stepped(weights, norms, self._rates(losses))
-        state = remember(state, context, "log_weight", logs)
-        return weighting(weights[:, of_view]), state
+        weights = follow_losses(logs, gramians, group, self._rates(losses), self.alpha, self.lr)
+        values = {**state.values, "losses": cast("Json", losses)}
+        kept = PluginState(values, state.tensors, state.per_primitive)
+        return weighting(weights), remember(kept, context, "log_weight", logs)
 
     @hookimpl
     @override
@@ -85,38 +82,3 @@ class GradNorm(Operator):
         if not known:
             return np.ones(len(losses))
         return np.array([s["average"] / s["start"] for s in losses.values()])
-
-    def _stepped(
-        self, weights: NDArray[np.float64], norms: NDArray[np.float64], rates: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """[B, S] log weights after a step; groups without a gradient keep theirs."""
-        active = norms > 0
-        count = np.maximum(active.sum(axis=1, keepdims=True), 1)
-        mean_rate = np.where(active, rates, 0.0).sum(axis=1, keepdims=True) / count
-        relative = rates / np.where(mean_rate > 0, mean_rate, 1.0)
-        # Only signs of differences matter, so that norms may be scaled to keep products finite.
-        lengths = weights * norms / np.maximum(norms.max(axis=1, keepdims=True), 1e-300)
-        target = lengths.sum(axis=1, keepdims=True) / count * relative**self.alpha
-        logs = np.log(weights) - self.lr * np.sign(lengths - target) * (active & (count > 1))
-        return np.log(_scaled(logs, active))
-
-
-def _group_norms(
-    gramians: NDArray[np.float64], members: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """[B, S] norms of the groups' summed gradients; `members` is [S, K]."""
-    squares = np.einsum("sk,bkl,sl->bs", members, gramians, members)
-    norms: NDArray[np.float64] = np.sqrt(np.maximum(squares, 0.0))
-    return norms
-
-
-def _scaled(logs: NDArray[np.float64], active: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """[B, S] weights whose active ones add up to their number."""
-    limited = np.clip(logs, -230.0, 230.0)
-    weights = np.exp(limited - limited.max(axis=1, keepdims=True))
-    total = np.where(active, weights, 0.0).sum(axis=1, keepdims=True)
-    count = active.sum(axis=1, keepdims=True)
-    # Where a block has no gradient at all the weights mean nothing; they stay finite.
-    factor = np.where(total > 0, count / np.where(total > 0, total, 1.0), 1.0)
-    scaled: NDArray[np.float64] = weights * factor
-    return scaled

@@ -109,7 +109,8 @@ def imtl_g(gramians: Floats, present: Flags) -> Floats:
 def _bargain(cosines: Floats) -> Floats:
     """Solves C beta = 1 / beta for beta > 0 by damped Newton.
 
-    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so that steps of 1 / (1 + decrement) converge from anywhere.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so that steps of
+    1 / (1 + decrement) converge from anywhere.
     """
     n = cosines.shape[0]
     beta = np.full(n, 1.0 / np.sqrt(cosines.sum() / n)) if cosines.sum() > 0.5 else np.ones(n)

@@ -30,8 +30,8 @@ class Progress(Observer):
 
     level: Literal["quiet", "normal", "verbose"] = Field(
         "normal",
-        description="quiet: nothing; normal: progress, evaluations, messages; "
-        "verbose: also the notes of the run and every change of density control",
+        description="quiet: nothing; normal: notes of the run, progress, evaluations, messages; "
+        "verbose: also every change of density control",
     )
     interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
 
@@ -42,7 +42,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Shows the scene, and with `verbose` the notes of the run."""
+        """Shows the scene, and what was chosen or left out and why."""
         self._pace = Pace(run.schedule.total)
         self._last_line = monotonic()
         if self.level == "quiet":
@@ -51,9 +51,8 @@ class Progress(Observer):
         self._say(f"{run.scene.name}: {train} training views, {test} held out")
         if run.folder is not None:
             self._say(f"results in {run.folder}")
-        if self.level == "verbose":
-            for note in run.notes:
-                self._say(f"- {note}")
+        for note in run.notes:
+            self._say(f"- {note}")
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:

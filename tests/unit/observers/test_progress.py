@@ -46,7 +46,8 @@ def test_plain_lines_at_every_tenth(capsys: pytest.CaptureFixture[str]):
     lines = err.splitlines()
     assert out == ""
     assert lines[:2] == ["boruszyn: 24 training views, 4 held out", "results in runs/x"]
-    assert lines[2] == ("step 2/20 (10 %), loss 0.2500, 1,000 primitives, 10.0 steps/s, 2 s left")
+    assert lines[2] == "- no masks"
+    assert lines[3] == ("step 2/20 (10 %), loss 0.2500, 1,000 primitives, 10.0 steps/s, 2 s left")
     assert len([line for line in lines if line.startswith("step ")]) == 10
     assert "evaluated at step 10: PSNR 21.50 dB, SSIM 0.7000, 1.0 s training" in lines
     assert "something to know" in lines
@@ -69,7 +70,7 @@ def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]):
     assert capsys.readouterr() == ("", "")
 
 
-def test_verbose_adds_notes_and_density_changes(capsys: pytest.CaptureFixture[str]):
+def test_verbose_adds_density_changes(capsys: pytest.CaptureFixture[str]):
     run_with(Progress(level="verbose"))
     lines = capsys.readouterr().err.splitlines()
     assert "- no masks" in lines

@@ -167,8 +167,14 @@ def shaken(made, seed):
     return replace(made, gaussians=mapped(made.gaussians, shake), camera=camera)
 
 
-def draw(name, made, weights, dtype):
-    """Name -> [rows, columns] float64 of all results and gradients; and the screen."""
+def draw(name, made, weights, dtype, noise=None):
+    """Name -> [rows, columns] float64 of all results and gradients; and the screen.
+
+    What lies behind a Gaussian enters its gradient. An algorithm that does not keep every blend has
+    it as the pixel's whole minus what lies in front: right to a rounding of the whole, not of
+    itself. Where given, `noise` [H, W] has that effect: an error e in what is behind adds to the
+    gradient by each alpha e / (1 - alpha), which is the gradient of e log(transmittance).
+    """
     gaussians = mapped(made.gaussians, lambda t: t.detach().to(dtype, copy=True).requires_grad_())
     background = torch.tensor(made.background, dtype=dtype)
     rasterizer = build("rasterizers", name, made.options)
@@ -179,6 +185,9 @@ def draw(name, made, weights, dtype):
         "depth": result.depth[..., None],
     }
     loss = sum((weights[key] * image).sum() for key, image in images.items())
+    if noise is not None:
+        whole = sum((weights[key] * image).detach().abs().sum(-1) for key, image in images.items())
+        loss = loss + (noise * whole * (1 - result.alpha).log()).sum()
     loss.backward()
     tensors = {name: getattr(gaussians, name) for name in TENSORS}
     found = {n: t.grad[:, None].flatten(1) for n, t in tensors.items() if t is not None}
@@ -200,6 +209,14 @@ def weighting(made, unsettled):
     }
 
 
+def drawn_shaken(made, weights, seed):
+    """Results of the reference with every number off by a few roundings."""
+    rng = torch.Generator().manual_seed(seed)
+    size = (made.camera.height, made.camera.width)
+    noise = 2 * ROUNDING * (2 * torch.rand(size, generator=rng, dtype=torch.float64) - 1)
+    return draw(REFERENCE, shaken(made, seed), weights, torch.float64, noise)[0]
+
+
 @pytest.mark.parametrize("case_name", CASES)
 @pytest.mark.parametrize("name", FAST)
 def test_agrees_with_the_reference(name, case_name):
@@ -210,10 +227,12 @@ def test_agrees_with_the_reference(name, case_name):
     weights = weighting(made, unsettled)
     expected, screen = draw(REFERENCE, made, weights, torch.float64)
     found, fast = draw(name, made, weights, torch.float32)
-    shakes = [draw(REFERENCE, shaken(made, s), weights, torch.float64)[0] for s in range(DRAWS)]
+    shakes = [drawn_shaken(made, weights, seed) for seed in range(DRAWS)]
     for key, rows in expected.items():
         change = torch.stack([(s[key] - rows).norm(dim=-1) for s in shakes]).amax(0)
-        limit = ROUNDINGS * (change + ROUNDING * rows.norm(dim=-1))
+        # alpha is 1 - transmittance: no better than a rounding of 1.
+        size = torch.ones(len(rows)) if key == "alpha" else rows.norm(dim=-1)
+        limit = ROUNDINGS * (change + ROUNDING * size)
         error = (found[key] - rows).norm(dim=-1)
         assert (error <= limit).all(), f"{key}: {(error / limit).max():.2f} of what is allowed"
     assert_same_footprints(screen, fast, exact, unsettled)
@@ -229,6 +248,42 @@ def assert_same_footprints(screen, fast, exact, unsettled):
     at_whole_pixel = np.abs(exact.extents - np.rint(exact.extents)) <= MARGIN * exact.extents
     vanished = (slack > 0) & (np.minimum(radii, found) == 0)
     assert np.all((radii == found) | vanished | ((np.abs(radii - found) == 1) & at_whole_pixel))
+
+
+@pytest.mark.parametrize(
+    ("tensor", "value"),
+    [
+        ("means", float("nan")),
+        ("means", float("inf")),
+        ("means", -1e30),
+        ("quats", 0.0),
+        ("quats", float("nan")),
+        ("scales", float("inf")),
+        ("scales", float("nan")),
+        ("opacities", 0.0039),
+        ("opacities", float("nan")),
+        ("opacities", float("inf")),
+        ("colors", float("nan")),
+        ("colors", float("inf")),
+    ],
+)
+@pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
+@pytest.mark.parametrize("name", FAST)
+def test_what_cannot_be_drawn_leaves_no_trace(name, response, tensor, value):
+    made, _ = settled(case(20, response=response))
+    getattr(made.gaussians, tensor)[3] = value
+    others = torch.arange(20) != 3
+    without = replace(made, gaussians=mapped(made.gaussians, lambda t: t[others]))
+    weights = weighting(made, np.zeros((made.camera.height, made.camera.width), bool))
+    found, screen = draw(name, made, weights, torch.float32)
+    expected, _ = draw(name, without, weights, torch.float32)
+    for key, rows in expected.items():
+        if len(found[key]) == len(rows):
+            assert torch.equal(found[key], rows), key
+        else:
+            assert torch.equal(found[key][others], rows), key
+            assert (found[key][3] == 0).all(), key
+    assert screen.radii[3] == 0
 
 
 def test_the_default_rasterizer_is_among_those_compared():

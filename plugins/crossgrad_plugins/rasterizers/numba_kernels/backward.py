@@ -15,6 +15,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
+    CAPPED,
+    FINISHED,
     LARGEST_ALPHA,
     OFFSETS,
     ONE,
@@ -51,7 +53,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.simd import (
     LANES,
-    as_negative,
     broadcast,
     fma,
     fnma,
@@ -148,14 +149,13 @@ def _gather(
         dx = offsets - broadcast(rows, row + ROW_CENTRE)
         power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
         touched = power >= load(constants, TOUCHED)
-        uncapped = exp2(power, constants)
-        alpha = smaller(uncapped, load(constants, LARGEST_ALPHA))
+        alpha = smaller(exp2(power, constants), load(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
         before = load(state, at + _T)
         weight = alpha * before
         after = before - weight
         blended = after >= load(constants, STOPPED)
-        store(state, at + _T, where(blended, after, as_negative(before)))
+        store(state, at + _T, where(blended, after, load(constants, FINISHED)))
         weight = where(blended, weight, zero)
         v_red = load(state, at + _RED)
         v_green = load(state, at + _GREEN)
@@ -172,10 +172,8 @@ def _gather(
         rest = load(state, at + _REST) - own
         store(state, at + _REST, rest)
         # alpha * dL/d(alpha), the gradient of the exponent and of the log of the opacity
-        capped = uncapped > load(constants, LARGEST_ALPHA)
         s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
-        s = where(blended, s, zero)
-        s = where(capped, zero, s)
+        s = where(blended & (power <= load(constants, CAPPED)), s, zero)
         dy = broadcast(rows, row + ROW_DY)
         sd = s * dx
         sy = s * dy

@@ -5,6 +5,8 @@ that use them. Written into the kernel they would be rebuilt in registers, which
 that made the forward pass 15 % slower.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,12 +31,14 @@ LARGEST_ALPHA = 7 * LANES
 TOUCHED = 8 * LANES
 STOPPED = 9 * LANES
 ONE = 10 * LANES
-OFFSETS = 11 * LANES  # pixel offsets of each column of segments
+FINISHED = 11 * LANES
+CAPPED = 12 * LANES
+OFFSETS = 13 * LANES  # pixel offsets of each column of segments
 
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     """Returns the constants for one cap of alpha, eight equal numbers each (offsets: 0, 1, ...)."""
-    values = (_ROUND, *_EXP2, *_EXP2_HIGH, max_alpha, TOUCH, STOP, 1.0)
+    values = (_ROUND, *_EXP2, *_EXP2_HIGH, max_alpha, TOUCH, STOP, 1.0, -1.0, math.log2(max_alpha))
     offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32)
     return np.concatenate([np.repeat(np.array(values, dtype=np.float32), LANES), offsets])
 

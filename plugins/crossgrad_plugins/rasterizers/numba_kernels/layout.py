@@ -11,7 +11,7 @@ so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of 
 import math
 
 #: Pixels of a tile, a multiple of eight on both sides.
-TILE_WIDTH = 16
+TILE_WIDTH = 32
 TILE_HEIGHT = 16
 #: A segment is eight pixels of a row; a tile's segments are numbered down its columns of segments.
 SEGMENT = 8

@@ -1,0 +1,169 @@
+"""Camera calibrations in COLMAP's terms, and their undistortion through pycolmap."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.errors import UserError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# A pinhole camera where every distortion parameter is 0. Fisheye models are not in the list: with
+# zero parameters they are equidistant, though pycolmap's `is_undistorted` says otherwise.
+_PINHOLE_AT_ZERO = frozenset(
+    {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
+)
+_PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """An undistorted calibration; pixels, pixel centres at +0.5."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def resized(self, width: int, height: int) -> "Pinhole":
+        """The calibration of the same photo resampled to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera model of COLMAP with its parameters.
+
+    Attributes:
+        model: COLMAP's name of the model, such as `PINHOLE` or `OPENCV`.
+        width: Pixels of the photos it was calibrated on.
+        height: Likewise.
+        params: In COLMAP's order for the model.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def check(self, where: object) -> None:
+        """Refuses what no photo can be taken with.
+
+        Raises:
+            UserError: Unknown model, wrong number of parameters, empty size, a focal length that is
+                not positive, or anything that is not finite. Names `where`.
+        """
+        if self.width < 1 or self.height < 1:
+            raise UserError(
+                "a camera has no pixels", where=where, found=f"{self.width} x {self.height}"
+            )
+        try:
+            camera = self._camera
+            valid = camera.verify_params()
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise UserError(
+                "unknown camera model",
+                where=where,
+                expected="a camera model of COLMAP",
+                found=self.model,
+            ) from error
+        if not valid:
+            raise UserError(
+                f"wrong number of parameters for camera model {self.model}",
+                where=where,
+                expected=str(camera.params_info),
+                found=str(len(self.params)),
+            )
+        if not all(map(math.isfinite, self.params)):
+            raise UserError(
+                "a camera parameter is not a finite number",
+                where=where,
+                found=f"{self.model} {list(self.params)}",
+            )
+        focal = [self.params[i] for i in camera.focal_length_idxs()]
+        if min(focal, default=1.0) <= 0:
+            raise UserError(
+                "a focal length is not positive",
+                where=where,
+                expected="pixels > 0",
+                found=f"{min(focal):g}",
+            )
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether photos need no undistortion."""
+        if self.model in _PINHOLE:
+            return True
+        extra = [self.params[i] for i in self._camera.extra_params_idxs()]
+        return self.model in _PINHOLE_AT_ZERO and not any(extra)
+
+    def resized(self, width: int, height: int) -> "Calibration":
+        """The calibration of the same photos resampled to `width` x `height`."""
+        if (width, height) == (self.width, self.height):
+            return self
+        if self.is_pinhole:
+            pinhole = self._read_pinhole(self._camera).resized(width, height)
+            params = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)
+            return Calibration("PINHOLE", width, height, params)
+        camera = self._make_camera()
+        camera.rescale(width, height)
+        return Calibration(self.model, width, height, tuple(float(p) for p in camera.params))
+
+    @cached_property
+    def pinhole(self) -> Pinhole:
+        """The calibration after undistortion; size and principal point may differ.
+
+        Raises:
+            UserError: The model has no pinhole equivalent.
+        """
+        if self.is_pinhole:
+            return self._read_pinhole(self._camera)
+        import pycolmap
+
+        try:
+            camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(
+                f"photos of camera model {self.model} cannot be undistorted to a pinhole",
+                found=str(error),
+                todo="export perspective photos, for example with COLMAP's image undistorter",
+            ) from error
+        return self._read_pinhole(camera)
+
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A photo in the pixels of `pinhole`, bilinear; black where nothing was seen.
+
+        Args:
+            image: [H, W, 3] or [H, W], in the size of the calibration.
+        """
+        import pycolmap
+
+        bitmap, _ = pycolmap.undistort_image(
+            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(image), self._camera
+        )
+        return np.asarray(bitmap.to_array())
+
+    @cached_property
+    def _camera(self) -> "pycolmap.Camera":
+        return self._make_camera()
+
+    def _make_camera(self) -> "pycolmap.Camera":
+        import pycolmap
+
+        return pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+    @staticmethod
+    def _read_pinhole(camera: "pycolmap.Camera") -> Pinhole:
+        matrix = camera.calibration_matrix()
+        fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Pinhole(camera.width, camera.height, fx, fy, cx, cy)

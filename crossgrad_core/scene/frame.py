@@ -1,0 +1,89 @@
+"""The local frame: the mean training camera is its origin, the cameras' extent its unit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.scene.types import Similarity
+
+# 1.1 x the largest distance of a training camera from their mean (3DGS, scene extent).
+_MARGIN = 1.1
+
+# Cameras that stand closer together than this share of their distance to the scene give no unit.
+_SAME_PLACE = 1e-6
+
+# Local coordinates are rounded to multiples of this, 1e-9 of the extent. One scene given in other
+# units or with another origin differs by a few units in the last place of float64; that is a
+# thousand to ten million times less than the grid, so nearly every coordinate comes out with the
+# same bits. The rounding itself is 60 times smaller than the step of float32 at 1.
+_GRID = 2.0**-30
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A local frame and how it was chosen.
+
+    Attributes:
+        similarity: Input frame -> local frame.
+        note: One sentence for the run's log.
+    """
+
+    similarity: Similarity
+    note: str
+
+    def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the input frame in the local frame, on its grid."""
+        return _snap(self.similarity.to_local(points))
+
+    def pose(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[4, 4] pose from the local frame; the rotation is kept, the centre is on the grid."""
+        center = self.points(camera_centers(world_to_camera[None]))[0]
+        pose = np.eye(4)
+        pose[:3, :3] = world_to_camera[:3, :3]
+        pose[:3, 3] = -pose[:3, :3] @ center
+        return pose
+
+
+def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 3] camera centres of poses [N, 4, 4]."""
+    rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
+    return np.asarray(-np.einsum("nij,ni->nj", rotation, translation))
+
+
+def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
+    """The local frame of a scene (3DGS: centre and extent of the training cameras).
+
+    Where the training cameras stand in one place, the unit is their median distance to the points,
+    and without points one unit of the input.
+
+    Args:
+        centers: [N, 3] centres of the training cameras, input frame; N >= 1.
+        points: [P, 3] SfM points, input frame; may be empty.
+    """
+    # Sums of coordinates far from 0 lose digits; sums of differences do not.
+    origin = centers[0] + (centers - centers[0]).mean(0)
+    extent = float(_MARGIN * np.linalg.norm(centers - origin, axis=1).max())
+    depth = float(np.median(np.linalg.norm(points - origin, axis=1))) if len(points) else 0.0
+    if extent > _SAME_PLACE * depth and extent > 0:
+        return Frame(
+            Similarity(origin, 1 / extent),
+            f"local frame: 1 unit = {extent:.6g} input units, the extent of the training cameras "
+            "(1.1 x largest distance from their mean)",
+        )
+    if depth > 0:
+        return Frame(
+            Similarity(origin, 1 / depth),
+            f"local frame: 1 unit = {depth:.6g} input units, the median distance to the SfM "
+            "points, because the training cameras stand in one place",
+        )
+    return Frame(
+        Similarity(origin, 1.0),
+        "local frame: 1 unit = 1 input unit, because the training cameras stand in one place and "
+        "there are no SfM points",
+    )
+
+
+def _snap(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Adding 0 turns -0.0 into 0.0.
+    return np.asarray(np.rint(points / _GRID) * _GRID + 0.0)

@@ -1,0 +1,16 @@
+"""How notes and errors name many things."""
+
+from collections.abc import Sequence
+
+_SHOWN = 3
+
+
+def name_some(names: Sequence[str]) -> str:
+    """The first few of many names, and how many more there are."""
+    shown = ", ".join(names[:_SHOWN])
+    return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+
+
+def count(number: int, noun: str) -> str:
+    """`1 photo`, `2 photos`."""
+    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -1,0 +1,115 @@
+"""Running statistics of operators that remember earlier steps."""
+
+import numpy as np
+from numba import njit
+
+from crossgrad_operators.numba_kernels.normal import Flags, Floats, Indices, normalised
+
+
+@njit(cache=True)
+def confident(
+    moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
+) -> Flags:
+    """[B, K, K] pairs that have probably been conflicting; `moments` are updated in place.
+
+    Args:
+        moments: [B, 3, K, K] raw exponential averages of the cosine and its square, and the number
+            of updates. Pairs without a product are not counted.
+        gramians: [B, K, K].
+        present: [B, K].
+        beta: Decay of the averages.
+        score: -mean / sqrt(variance / n_eff + 1e-12) from which a conflict is believed.
+        warmup: Updates of a pair before that.
+    """
+    blocks, views, _ = gramians.shape
+    gates = np.zeros((blocks, views, views), np.bool_)
+    norms, cosines = np.empty(views), np.empty((views, views))
+    effective = (1.0 + beta) / (1.0 - beta)
+    for b in range(blocks):
+        normalised(gramians[b], present[b], norms, cosines)
+        for i in range(views):
+            for j in range(views):
+                if i == j or gramians[b, i, j] == 0.0:
+                    continue
+                c = cosines[i, j]
+                moments[b, 0, i, j] = beta * moments[b, 0, i, j] + (1.0 - beta) * c
+                moments[b, 1, i, j] = beta * moments[b, 1, i, j] + (1.0 - beta) * c * c
+                moments[b, 2, i, j] += 1.0
+                missing = 1.0 - beta ** moments[b, 2, i, j]
+                mean = moments[b, 0, i, j] / missing
+                variance = max(moments[b, 1, i, j] / missing - mean * mean, 0.0)
+                believed = -mean / np.sqrt(variance / effective + 1e-12) >= score
+                gates[b, i, j] = believed and moments[b, 2, i, j] > warmup
+    return gates
+
+
+@njit(cache=True)
+def _scale(logs: Floats, active: Flags) -> None:
+    """Shifts log weights so that the active weights add up to their number."""
+    largest = -np.inf
+    count = 0
+    for s in range(logs.size):
+        logs[s] = min(max(logs[s], -230.0), 230.0)
+        if active[s]:
+            largest = max(largest, logs[s])
+            count += 1
+    if count == 0:
+        return
+    total = 0.0
+    for s in range(logs.size):
+        if active[s]:
+            total += np.exp(logs[s] - largest)
+    logs -= largest + np.log(total / count)
+
+
+@njit(cache=True)
+def follow_losses(
+    logs: Floats, gramians: Floats, group: Indices, rates: Floats, alpha: float, lr: float
+) -> Floats:
+    """[B, K] GradNorm weights of this step; `logs` are the log weights of the next one after it.
+
+    Args:
+        logs: [B, S] log weights.
+        gramians: [B, K, K].
+        group: [K] group of each view, below S.
+        rates: [S] relative losses.
+        alpha: Exponent of the rates.
+        lr: Step of a log weight.
+    """
+    blocks, views, _ = gramians.shape
+    groups = rates.size
+    weights = np.zeros((blocks, views))
+    lengths = np.empty(groups)
+    active = np.empty(groups, np.bool_)
+    for b in range(blocks):
+        squares = np.zeros(groups)
+        for i in range(views):
+            for j in range(views):
+                if group[i] == group[j]:
+                    squares[group[i]] += gramians[b, i, j]
+        count = 0
+        rate = 0.0
+        for s in range(groups):
+            lengths[s] = np.sqrt(max(squares[s], 0.0))
+            active[s] = lengths[s] > 0.0
+            if active[s]:
+                count += 1
+                rate += rates[s]
+        if count == 0:
+            continue
+        _scale(logs[b], active)
+        for k in range(views):
+            weights[b, k] = np.exp(logs[b, group[k]])
+        if count == 1:
+            continue
+        mean = 0.0
+        for s in range(groups):
+            if active[s]:
+                lengths[s] *= np.exp(logs[b, s])
+                mean += lengths[s] / count
+        for s in range(groups):
+            if active[s]:
+                target = mean * (rates[s] * count / rate) ** alpha if rate > 0.0 else mean
+                logs[b, s] -= lr * np.sign(lengths[s] - target)
+        _scale(logs[b], active)
+    return weights
