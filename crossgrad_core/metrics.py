@@ -1,8 +1,8 @@
 """Image metrics of evaluation: PSNR and two kinds of SSIM on 8-bit images.
 
-Every metric clamps both images to [0, 1] and rounds them to 8 bits first, as if the render had been
-written to a file and read back. With a mask only kept pixels count; for both SSIMs a masked-out pixel
-is 0 in both images.
+Every metric clamps both images to [0, 1] and rounds them to 8 bits first, as if the render had
+been written to a file and read back. With a mask only kept pixels count; for both SSIMs a
+masked-out pixel is 0 in both images.
 """
 
 import numpy as np
@@ -12,18 +12,18 @@ from torch import Tensor
 
 from crossgrad_core.photometric.reference import RADIUS, SIGMA, WINDOW, masked
 
-#: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite; images
-#: that differ reach it only if fewer than one in 150,000 of their values is off, by one 8-bit step.
+#: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite;
+#: images that differ reach it only if fewer than one value in 150,000 is off, by one 8-bit step.
 PSNR_LIMIT = 100.0
 
 SSIM_SKIMAGE_TOO_SMALL = (
-    f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border of an image of "
-    f"{WINDOW} x {WINDOW} or more"
+    f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
+    f"in an image of {WINDOW} x {WINDOW} or more"
 )
 
 
 def lpips_unavailable_reason() -> str:
-    """Why LPIPS is null: the weights of its network are not part of any package that is installed."""
+    """Why LPIPS is null: no package brings the weights of its network."""
     return (
         "LPIPS needs the pretrained AlexNet or VGG trunk, which no Python package ships; "
         "it is not computed"
@@ -58,9 +58,9 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """SSIM as the loss has it: 11 x 11 Gaussian window, sigma 1.5, zero-padded, mean over kept pixels.
+    """SSIM as the loss has it: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
 
-    Arguments as for `psnr`. None if no pixel is kept.
+    Arguments as for `psnr`. The mean over kept pixels; None if no pixel is kept.
     """
     from crossgrad_core.photometric.fused import loss_terms
 
@@ -75,7 +75,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """SSIM of scikit-image with Gaussian weights, sigma 1.5, and without sample covariance.
 
-    As scikit-image does, the mean leaves out a border of 5 pixels, where windows would leave the image.
+    As in scikit-image, the mean leaves out a border of 5 pixels, where windows leave the image.
 
     Arguments as for `psnr`. None, with `SSIM_SKIMAGE_TOO_SMALL` as the reason, if nothing is left.
     """
@@ -97,7 +97,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
     rendered, photo = (
         masked(_eight_bit(i).to(torch.float64) / 255, mask).numpy() for i in (image, target)
     )
-    _, full = structural_similarity(
+    _, full = structural_similarity(  # type: ignore[no-untyped-call]
         rendered,
         photo,
         gaussian_weights=True,

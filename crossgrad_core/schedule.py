@@ -7,6 +7,12 @@ ScheduleMode = Literal["scaled", "absolute"]
 
 #: The length that every published figure is written for (3DGS).
 REFERENCE_STEPS = 30_000
+#: Learning rates of colour, scale and opacity are not stretched with the run, so that the first
+#: transient always takes some hundred steps. Gradients are large everywhere during it, and growing
+#: then copies Gaussians that only had to settle.
+WARM_UP = 500
+#: The statistics of so many steps decide about growth (published figure, a floor here).
+SHORTEST_INTERVAL = 100
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
 
@@ -50,9 +56,9 @@ class Schedule:
             total=total,
             lr_steps=total,
             sh_interval=max(100, total // 30),
-            densify_from=total // 60,
+            densify_from=max(total // 60, min(WARM_UP, total // 4)),
             densify_until=total // 2,
-            densify_every=max(50, total // 300),
+            densify_every=max(min(SHORTEST_INTERVAL, max(1, total // 20)), total // 300),
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
             prune_large_from=total // 10,
             anchors_from=total // 20,

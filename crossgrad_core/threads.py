@@ -21,22 +21,24 @@ def configure_threads(n: int | None = None) -> int:
 
     - OpenMP wakes its threads in about 3 microseconds, workqueue in 40 to 80.
     - torch brings its own copy of libgomp and Numba loads the system's, so there are two pools, and
-      idle threads of a pool spin for a while before they sleep. Numba's and torch's parallel operators
-      in turn take as long as the two apart when both are OpenMP. With workqueue, whose threads have to
-      be woken by the scheduler while torch's spin, the same loop takes up to twice as long.
-      `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per parallel call,
-      which small operators feel more than large ones gain: the default is left alone.
-    - workqueue ends the process when two Python threads enter parallel kernels at once; OpenMP and TBB
-      do not. OpenMP (GNU) in turn forbids parallel kernels in a forked child: start worker processes
-      with the "spawn" or "forkserver" method if they are to run any.
+      idle threads of a pool spin for a while before they sleep. Numba's and torch's parallel
+      operators in turn take as long as the two apart when both are OpenMP. With workqueue, whose
+      threads have to be woken by the scheduler while torch's spin, the same loop takes up to twice
+      as long. `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per
+      parallel call, which small operators feel more than large ones gain: the default is left
+      alone.
+    - workqueue ends the process when two Python threads enter parallel kernels at once; OpenMP and
+      TBB do not. OpenMP (GNU) in turn forbids parallel kernels in a forked child: start worker
+      processes with the "spawn" or "forkserver" method if they are to run any.
 
     On the CPU torch runs backward passes in the thread that calls `backward`, so a parallel kernel
-    inside `torch.autograd.Function` meets the same pool as everywhere else. Numba's number of threads
-    belongs to the calling thread: a second thread that runs kernels has to call this function too.
+    inside `torch.autograd.Function` meets the same pool as everywhere else. Numba's number of
+    threads belongs to the calling thread: a second thread that runs kernels has to call this
+    function too.
 
     Args:
-        n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else the
-            cores that this process may use (its affinity and, in a container, its CPU quota).
+        n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else
+            the cores that this process may use (its affinity and, in a container, its CPU quota).
 
     Returns:
         The number of threads in force.
@@ -46,7 +48,7 @@ def configure_threads(n: int | None = None) -> int:
     """
     import numba
 
-    most = int(numba.config.NUMBA_NUM_THREADS)
+    most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     if n is None:
         n = min(_default_threads(), most)
     if not 1 <= n <= most:
@@ -68,7 +70,8 @@ def _prefer_openmp() -> None:
     import numba
 
     if not {"NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER_PRIORITY"} & os.environ.keys():
-        numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+        layers = ["omp", "tbb", "workqueue"]
+        numba.config.THREADING_LAYER_PRIORITY = layers  # type: ignore[attr-defined]
 
 
 def _default_threads() -> int:
@@ -80,7 +83,7 @@ def _default_threads() -> int:
 
 
 def available_cores() -> int:
-    """Cores this process may use: its affinity, and at most its container's CPU quota, rounded up."""
+    """Cores this process may use: its affinity, at most its container's CPU quota rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
 

@@ -31,11 +31,11 @@ class Vanilla(Backbone):
     sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")
     lr_means: float = Field(1.6e-4, gt=0, description="initial, per scene extent")
     lr_means_final: float = Field(1.6e-6, gt=0, description="final, per scene extent")
-    lr_scales: float = Field(5e-3, ge=0)
-    lr_quats: float = Field(1e-3, ge=0)
-    lr_opacities: float = Field(0.05, ge=0)
-    lr_f_dc: float = Field(2.5e-3, ge=0)
-    lr_f_rest: float = Field(2.5e-3 / 20, ge=0)
+    lr_scales: float = Field(5e-3, ge=0, description="learning rate of the log scales")
+    lr_quats: float = Field(1e-3, ge=0, description="learning rate of the rotations")
+    lr_opacities: float = Field(0.05, ge=0, description="learning rate of the opacity logits")
+    lr_f_dc: float = Field(2.5e-3, ge=0, description="learning rate of SH band 0")
+    lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
 
     @override
     def blocks(self) -> tuple[Block, ...]:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from crossgrad_core.optimizer.state import AdamState
 
-# Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by less
-# than 1e-14 of its learning rate, but as they decay they would become subnormal.
+# Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
+# less than 1e-14 of its learning rate, but as they decay they would become subnormal.
 TINY = 1e-30
 # Second moments below float32's smallest normal number count as 0: their root, 1e-19, is nothing
 # against eps = 1e-15, and subnormal numbers are slow on most processors.
@@ -52,10 +52,10 @@ def adam_step(
 ) -> None:
     """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
 
-    A tensor without gradient (None or absent) keeps value, moments and step count. Numbers too small
-    or too large for float32 arithmetic are treated as the constants of this module say; within
-    [1e-18, 1e18] the result is that of `torch.optim.Adam` to rounding. A NaN in a gradient spreads to
-    its element, as it does there.
+    A tensor without gradient (None or absent) keeps value, moments and step count. Gradients too
+    small or too large for float32 arithmetic are treated as the constants of this module say;
+    within [1e-17, 1e18] the result is that of `torch.optim.Adam` to rounding. A NaN in a gradient
+    spreads to its element, as it does there.
 
     Args:
         params: Floating-point tensors of any shape, by name.
@@ -87,7 +87,7 @@ def adam_step(
 def update_tensor(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """Applies one step to one tensor and its moments: fused on the CPU in float32, else by torch."""
+    """Applies one step to a tensor and its moments: fused on the CPU in float32, else by torch."""
     tensors = (param, exp_avg, exp_avg_sq)
     on_cpu = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, grad))
     if on_cpu and all(t.is_contiguous() for t in tensors):
@@ -120,9 +120,7 @@ def _without(values: Tensor, floor: float) -> Tensor:
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 
-def _coefficients(
-    count: int, lr: float, betas: tuple[float, float], eps: float
-) -> Coefficients:
+def _coefficients(count: int, lr: float, betas: tuple[float, float], eps: float) -> Coefficients:
     beta1, beta2 = betas
     return Coefficients(
         beta1=beta1,
@@ -148,4 +146,6 @@ def _check(
         grad = grads.get(name)
         if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):
             found = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
-            raise ValueError(f"gradient of `{name}` must have the shape and type of the tensor; {found}")
+            raise ValueError(
+                f"gradient of `{name}` must have the shape and type of the tensor; {found}"
+            )

@@ -1,9 +1,12 @@
 """Adam's update of one float32 tensor in a single pass over memory (Numba, CPU)."""
 
+from typing import TypeAlias
+
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_core.jit import kernel, parallel_kernel
 from crossgrad_core.optimizer.adam import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
@@ -11,15 +14,20 @@ _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the nu
 _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+_Floats: TypeAlias = NDArray[np.float32]
+_Numbers: TypeAlias = tuple[
+    np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32
+]
 
 
-@njit(**_OPTIONS)
-def _update(param, grad, exp_avg, exp_avg_sq, coefficients):
-    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor = coefficients
+@kernel
+def _update(
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+) -> None:
+    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor = numbers
     for i in range(len(param)):
         g = grad[i]
-        g = _LARGEST if g > _LARGEST else (-_LARGEST if g < -_LARGEST else g)
+        g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m
@@ -31,11 +39,13 @@ def _update(param, grad, exp_avg, exp_avg_sq, coefficients):
         param[i] -= step_size * (m / (np.sqrt(v) * root_scale + eps))
 
 
-@njit(parallel=True, **_OPTIONS)
-def _update_chunks(param, grad, exp_avg, exp_avg_sq, coefficients):
+@parallel_kernel
+def _update_chunks(
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+) -> None:
     for chunk in prange((len(param) + _CHUNK - 1) // _CHUNK):
         a, b = chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK)
-        _update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], coefficients)
+        _update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
 
 
 def update_arrays(
@@ -46,19 +56,16 @@ def update_arrays(
     step: Coefficients,
 ) -> None:
     """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
-    coefficients = tuple(
-        np.float32(value)
-        for value in (
-            step.beta1,
-            1 - step.beta1,
-            step.beta2,
-            1 - step.beta2,
-            step.step_size,
-            step.root_scale,
-            step.eps,
-            step.square_floor,
-        )
+    numbers: _Numbers = (
+        np.float32(step.beta1),
+        np.float32(1 - step.beta1),
+        np.float32(step.beta2),
+        np.float32(1 - step.beta2),
+        np.float32(step.step_size),
+        np.float32(step.root_scale),
+        np.float32(step.eps),
+        np.float32(step.square_floor),
     )
     # A single chunk is not worth waking other threads for.
     update = _update if len(param) <= _CHUNK else _update_chunks
-    update(param, grad, exp_avg, exp_avg_sq, coefficients)
+    update(param, grad, exp_avg, exp_avg_sq, numbers)

@@ -5,37 +5,44 @@ five, M_s, M_d, E[s^2], E[d^2], and factors without cancellation between the two
 
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 
-with V = E[.^2] - M^2. Its gradient is G * a + s (G * b) + d (G * c), where G * is the same window and
-a, b, c hold the derivatives by M_s + M_d, V_s and V_d. Variances are differences of nearly equal
-numbers where the image is smooth, so s and d are taken relative to a centre: their means over the tile
-(per channel).
+with V = E[.^2] - M^2. Its gradient is G * a + s (G * b) + d (G * c), where G * is the same window
+and a, b, c hold the derivatives by M_s + M_d, V_s and V_d. Variances are differences of nearly
+equal numbers where the image is smooth, so s and d are taken relative to a centre: their means over
+the tile (per channel).
 
-The image is cut into tiles whose size depends on the image's size only. A tile runs down its rows with
-ring buffers of sixteen rows (s, d, mask; a, b, c), so that the working set stays in the second-level
-cache and memory does not grow with the image. Rows are kept interleaved, [column * 3 + channel]: a step
-of one column is three floats. Every tile recomputes its halo, so tiles are independent and the result
-has the same bits for any number of threads.
+The image is cut into tiles whose size depends on the image's size only. A tile runs down its rows
+with ring buffers of sixteen rows (s, d, mask; a, b, c), so that the working set stays in the
+second-level cache and memory does not grow with the image. Rows are kept interleaved,
+[column * 3 + channel]: a step of one column is three floats. Every tile recomputes its halo, so
+tiles are independent and the result has the same bits for any number of threads.
 """
+# ruff: noqa: ANN401, ARG001 - Numba's extension points are untyped and fix the arguments.
 
-import numba
+from typing import Any, TypeAlias
+
 import numpy as np
-from llvmlite import ir
-from numba import njit, prange, types
-from numba.extending import intrinsic
+from numba import get_num_threads, prange, types
 from numpy.typing import NDArray
 
+from crossgrad_core.jit import kernel, parallel_kernel, sum_kernel
 from crossgrad_core.photometric._simd import (
     LANES,
-    element_pointer,
-    emit_load,
+    emitted,
     f32x8,
     load,
+    product,
     splat,
     store,
     symmetric_sum,
+    vector_at,
     where_positive,
 )
 from crossgrad_core.photometric.reference import C1, C2, RADIUS, WINDOW, gaussian_window
+
+_Floats: TypeAlias = NDArray[np.float32]  # 1-D
+_Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
+_Flags: TypeAlias = NDArray[np.bool_]  # 1-D
+_Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
 
 _TILE_ROWS = 64
 _TILE_COLUMNS = 384
@@ -65,69 +72,62 @@ _ZERO, _ONE, _TWO, _HALF = (np.float32(v) for v in (0, 1, 2, 0.5))
 _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 _WHITE = np.float32(255)
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-# Only sums of float64 may be reordered (into vector lanes; the order is then fixed by the machine code).
-_SUM_OPTIONS = _OPTIONS | {"fastmath": {"contract", "nsz", "reassoc"}}
 
-
-@intrinsic
-def _across(typing_context, array, start):
+@emitted
+def _across(typing_context: Any, array: Any, start: Any) -> Any:
     """Window sum over eleven columns, the first of them at element `start`."""
 
-    def generate(context, builder, signature, args):
-        array_type = signature.args[0]
-        taps = []
-        for k in range(WINDOW):
-            index = builder.add(args[1], ir.Constant(args[1].type, _CHANNELS * k))
-            pointer = element_pointer(context, builder, array_type, args[0], index)
-            taps.append(emit_load(builder, pointer))
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array_type, (row, first) = signature.args[0], args
+        starts = [builder.add(first, first.type(_CHANNELS * k)) for k in range(WINDOW)]
+        taps = [vector_at(context, builder, array_type, row, index) for index in starts]
         return symmetric_sum(builder, taps, _WEIGHTS)
 
     return f32x8(array, types.intp), generate
 
 
-def _ring_taps(context, builder, array_type, array, start, row):
-    """Loads column `start` of the ring's rows row - 5 .. row + 5."""
-    integer = row.type
+def _ring_taps(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+    """Column `start` of the ring's rows row - 5 .. row + 5."""
+    array, start, row = args
     taps = []
     for k in range(-RADIUS, RADIUS + 1):
-        slot = builder.and_(
-            builder.add(row, ir.Constant(integer, k)), ir.Constant(integer, _SLOTS - 1)
-        )
-        index = builder.add(start, builder.mul(slot, ir.Constant(integer, _STRIDE)))
-        pointer = element_pointer(context, builder, array_type, array, index)
-        taps.append(emit_load(builder, pointer))
+        slot = builder.and_(builder.add(row, row.type(k)), row.type(_SLOTS - 1))
+        index = builder.add(start, builder.mul(slot, row.type(_STRIDE)))
+        taps.append(vector_at(context, builder, signature.args[0], array, index))
     return taps
 
 
-@intrinsic
-def _down(typing_context, array, start, row):
+@emitted
+def _down(typing_context: Any, array: Any, start: Any, row: Any) -> Any:
     """Window sum over rows row - 5 .. row + 5 of the ring whose column is at element `start`."""
 
-    def generate(context, builder, signature, args):
-        taps = _ring_taps(context, builder, signature.args[0], *args)
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        taps = _ring_taps(context, builder, signature, args)
         return symmetric_sum(builder, taps, _WEIGHTS)
 
     return f32x8(array, types.intp, types.intp), generate
 
 
-@intrinsic
-def _down_with_squares(typing_context, array, start, row):
+@emitted
+def _down_with_squares(typing_context: Any, array: Any, start: Any, row: Any) -> Any:
     """Window sums over rows row - 5 .. row + 5 of the ring's values and of their squares."""
-    pair = types.UniTuple(f32x8, 2)
+    pair: Any = types.UniTuple(f32x8, 2)  # type: ignore[no-untyped-call]
 
-    def generate(context, builder, signature, args):
-        taps = _ring_taps(context, builder, signature.args[0], *args)
-        squares = [builder.fmul(tap, tap, flags=("contract", "nsz")) for tap in taps]
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        taps = _ring_taps(context, builder, signature, args)
+        squares = [product(builder, tap, tap) for tap in taps]
         sums = [symmetric_sum(builder, values, _WEIGHTS) for values in (taps, squares)]
         return context.make_tuple(builder, pair, sums)
 
     return pair(array, types.intp, types.intp), generate
 
 
-@njit(**_OPTIONS)
-def _set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width):
-    """Per channel, means of s and d over every eighth row of the tile, x and y clipped to [0, 1]."""
+@kernel
+def _set_centres(
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, box: _Box, width: int,
+) -> None:  # fmt: skip
+    """Per channel, means of s and d over every eighth row of the tile, x and y clipped."""
     top, bottom, left, right = box
     for channel in range(_CHANNELS):
         count = 1e-9  # nothing kept: the sums are 0, and so are the centres
@@ -139,9 +139,9 @@ def _set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, 
                 count += 1.0
                 i = (row * width + column) * _CHANNELS + channel
                 y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
-                # NaN fails both comparisons and counts as 0.
-                sum_x += _ONE if image[i] > _ONE else (image[i] if image[i] > _ZERO else _ZERO)
-                sum_y += _ONE if y > _ONE else (y if y > _ZERO else _ZERO)
+                # In this order a NaN counts as 0.
+                sum_x += float(min(max(_ZERO, image[i]), _ONE))
+                sum_y += float(min(max(_ZERO, y), _ONE))
         centre_sum = np.float32((sum_x + sum_y) / count)
         centre_difference = np.float32((sum_x - sum_y) / count)
         for j in range(channel, _STRIDE, _CHANNELS):
@@ -152,29 +152,33 @@ def _set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, 
 # Loops over views from 0 on, because an index that may be negative keeps LLVM from vectorising.
 
 
-@njit(**_OPTIONS)
-def _fill(array, start, count, value):
+@kernel
+def _fill(array: _Floats, start: int, count: int, value: np.float32) -> None:
     view = array[start : start + count]
     for j in range(count):
         view[j] = value
 
 
-@njit(**_OPTIONS)
-def _copy(destination, start, source, source_start, count):
+@kernel
+def _copy(destination: _Floats, start: int, source: _Floats, source_start: int, count: int) -> None:
     view, values = destination[start : start + count], source[source_start : source_start + count]
     for j in range(count):
         view[j] = values[j]
 
 
-@njit(**_OPTIONS)
-def _copy_8bit(destination, start, source, source_start, count):
+@kernel
+def _copy_8bit(
+    destination: _Floats, start: int, source: _Bytes, source_start: int, count: int
+) -> None:
     view, values = destination[start : start + count], source[source_start : source_start + count]
     for j in range(count):
         view[j] = np.float32(values[j]) / _WHITE
 
 
-@njit(**_OPTIONS)
-def _copy_mask(destination, start, mask, mask_start, pixels):
+@kernel
+def _copy_mask(
+    destination: _Floats, start: int, mask: _Flags, mask_start: int, pixels: int
+) -> None:
     """Each pixel's mask, once per channel, as 0 or 1."""
     view, values = destination[start : start + _CHANNELS * pixels], mask[mask_start:]
     for pixel in range(pixels):
@@ -182,8 +186,11 @@ def _copy_mask(destination, start, mask, mask_start, pixels):
         view[3 * pixel], view[3 * pixel + 1], view[3 * pixel + 2] = keep, keep, keep
 
 
-@njit(**_OPTIONS)
-def _load_row(scratch, image, target, target_8bit, is_8bit, mask, is_masked, row, box, height, width):
+@kernel
+def _load_row(
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, row: int, box: _Box, height: int, width: int,
+) -> None:  # fmt: skip
     """Puts s, d (relative to their centres) and the mask of a row into the rings.
 
     Outside the image and at masked-out pixels both images are 0.
@@ -219,9 +226,9 @@ def _load_row(scratch, image, target, target_8bit, is_8bit, mask, is_masked, row
         store(scratch, d + j, x - y - load(scratch, _CENTRE_DIFFERENCE + j))
 
 
-@njit(**_OPTIONS)
-def _ssim_row(scratch, row, columns):
-    """Writes 1 - SSIM of a row to the line and its a, b, c to their rings, 0 where nothing counts."""
+@kernel
+def _ssim_row(scratch: _Floats, row: int, columns: int) -> None:
+    """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts."""
     for j in range(0, _CHANNELS * (columns + 4 * RADIUS), LANES):
         values, squares = _down_with_squares(scratch, _SUM + j, row)
         store(scratch, _PARTIAL + j, values)
@@ -267,16 +274,18 @@ def _ssim_row(scratch, row, columns):
         )
 
 
-@njit(**_OPTIONS)
-def _clear_row(scratch, row, columns):
+@kernel
+def _clear_row(scratch: _Floats, row: int, columns: int) -> None:
     """Sets a, b, c of a row outside the image to 0."""
     slot = (row & (_SLOTS - 1)) * _STRIDE
     for ring in (_BY_MEAN, _BY_SUM_VARIANCE, _BY_DIFFERENCE_VARIANCE):
         _fill(scratch, ring + slot, _CHANNELS * (columns + 2 * RADIUS), _ZERO)
 
 
-@njit(**_OPTIONS)
-def _gradient_row(scratch, row, columns, l1_weight, ssim_weight):
+@kernel
+def _gradient_row(
+    scratch: _Floats, row: int, columns: int, l1_weight: np.float32, ssim_weight: np.float32
+) -> None:
     """Writes the loss's gradient at a row of the tile to the line."""
     for j in range(0, _CHANNELS * (columns + 2 * RADIUS), LANES):
         store(scratch, _BACK + j, _down(scratch, _BY_MEAN + j, row))
@@ -297,8 +306,8 @@ def _gradient_row(scratch, row, columns, l1_weight, ssim_weight):
         store(scratch, _LINE + j, where_positive(keep, l1 - ssim * weight, zero))
 
 
-@njit(**_SUM_OPTIONS)
-def _sum(array, start, count):
+@sum_kernel
+def _sum(array: _Floats, start: int, count: int) -> float:
     view = array[start : start + count]
     total = 0.0
     for j in range(count):
@@ -306,8 +315,8 @@ def _sum(array, start, count):
     return total
 
 
-@njit(**_SUM_OPTIONS)
-def _sum_absolute(scratch, start, count):
+@sum_kernel
+def _sum_absolute(scratch: _Floats, start: int, count: int) -> float:
     """Sum of |d| from element `start` of the ring on; the pixel at `start` begins a period."""
     view, centre = scratch[start : start + count], scratch[_CENTRE_DIFFERENCE:]
     total = 0.0
@@ -316,11 +325,12 @@ def _sum_absolute(scratch, start, count):
     return total
 
 
-@njit(**_OPTIONS)
+@kernel
 def _tile(
-    scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
-    box, height, width, l1_weight, ssim_weight,
-):  # fmt: skip
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
+    box: _Box, height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
+) -> tuple[float, float]:  # fmt: skip
     """Sums of |x - y| and 1 - SSIM over a tile; its gradient is written to `gradient`."""
     top, bottom, left, right = box
     columns = right - left
@@ -350,12 +360,14 @@ def _tile(
     return absolute, dissimilarity
 
 
-@njit(parallel=True, **_OPTIONS)
+@parallel_kernel
 def _all_tiles(
-    scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient, with_gradient,
-    height, width, l1_weight, ssim_weight, sums,
-):  # fmt: skip
-    """Runs every tile; tile t uses row t % step of `scratch` [step, _SCRATCH], step threads at most."""
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
+    height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
+    sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Runs every tile; tile t uses row t % step of `scratch` [step, _SCRATCH]."""
     step = scratch.shape[0]
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
@@ -379,7 +391,7 @@ def loss_terms(
     gradient: NDArray[np.float32] | None = None,
     ssim_weight: float = 0.2,
 ) -> tuple[float, float]:
-    """Means of |x - y| and of 1 - SSIM over the kept pixels, and the gradient of the loss by the image.
+    """Means of |x - y| and of 1 - SSIM over the kept pixels, and the gradient by the image.
 
     Args:
         image: [H, W, 3], C-contiguous.
@@ -401,13 +413,13 @@ def loss_terms(
     count = kept * _CHANNELS
     down, across = -(-height // _TILE_ROWS), -(-width // _TILE_COLUMNS)
     sums = np.zeros((down, across, 2))
-    threads = min(numba.get_num_threads(), down * across)
+    threads = min(get_num_threads(), down * across)
     is_8bit = target.dtype == np.uint8
     _all_tiles(
         np.zeros((threads, _SCRATCH), np.float32),
         image.reshape(-1),
-        np.empty(0, np.float32) if is_8bit else target.reshape(-1),
-        target.reshape(-1) if is_8bit else np.empty(0, np.uint8),
+        np.empty(0, np.float32) if is_8bit else target.reshape(-1).view(np.float32),
+        target.reshape(-1).view(np.uint8) if is_8bit else np.empty(0, np.uint8),
         is_8bit,
         np.empty(0, np.bool_) if mask is None else mask.reshape(-1),
         mask is not None,

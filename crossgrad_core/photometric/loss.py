@@ -65,7 +65,7 @@ class _FusedLoss(torch.autograd.Function):
         return image.new_tensor((1 - ssim_weight) * absolute + ssim_weight * dissimilarity)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     @override
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors

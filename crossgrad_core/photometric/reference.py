@@ -4,8 +4,8 @@ It is the readable definition and the oracle of the fused kernel.
 """
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - torch's own convention
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 WINDOW = 11  # pixels
 RADIUS = WINDOW // 2
@@ -26,8 +26,8 @@ def l1_ssim_loss(
 ) -> Tensor:
     """(1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
 
-    A masked-out pixel is 0 in both images before SSIM's windows are summed, has no term of its own in
-    either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
+    A masked-out pixel is 0 in both images before SSIM's windows are summed, has no term of its own
+    in either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
 
     Args:
         image: [H, W, C] floating point; values may lie outside [0, 1].
@@ -48,7 +48,8 @@ def l1_ssim_loss(
     else:
         dissimilarity = masked(dissimilarity, mask)
         count = (mask.sum() * image.shape[-1]).clamp(min=1)
-    return ((1 - ssim_weight) * absolute.sum() + ssim_weight * dissimilarity.sum()) / count
+    loss: Tensor = (1 - ssim_weight) * absolute.sum() + ssim_weight * dissimilarity.sum()
+    return loss / count
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
@@ -67,11 +68,12 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     covariance = xy - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
     contrast_structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
-    return luminance * contrast_structure
+    ssim: Tensor = luminance * contrast_structure
+    return ssim
 
 
 def masked(image: Tensor, mask: Tensor | None) -> Tensor:
-    """The image [H, W, C] with masked-out pixels set to 0, so that not even a NaN leaks from them."""
+    """The image [H, W, C], 0 at masked-out pixels, so that not even a NaN leaks from them."""
     if mask is None:
         return image
     return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))
@@ -86,8 +88,9 @@ def _windowed(fields: Tensor) -> Tensor:
     """Gaussian-weighted sums of [M, H, W, C] over the window around each pixel, same shape."""
     if fields.numel() == 0:
         return fields
-    planes = fields.permute(0, 3, 1, 2).flatten(0, 1).unsqueeze(1)  # [M * C, 1, H, W]
+    fields = fields.permute(0, 3, 1, 2)  # [M, C, H, W]
+    planes = fields.reshape(-1, 1, *fields.shape[2:])  # [M * C, 1, H, W]
     weight = gaussian_window().to(fields)
-    planes = F.conv2d(planes, weight.view(1, 1, WINDOW, 1), padding=(RADIUS, 0))
-    planes = F.conv2d(planes, weight.view(1, 1, 1, WINDOW), padding=(0, RADIUS))
-    return planes.squeeze(1).unflatten(0, (fields.shape[0], -1)).permute(0, 2, 3, 1)
+    planes = conv2d(planes, weight.view(1, 1, WINDOW, 1), padding=(RADIUS, 0))
+    planes = conv2d(planes, weight.view(1, 1, 1, WINDOW), padding=(0, RADIUS))
+    return planes.view(fields.shape).permute(0, 2, 3, 1)

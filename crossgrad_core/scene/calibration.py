@@ -138,6 +138,22 @@ class Calibration:
             ) from error
         return self._read_pinhole(camera)
 
+    @cached_property
+    def fills_frame(self) -> bool:
+        """Whether the distorted photo reaches every pixel of the undistorted one."""
+        if self.is_pinhole:
+            return True
+        frame = self.pinhole
+        u = np.arange(frame.width) + 0.5
+        v = np.arange(frame.height) + 0.5
+        rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
+        columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
+        plane = np.concatenate(rows + columns) - [frame.cx, frame.cy]
+        rays = np.column_stack([plane / [frame.fx, frame.fy], np.ones(len(plane))])
+        # Bilinear interpolation needs a pixel centre on either side.
+        pixels = np.asarray(self._camera.img_from_cam(rays), dtype=float) - 0.5
+        return bool(((pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])).all())
+
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A photo in the pixels of `pinhole`, bilinear; black where nothing was seen.
 

@@ -20,20 +20,18 @@ RESIZE_FILTER = "scikit-image resize, anti-aliased"
 _FULL_8_BIT, _FULL_16_BIT = 255, 65535
 
 
-def decode_photo(path: Path, upright: bool) -> tuple[Pixels, Pixels | None]:
+def decode_photo(path: Path) -> tuple[Pixels, Pixels | None]:
     """A photo as [H, W, 3] RGB and, where it has any, its [H, W] alpha channel.
 
-    Args:
-        path: The photo; grey, palette, CMYK and 16-bit photos become 8-bit RGB.
-        upright: Whether to apply the EXIF orientation.
+    Grey, palette, CMYK and 16-bit photos become 8-bit RGB. EXIF rotation is not applied.
 
     Raises:
         UserError: The photo is damaged or of a kind that cannot be shown.
     """
-    return _decode(path, upright, _read_photo)
+    return _decode(path, _read_photo)
 
 
-def decode_mask(path: Path, upright: bool) -> Pixels:
+def decode_mask(path: Path) -> Pixels:
     """A mask as [H, W], 255 where the pixel counts: where it is at least half white.
 
     White is 1 in a mask whose values are only 0 and 1.
@@ -41,7 +39,7 @@ def decode_mask(path: Path, upright: bool) -> Pixels:
     Raises:
         UserError: The mask is damaged or of a kind that cannot be shown.
     """
-    grey = _decode(path, upright, _read_grey)
+    grey = _decode(path, _read_grey)
     top = int(grey.max())
     white = 1 if top <= 1 else _FULL_8_BIT if top <= _FULL_8_BIT else _FULL_16_BIT
     return np.where(2 * grey >= white, _FULL_8_BIT, 0).astype(np.uint8)
@@ -66,12 +64,23 @@ def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) ->
     return np.asarray(np.rint(mixed), dtype=np.uint8)
 
 
-def _decode(path: Path, upright: bool, read: "Callable[[Image], T]") -> T:
-    from PIL import Image, ImageOps
+def turn(pixels: Pixels, orientation: int) -> Pixels:
+    """[H, W, ...] pixels turned upright by an EXIF orientation of a quarter turn (5 to 8)."""
+    turned = {
+        5: pixels.swapaxes(0, 1),
+        6: np.rot90(pixels, -1),
+        7: pixels[::-1, ::-1].swapaxes(0, 1),
+        8: np.rot90(pixels),
+    }
+    return turned.get(orientation, pixels)
+
+
+def _decode(path: Path, read: "Callable[[Image], T]") -> T:
+    from PIL import Image
 
     try:
         with Image.open(path) as image:
-            return read(ImageOps.exif_transpose(image) if upright else image)
+            return read(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(
             "the photo cannot be decoded",

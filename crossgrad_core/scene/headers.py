@@ -13,7 +13,7 @@ _TAIL = 64
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 _ORIENTATION = 0x0112
-_FIRST_QUARTER_TURN = 5  # EXIF orientations 5 to 8 swap width and height
+_QUARTER_TURNS = range(5, 9)
 _TIFF_DATA = ((273, 279), (324, 325))  # offsets and byte counts of strips and of tiles
 
 
@@ -64,12 +64,13 @@ def read_header(path: Path) -> PhotoHeader:
     return header
 
 
-def swaps_sides(path: Path) -> bool:
-    """Whether the EXIF orientation of a photo swaps width and height."""
+def read_quarter_turn(path: Path) -> int | None:
+    """The EXIF orientation of a photo, if it swaps width and height (5 to 8)."""
     from PIL import Image
 
     with Image.open(path) as image:
-        return int(image.getexif().get(_ORIENTATION, 1)) >= _FIRST_QUARTER_TURN
+        orientation = int(image.getexif().get(_ORIENTATION, 1))
+    return orientation if orientation in _QUARTER_TURNS else None
 
 
 def _describe(image: "Image") -> PhotoHeader:

@@ -12,10 +12,14 @@ from typing_extensions import override
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize
+from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize, turn
 from crossgrad_core.scene.types import Photo
 
+_Decoded = tuple[Tensor, Tensor | None]
+
 _OPAQUE, _HALF = 255, 128
+# More than the views of one step, so that none is decoded twice in it.
+_LATEST = 16
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class PhotoSource:
         path: The photo.
         width: Width of the photo in the pixels that its pose refers to.
         height: Likewise.
-        upright: Whether its pose refers to the photo after its EXIF rotation.
+        orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
         mask: The mask file, or None.
         alpha: Whether the file may have transparent pixels.
         background: RGB in [0, 1] behind transparent pixels; None where they do not count.
@@ -37,7 +41,7 @@ class PhotoSource:
     path: Path
     width: int
     height: int
-    upright: bool
+    orientation: int
     mask: Path | None
     alpha: bool
     background: tuple[float, float, float] | None
@@ -48,26 +52,29 @@ class PhotoSource:
     def may_mask(self) -> bool:
         """Whether some pixels may not count."""
         transparent = self.alpha and self.background is None
-        return self.mask is not None or transparent or self.distorted is not None
+        blank = self.distorted is not None and not self.distorted.fills_frame
+        return self.mask is not None or transparent or blank
 
-    def decode(self) -> tuple[Tensor, Tensor | None]:
+    def decode(self) -> _Decoded:
         """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts.
 
         Raises:
             UserError: The photo or its mask is damaged or has changed its size.
         """
-        rgb, alpha = decode_photo(self.path, self.upright)
+        rgb, alpha = decode_photo(self.path)
+        rgb = turn(rgb, self.orientation)
         self._check_size(rgb)
         keep = self._decode_mask()
-        if alpha is not None and self.background is not None:
-            rgb = blend(rgb, alpha, self.background)
-        elif alpha is not None:
-            opaque = np.where(alpha >= _HALF, _OPAQUE, 0).astype(np.uint8)
-            keep = opaque if keep is None else np.minimum(keep, opaque)
+        if alpha is not None:
+            alpha = turn(alpha, self.orientation)
+            if self.background is not None:
+                rgb = blend(rgb, alpha, self.background)
+            else:
+                keep = _both(keep, np.where(alpha >= _HALF, _OPAQUE, 0).astype(np.uint8))
         if self.distorted is not None:
             keep = self._undistort_mask(self.distorted, keep)
-            rgb = self.distorted.undistort(rgb)
-        image = torch.from_numpy(np.ascontiguousarray(resize(rgb, *self.target)))
+            rgb = self.distorted.undistort(np.ascontiguousarray(rgb))
+        image = torch.from_numpy(np.array(resize(rgb, *self.target), order="C"))
         if keep is None or keep.min() == _OPAQUE:
             return image, None
         return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
@@ -86,55 +93,71 @@ class PhotoSource:
         """The mask file in the photo's size, 0 or 255; the nearest pixel where sizes differ."""
         if self.mask is None:
             return None
-        mask = decode_mask(self.mask, upright=False)
-        if self.upright and mask.shape == (self.width, self.height) != mask.shape[::-1]:
-            mask = decode_mask(self.path, upright=True)
+        mask = decode_mask(self.mask)
+        if mask.shape == (self.width, self.height):
+            mask = turn(mask, self.orientation)
         rows = (np.arange(self.height) * mask.shape[0]) // self.height
         columns = (np.arange(self.width) * mask.shape[1]) // self.width
-        return mask[rows][:, columns]
+        return np.asarray(mask[rows[:, None], columns])
 
-    def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels:
+    def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels | None:
         """The mask in undistorted pixels; pixels that the photo does not reach do not count."""
+        if keep is not None:
+            keep = distorted.undistort(keep)
+        if distorted.fills_frame:
+            return keep
         reached = distorted.undistort(np.full((self.height, self.width), _OPAQUE, dtype=np.uint8))
-        blank = np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8)
-        return blank if keep is None else np.minimum(blank, distorted.undistort(keep))
+        return _both(keep, np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8))
 
 
 class PhotoCache:
     """Decoded photos in a bounded amount of memory; may be used from several threads.
 
     Training walks through all photos again and again. Were the least recently used photo dropped, a
-    set a little larger than the memory would hardly ever be found in it, so that what is there
-    stays and the *latest* photos make room: of a set twice as large as the memory, half is found.
+    set a little larger than the memory would hardly ever be found in it. So what is there stays,
+    and only the latest few photos make room for new ones: of a set twice as large as the memory,
+    about half is found.
 
     Args:
-        mib: Memory for decoded photos and masks, MiB. One photo is kept even if it is larger.
+        mib: Memory for decoded photos and masks, MiB. The latest photo is kept even if it is larger.
     """
 
     def __init__(self, mib: int) -> None:
         self._limit = mib * 2**20
         self._used = 0
-        self._entries: OrderedDict[PhotoSource, tuple[Tensor, Tensor | None]] = OrderedDict()
+        self._kept: OrderedDict[PhotoSource, _Decoded] = OrderedDict()
+        self._latest: OrderedDict[PhotoSource, _Decoded] = OrderedDict()
         self._lock = Lock()
 
-    def get(self, source: PhotoSource) -> tuple[Tensor, Tensor | None]:
+    @property
+    def used(self) -> int:
+        """Bytes of the decoded photos and masks."""
+        return self._used
+
+    def get(self, source: PhotoSource) -> _Decoded:
         """The decoded photo and mask of `source`; shared, so never to be written to."""
         with self._lock:
-            entry = self._entries.get(source)
-        if entry is None:
-            entry = source.decode()
+            decoded = self._kept.get(source) or self._latest.get(source)
+        if decoded is None:
+            decoded = source.decode()
             with self._lock:
-                self._keep(source, entry)
-        return entry
+                self._keep(source, decoded)
+        return decoded
 
-    def _keep(self, source: PhotoSource, entry: tuple[Tensor, Tensor | None]) -> None:
-        if source in self._entries:
+    def _keep(self, source: PhotoSource, decoded: _Decoded) -> None:
+        if source in self._kept or source in self._latest:
             return
-        need = _bytes(entry)
-        while self._entries and self._used + need > self._limit:
-            self._used -= _bytes(self._entries.popitem(last=True)[1])
-        self._entries[source] = entry
-        self._used += need
+        self._latest[source] = decoded
+        self._used += _bytes(decoded)
+        while self._used > self._limit and len(self._latest) + len(self._kept) > 1:
+            if len(self._latest) > 1:
+                _, dropped = self._latest.popitem(last=False)
+            else:
+                _, dropped = self._kept.popitem()
+            self._used -= _bytes(dropped)
+        if len(self._latest) > _LATEST:
+            key, decoded = self._latest.popitem(last=False)
+            self._kept[key] = decoded
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,5 +176,9 @@ class FilePhoto(Photo):
         return self.cache.get(self.source)[1] if self.source.may_mask else None
 
 
-def _bytes(entry: tuple[Tensor, Tensor | None]) -> int:
-    return sum(tensor.nbytes for tensor in entry if tensor is not None)
+def _both(first: Pixels | None, second: Pixels) -> Pixels:
+    return second if first is None else np.minimum(first, second)
+
+
+def _bytes(decoded: _Decoded) -> int:
+    return sum(tensor.nbytes for tensor in decoded if tensor is not None)

@@ -90,8 +90,8 @@ class _Draw(torch.autograd.Function):
         frame = forward(
             _gaussians(call.degree, tensors),
             CameraArrays(
-                camera.world_to_camera.numpy().astype(np.float32),
-                camera.matrix.numpy().astype(np.float32),
+                camera.world_to_camera.numpy(),
+                camera.matrix.numpy(),
                 camera.width,
                 camera.height,
             ),

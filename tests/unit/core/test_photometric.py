@@ -1,10 +1,10 @@
-"""The fused photometric loss against its float64 definition, and the definition against closed forms."""
+"""The fused photometric loss against its definition, and the definition against closed forms."""
 
 import numba
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
+from torch.nn.functional import interpolate
 
 from crossgrad_core.photometric import l1_ssim_loss, photometric_loss, ssim_map
 from crossgrad_core.photometric.fused import loss_terms
@@ -19,7 +19,7 @@ def smooth_noise(seed, h=H, w=W):
     image = torch.zeros(3, h, w)
     for octave in range(4):
         cells = torch.rand(1, 3, 3 * 2**octave, 5 * 2**octave, generator=generator)
-        image += F.interpolate(cells, (h, w), mode="bicubic")[0] / 2**octave
+        image += interpolate(cells, (h, w), mode="bicubic")[0] / 2**octave
     return ((image - image.min()) / (image.max() - image.min())).permute(1, 2, 0).contiguous()
 
 
@@ -189,9 +189,7 @@ def test_layouts_and_types_other_than_the_fused_one():
 @pytest.mark.parametrize("kept", [None, random_mask((5, 7))])
 def test_reference_gradient_is_that_of_finite_differences(kept):
     image, target = noise(17, 5, 7).double().requires_grad_(), noise(18, 5, 7)
-    assert torch.autograd.gradcheck(
-        lambda x: l1_ssim_loss(x, target, kept), image, fast_mode=True
-    )
+    assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, kept), image, fast_mode=True)
 
 
 def test_window_is_the_normalised_gaussian():

@@ -85,11 +85,11 @@ def test_backward_on_the_cpu_runs_in_the_calling_thread():
 
     class Probe(torch.autograd.Function):
         @staticmethod
-        def forward(ctx, x):
+        def forward(_ctx, x):
             return x.clone()
 
         @staticmethod
-        def backward(ctx, gradient):
+        def backward(_ctx, gradient):
             seen.append(threading.get_ident())
             return gradient
 

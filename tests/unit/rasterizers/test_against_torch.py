@@ -29,7 +29,7 @@ OUTPUTS = frozenset({"depth", "pixels", "abs_gradient"})
 TENSORS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 MARGIN = 2e-4
 ROUNDING = 2.0**-23
-ROUNDINGS = 16
+ROUNDINGS = 8
 DRAWS = 3
 
 

@@ -44,7 +44,7 @@ class Pinhole(NamedTuple):
 
 
 def pinhole(
-    viewmat: NDArray[np.float32], intrinsics: NDArray[np.float32], width: int, height: int
+    viewmat: NDArray[np.floating], intrinsics: NDArray[np.floating], width: int, height: int
 ) -> Pinhole:
     """Makes a camera from a world-to-camera matrix [4, 4] and K [3, 3]."""
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))

@@ -28,6 +28,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.projection import project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
+from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade, unshade
 
@@ -72,8 +73,8 @@ class CameraArrays:
         height: Pixels.
     """
 
-    viewmat: Float32
-    intrinsics: Float32
+    viewmat: NDArray[np.floating]
+    intrinsics: NDArray[np.floating]
     width: int
     height: int
 
@@ -217,7 +218,17 @@ def forward(
         counts,
         masks,
     )
-    pixels = None if counts is None else _count_pixels(gaussians, projected, lists, counts)
+    pixels = None
+    if counts is not None:
+        pixels = np.zeros_like(projected.radii)
+        count_pixels(
+            projected.drawn,
+            projected.owners,
+            lists.shelves,
+            lists.entry_of_slot,
+            counts,
+            pixels,
+        )
     return Frame(image, alpha, depth, pixels, gaussians, options, projected, lists, masks)
 
 
@@ -359,6 +370,7 @@ def _project(
             projected.drawn,
             projected.owners,
             projected.records,
+            projected.radii,
         )
     return projected, boxes, shelves, depths, room
 
@@ -395,8 +407,3 @@ def _tile_order(columns: int, rows: int) -> Int32:
     spread = (np.arange(rows) * step) % rows
     return (spread[:, None] * columns + np.arange(columns)).ravel().astype(np.int32)
 
-
-def _count_pixels(
-    gaussians: GaussianArrays, projected: Projected, lists: TileLists, counts: Int32
-) -> Int32:
-    raise NotImplementedError

@@ -185,6 +185,18 @@ def _project_one(
     return np.int32(max(1.0, np.ceil(min(max(extent_x, extent_y), _LARGEST_RADIUS))))
 
 
+@device
+def _tint(
+    i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]
+) -> bool:
+    """Writes the colour of Gaussian i to record j; returns whether it is finite."""
+    red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
+    records[j * RECORD + RED] = red
+    records[j * RECORD + GREEN] = green
+    records[j * RECORD + BLUE] = blue
+    return math.isfinite(red) and math.isfinite(green) and math.isfinite(blue)
+
+
 @parallel_kernel
 def project(
     camera: Pinhole,
@@ -248,12 +260,10 @@ def project(
                 depths,
                 boxes,
             )
+            if radius > 0 and colors is not None and not _tint(i, j, colors, records):
+                radius = 0
             radii[i] = radius
             if radius > 0:
-                if colors is not None:
-                    records[j * RECORD + RED] = colors[i, 0]
-                    records[j * RECORD + GREEN] = colors[i, 1]
-                    records[j * RECORD + BLUE] = colors[i, 2]
                 owners[j] = i
                 shelves[j, FIRST_SLOT] = tiles
                 tiles += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])

@@ -36,49 +36,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SUM_Y,
     SUM_YY,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    load,
-    prefetch,
-    splat,
-    store,
-)
-
-#: Slots ahead for which memory is asked.
-_AHEAD = 24
-
-
-@device
-def _add_up(
-    first: int,
-    count: int,
-    entry_of_slot: NDArray[np.int32],
-    masks: NDArray[np.uint64],
-    partials: NDArray[np.float32],
-    sums: NDArray[np.float32],
-) -> bool:
-    """Adds up the sums of one record's entries; returns whether there were any.
-
-    `partials` ends with a row of zeros.
-    """
-    zeros = masks.shape[0]
-    low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
-    found = False
-    for slot in range(first, first + count):
-        ahead = np.intp(entry_of_slot[min(slot + _AHEAD, entry_of_slot.shape[0] - 1)])
-        prefetch(masks, ahead)
-        prefetch(partials, ahead * PARTIAL)
-        entry = np.intp(entry_of_slot[slot])
-        blended = masks[entry] != 0
-        # Rows of entries without a mask were never written.
-        row = (entry if blended else zeros) * PARTIAL
-        found |= blended
-        low = low + load(partials, row)
-        high = high + load(partials, row + LANES)
-    store(sums, 0, low)
-    store(sums, LANES, high)
-    return found
-
+from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
 
 @device
 def _outer_sum(
@@ -314,7 +272,7 @@ def unproject(
         sums = np.empty(PARTIAL, np.float32)
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
-            if not _add_up(first, count, entry_of_slot, masks, partials, sums):
+            if not add_up(first, count, entry_of_slot, masks, partials, sums):
                 continue
             i = np.intp(owners[j])
             v_colors[i, 0] = sums[SUM_RED]

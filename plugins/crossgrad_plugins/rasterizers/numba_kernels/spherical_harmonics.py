@@ -7,7 +7,12 @@ from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    CHUNK,
+    LOG_OPACITY,
+    RECORD,
+    RED,
+)
 
 #: Number of basis functions of all degrees.
 BASIS = 16
@@ -104,6 +109,7 @@ def shade(
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
     records: NDArray[np.float32],
+    radii: NDArray[np.int32],
 ) -> None:
     """Writes max(0, 1/2 + harmonics(direction)) to the colours of the records.
 
@@ -114,7 +120,8 @@ def shade(
         dc: [N, 1, 3] coefficients of degree 0.
         rest: [N, B - 1, 3] of the higher degrees; only those active are read.
         drawn, owners: From `project`.
-        records: Flat records, colours written.
+        records: Flat records, colours written; a colour that is not finite draws nothing.
+        radii: [N] set to 0 for these.
     """
     count = (degree + 1) * (degree + 1)
     for chunk in prange(drawn.shape[0]):
@@ -127,6 +134,10 @@ def shade(
                 colour = 0.5 + basis[0] * np.float64(dc[i, 0, channel])
                 for k in range(1, count):
                     colour += basis[k] * np.float64(rest[i, k - 1, channel])
+                if not math.isfinite(colour):
+                    # Reaches no pixel.
+                    records[j * RECORD + LOG_OPACITY] = -math.inf
+                    radii[i] = 0
                 records[j * RECORD + RED + channel] = max(colour, 0.0)
 
 

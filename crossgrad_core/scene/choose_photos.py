@@ -1,0 +1,304 @@
+"""Which file, size and calibration every view gets; only headers are read."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.calibration import Calibration, Pinhole
+from crossgrad_core.scene.decode import RESIZE_FILTER
+from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.scene.photo_files import (
+    PhotoFolder,
+    check_masks,
+    find_mask,
+    find_mask_folder,
+    find_photo_folders,
+)
+from crossgrad_core.scene.photos import PhotoSource
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.wording import count, name_some
+
+_MIB = 2**20
+
+
+@dataclass(frozen=True)
+class ChosenPhotos:
+    """The photos of a scene.
+
+    Attributes:
+        sources: View name -> how its photo is decoded; views without a photo are not in it.
+        pinholes: View name -> calibration of the photo as trained.
+        notes: What was left out, undistorted, resized or masked.
+    """
+
+    sources: Mapping[str, PhotoSource]
+    pinholes: Mapping[str, Pinhole]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Paths and headers of the photos of one folder, by view name."""
+
+    folder: PhotoFolder
+    paths: Mapping[str, Path]
+    headers: Mapping[str, PhotoHeader]
+
+    @property
+    def longest(self) -> int:
+        """Longest side in pixels."""
+        return max(max(header.width, header.height) for header in self.headers.values())
+
+
+def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
+    """Pairs views with photos by name and settles the size of each photo as trained.
+
+    Raises:
+        UserError: No view has a photo, a photo is damaged or does not fit its camera, or the mask
+            folder that was asked for is not there.
+    """
+    folders = find_photo_folders(raw.images)
+    names = sorted(view.name for view in raw.views)
+    found = _read_folder(folders[0], names, raw)
+    notes = _note_missing(found, names)
+    found, more = _prefer_reduced(found, folders[1:], options.max_size)
+    notes += more
+    views = {view.name: view for view in raw.views if view.name in found.paths}
+    masks = _find_masks(raw, options, tuple(views))
+    shared: dict[Calibration, Calibration] = {}
+    sources: dict[str, PhotoSource] = {}
+    pinholes: dict[str, Pinhole] = {}
+    for name in sorted(views):
+        view, path, header = views[name], found.paths[name], found.headers[name]
+        width, height, orientation = _fit(view.calibration, header, path)
+        fitted = view.calibration.resized(width, height)
+        # Photos of one camera share its undistortion.
+        fitted = shared.setdefault(fitted, fitted)
+        target = _limit(fitted.pinhole.width, fitted.pinhole.height, options.max_size)
+        pinholes[name] = fitted.pinhole.resized(*target)
+        sources[name] = PhotoSource(
+            path=path,
+            width=width,
+            height=height,
+            orientation=orientation,
+            mask=masks.get(name),
+            alpha=header.alpha,
+            background=raw.background,
+            distorted=None if fitted.is_pinhole else fitted,
+            target=target,
+        )
+    for name, mask in masks.items():
+        _check_mask(mask, sources[name])
+    notes += _note_sizes(raw, found, sources, pinholes)
+    notes += _note_kinds(raw, found, sources, masks)
+    notes += _note_memory(sources, options)
+    return ChosenPhotos(sources, pinholes, tuple(notes))
+
+
+def _read_folder(folder: PhotoFolder, names: Sequence[str], raw: RawScene) -> _Found:
+    paths = _pair(folder, names)
+    if not paths:
+        raise UserError(
+            "no posed image has a photo",
+            where=folder.path,
+            expected=f"photos named as in the model, such as {names[0]}",
+            found=name_some(folder.names) or "no photo",
+            todo="put the photos below the image folder under the names that the model gives them",
+        )
+    return _Found(folder, paths, {name: read_header(path) for name, path in paths.items()})
+
+
+def _pair(folder: PhotoFolder, names: Sequence[str]) -> dict[str, Path]:
+    posed = frozenset(names)
+    pairs = ((name, folder.find(name, posed)) for name in names)
+    return {name: path for name, path in pairs if path is not None}
+
+
+def _prefer_reduced(
+    full: _Found, reduced: Sequence[PhotoFolder], max_size: int | None
+) -> tuple[_Found, list[str]]:
+    """The largest photo folder that keeps to the size limit, unless resizing keeps far more.
+
+    A folder with photos smaller than half the limit is not worth what it would throw away.
+    """
+    notes: list[str] = []
+    if max_size is None or full.longest <= max_size:
+        return full, notes
+    for folder in reduced:
+        paths = _pair(folder, tuple(full.paths))
+        if len(paths) < len(full.paths):
+            absent = [name for name in full.paths if name not in paths]
+            notes.append(
+                f"photos: {folder.path.name}/ is not used, {count(len(absent), 'photo')} of it "
+                f"missing: {name_some(absent)}"
+            )
+            continue
+        found = _Found(folder, paths, {name: read_header(path) for name, path in paths.items()})
+        if found.longest <= max_size:
+            return (found if 2 * found.longest >= max_size else full), notes
+    return full, notes
+
+
+def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int, int, int]:
+    """Width, height and EXIF orientation of a photo in the pixels that its pose refers to.
+
+    COLMAP ignores EXIF rotation, so the stored pixel grid is taken, unless the camera has the shape
+    of the rotated photo only.
+    """
+    width, height = header.width, header.height
+    if _same_shape(width, height, calibration):
+        return width, height, 1
+    orientation = read_quarter_turn(path)
+    if orientation is not None and _same_shape(height, width, calibration):
+        return height, width, orientation
+    raise UserError(
+        "a photo does not have the shape of its camera",
+        where=path,
+        expected=f"{calibration.width} x {calibration.height} pixels, or in that proportion",
+        found=f"{width} x {height} pixels",
+        todo="use the photos that the poses were estimated from",
+    )
+
+
+def _same_shape(width: int, height: int, calibration: Calibration) -> bool:
+    """Whether a size is a scaled copy of the camera's, each side off by at most one pixel."""
+    least = max((width - 1) / calibration.width, (height - 1) / calibration.height)
+    most = min((width + 1) / calibration.width, (height + 1) / calibration.height)
+    return least <= most
+
+
+def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """The size with the longest side cut down to the limit."""
+    longest = max(width, height)
+    if max_size is None or longest <= max_size:
+        return width, height
+    shortened = (int(side * max_size / longest + 0.5) for side in (width, height))
+    new_width, new_height = (max(1, side) for side in shortened)
+    return new_width, new_height
+
+
+def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> dict[str, Path]:
+    folder = find_mask_folder(options.masks, raw.root)
+    if folder is None:
+        return {}
+    pairs = ((name, find_mask(folder, name)) for name in names)
+    masks = {name: path for name, path in pairs if path is not None}
+    check_masks(folder, options.masks, len(masks), names)
+    return masks
+
+
+def _check_mask(path: Path, source: PhotoSource) -> None:
+    header = read_header(path)
+    photo = Calibration("PINHOLE", source.width, source.height, ())
+    sizes = [(header.width, header.height)]
+    if source.orientation != 1:
+        sizes.append((header.height, header.width))
+    if not any(_same_shape(width, height, photo) for width, height in sizes):
+        raise UserError(
+            "a mask does not have the shape of its photo",
+            where=path,
+            expected=f"{source.width} x {source.height} pixels, or in that proportion",
+            found=f"{header.width} x {header.height} pixels",
+        )
+
+
+def _note_missing(found: _Found, names: Sequence[str]) -> list[str]:
+    notes = []
+    absent = [name for name in names if name not in found.paths]
+    if absent:
+        notes.append(
+            f"photos: {count(len(absent), 'posed image')} left out, the photo is missing: "
+            + name_some(absent)
+        )
+    poseless = found.folder.others(found.paths.values())
+    if poseless:
+        notes.append(
+            f"photos: {count(len(poseless), 'photo')} without a pose left out: "
+            + name_some(poseless)
+        )
+    renamed = [n for n, p in found.paths.items() if p != found.folder.path / n]
+    if renamed:
+        notes.append(
+            f"photos: {count(len(renamed), 'photo')} paired by name without suffix or case: "
+            + name_some(renamed)
+        )
+    return notes
+
+
+def _note_sizes(
+    raw: RawScene,
+    found: _Found,
+    sources: Mapping[str, PhotoSource],
+    pinholes: Mapping[str, Pinhole],
+) -> list[str]:
+    notes = []
+    models = Counter(s.distorted.model for s in sources.values() if s.distorted is not None)
+    if models:
+        kinds = ", ".join(f"{number} from {model}" for model, number in sorted(models.items()))
+        notes.append(
+            f"photos: {count(models.total(), 'photo')} undistorted to PINHOLE with pycolmap "
+            f"({kinds})"
+        )
+    native = {n: s.distorted.pinhole if s.distorted else s for n, s in sources.items()}
+    resized = [n for n, s in sources.items() if s.target != (native[n].width, native[n].height)]
+    sizes = Counter(source.target for source in sources.values())
+    shown = ", ".join(
+        f"{width} x {height} ({number})" for (width, height), number in sizes.most_common(3)
+    )
+    shown += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""  # noqa: PLR2004
+    how = f", {len(resized)} resized ({RESIZE_FILTER})" if resized else ", not resized"
+    notes.append(f"photos: {shown} from {found.folder.path.name}/{how}")
+    calibrated = {v.name: (v.calibration.width, v.calibration.height) for v in raw.views}
+    scaled = sum((s.width, s.height) != calibrated[n] for n, s in sources.items())
+    if scaled:
+        notes.append(
+            f"photos: {count(scaled, 'camera')} scaled to photos of another size than calibrated"
+        )
+    del pinholes
+    return notes
+
+
+def _note_kinds(
+    raw: RawScene,
+    found: _Found,
+    sources: Mapping[str, PhotoSource],
+    masks: Mapping[str, Path],
+) -> list[str]:
+    notes = []
+    turned = sum(source.orientation != 1 for source in sources.values())
+    if turned:
+        notes.append(
+            f"photos: {turned} turned by their EXIF orientation, as the shape of their camera asks"
+        )
+    headers = found.headers.values()
+    alpha = sum(header.alpha for header in headers)
+    if alpha and raw.background is None:
+        notes.append(f"photos: {alpha} with transparency; pixels with alpha < 0.5 do not count")
+    elif alpha:
+        notes.append(f"photos: {alpha} with transparency, blended over RGB {raw.background}")
+    grey = sum(header.grey for header in headers)
+    if grey:
+        notes.append(f"photos: {grey} grey, taken as three equal channels")
+    if masks:
+        notes.append(
+            f"masks: {len(masks)} of {count(len(sources), 'photo')} have one; black pixels do not "
+            "count"
+        )
+    return notes
+
+
+def _note_memory(sources: Mapping[str, PhotoSource], options: SceneOptions) -> list[str]:
+    need = sum(3 * s.target[0] * s.target[1] for s in sources.values()) / _MIB
+    if need <= options.cache_mib:
+        return []
+    return [
+        f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
+        "others are decoded again whenever they are drawn (more memory: cache_mib; smaller photos: "
+        "max_size, or a folder of reduced photos)"
+    ]
+
+
+__all__ = ["ChosenPhotos", "RawView", "choose_photos"]

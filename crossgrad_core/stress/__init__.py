@@ -1,0 +1,1 @@
+"""Stiff and extreme gradients against exact arithmetic, for every registered operator."""

@@ -1,0 +1,561 @@
+"""Each contract check fails for a component that breaks what it checks: checks times defects."""
+
+from dataclasses import replace
+from pathlib import Path
+from unittest import SkipTest
+
+import numpy as np
+import pytest
+import torch
+from pydantic import BaseModel, ConfigDict
+
+from crossgrad_core import plugin as api
+from crossgrad_core.registry import load
+from crossgrad_core.testing import (
+    aggregation,
+    backbones,
+    components,
+    densifiers,
+    groupings,
+    observers,
+    operators,
+    rasterizers,
+    readers,
+    samplers,
+)
+from crossgrad_core.testing.contract import ContractError
+
+Vanilla = load("backbones", "vanilla")
+Torch = load("rasterizers", "torch")
+Radial = load("groupings", "radial")
+NoDensification = load("densifiers", "none")
+
+
+class Adding(api.Operator):
+    """The plain sum, by way of Gramians: every defect is a small change of it."""
+
+    def weights(self, gramians, context, rng):
+        return np.where(context.present, 1.0, 0.0)
+
+    def transform(self, gramians, context, state, rng):
+        return self.weights(gramians, context, rng)[:, None, :], state
+
+
+class OneBlockTooFew(Adding):
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        return matrices[:-1], state
+
+
+class SinglePrecision(Adding):
+    def weights(self, gramians, context, rng):
+        return super().weights(gramians, context, rng).astype(np.float32)
+
+
+class DividesByZero(Adding):
+    def weights(self, gramians, context, rng):
+        with np.errstate(all="ignore"):
+            return 1.0 / np.sqrt(np.einsum("bkk->bk", gramians))
+
+
+class LooksAtOtherBlocks(Adding):
+    def weights(self, gramians, context, rng):
+        return super().weights(gramians, context, rng) * len(gramians)
+
+
+class ChangesGramians(Adding):
+    def weights(self, gramians, context, rng):
+        gramians *= 2.0
+        return super().weights(gramians, context, rng)
+
+
+class ChangesLosses(Adding):
+    def weights(self, gramians, context, rng):
+        context.losses[:] = 0.0
+        return super().weights(gramians, context, rng)
+
+
+class GlobalRandomness(Adding):
+    def weights(self, gramians, context, rng):
+        return super().weights(gramians, context, rng) * torch.rand(1).item()
+
+
+class HiddenCounter(Adding):
+    calls: dict[str, int] = {}
+
+    def weights(self, gramians, context, rng):
+        self.calls["n"] = self.calls.get("n", 0) + 1
+        return super().weights(gramians, context, rng) * self.calls["n"]
+
+
+class TextKeys(Adding):
+    def transform(self, gramians, context, state, rng):
+        matrices, _ = super().transform(gramians, context, state, rng)
+        return matrices, api.PluginState({1: 2.0})
+
+
+class Reverses(Adding):
+    def weights(self, gramians, context, rng):
+        return -super().weights(gramians, context, rng)
+
+
+class AbsoluteThreshold(Adding):
+    def weights(self, gramians, context, rng):
+        longer = np.einsum("bkk->bk", gramians) > 20.0
+        return np.where(context.present, np.where(longer, 1.0, 0.5), 0.0)
+
+
+class ForgetsATensor(Adding):
+    def aggregate(self, context, state):
+        aggregated, state = super().aggregate(context, state)
+        gradients = {name: g for name, g in aggregated.gradients.items() if name != "means"}
+        return replace(aggregated, gradients=gradients), state
+
+
+class CountsViewsThatAreNotThere(Adding):
+    def aggregate(self, context, state):
+        aggregated, state = super().aggregate(context, state)
+        share = 1.0 / context.gradients.finite("tensor").sum()
+        gradients = {n: None if g is None else g * share for n, g in aggregated.gradients.items()}
+        return replace(aggregated, gradients=gradients), state
+
+
+class ChangesGradients(Adding):
+    def aggregate(self, context, state):
+        context.gradients.elementwise(lambda name, gradients: double(gradients))
+        return super().aggregate(context, state)
+
+
+def double(gradients):
+    for gradient in gradients:
+        if gradient is not None:
+            gradient.mul_(2.0)
+
+
+class InTurn(api.Sampler):
+    """K views by position, one after the other."""
+
+    default_views = 2
+
+    def sample(self, context, state):
+        start = state.values.get("start", 0)
+        number = len(context.scene.train)
+        views = tuple((start + k) % number for k in range(context.views_per_step))
+        return api.Draw(views), api.PluginState({"start": start + context.views_per_step})
+
+
+class UsualViewsRefused(InTurn):
+    views = api.ViewCounts(4, 4)
+
+
+class OneViewTooFew(InTurn):
+    def sample(self, context, state):
+        draw, state = super().sample(context, state)
+        return api.Draw(draw.views[1:]), state
+
+
+class NumpyPositions(InTurn):
+    def sample(self, context, state):
+        draw, state = super().sample(context, state)
+        return api.Draw(tuple(np.array(draw.views))), state
+
+
+class BeyondTheEnd(InTurn):
+    def sample(self, context, state):
+        draw, state = super().sample(context, state)
+        return api.Draw(tuple(view + 1 for view in draw.views)), state
+
+
+class NeverTheFirst(InTurn):
+    def sample(self, context, state):
+        draw, state = super().sample(context, state)
+        return api.Draw(tuple(view or 1 for view in draw.views)), state
+
+
+class GlobalDraws(InTurn):
+    def sample(self, context, state):
+        number = len(context.scene.train)
+        views = np.random.randint(number, size=context.views_per_step)  # noqa: NPY002
+        return api.Draw(tuple(int(view) for view in views)), state
+
+
+class RemembersOnItself(InTurn):
+    seen: list[int] = []
+
+    def sample(self, context, state):
+        self.seen.append(1)
+        number = len(context.scene.train)
+        return api.Draw((len(self.seen) % number,) * context.views_per_step), state
+
+
+class ChangesItsState(InTurn):
+    def sample(self, context, state):
+        state.values.setdefault("steps", []).append(context.step)
+        return super().sample(context, state)[0], state
+
+
+class ForeignLabel(Radial):
+    def label(self, scene, views, rng, probe=None):
+        return api.Labelling(("close",) * len(views))
+
+
+class OneLabelForAll(Radial):
+    def label(self, scene, views, rng, probe=None):
+        return api.Labelling(("near",))
+
+
+class EmptyGroup(Radial):
+    def label(self, scene, views, rng, probe=None):
+        return api.Labelling(("near",) * len(views))
+
+
+class FittedOnWhatIsAsked(Radial):
+    def label(self, scene, views, rng, probe=None):
+        far = (len(views) + 1) // 2
+        return api.Labelling(("far",) * far + ("near",) * (len(views) - far))
+
+
+class GlobalLabels(Radial):
+    def label(self, scene, views, rng, probe=None):
+        torch.rand(1)
+        return super().label(scene, views, rng, probe)
+
+
+class FlatImage(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        render = super().render(gaussians, camera, background, outputs)
+        return replace(render, image=render.image.mean(dim=-1))
+
+
+class ForgetsTheBackground(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        return super().render(gaussians, camera, torch.zeros_like(background), outputs)
+
+
+class NeedsGaussians(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        if len(gaussians) == 0:
+            raise IndexError("nothing to draw")
+        return super().render(gaussians, camera, background, outputs)
+
+
+class FrozenOpacities(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        frozen = replace(gaussians, opacities=gaussians.opacities.detach())
+        return super().render(frozen, camera, background, outputs)
+
+
+class NoStatistics(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        render = super().render(gaussians, camera, background, outputs)
+        return replace(render, screen=api.Screen(torch.zeros_like(render.screen.radii)))
+
+
+class Flickers(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        render = super().render(gaussians, camera, background, outputs)
+        return replace(render, image=render.image + 1e-6 * torch.rand(1))
+
+
+class LessOpaque(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        thinner = replace(gaussians, opacities=0.9 * gaussians.opacities)
+        return super().render(thinner, camera, background, outputs)
+
+
+class LooseTensor(Vanilla):
+    def blocks(self):
+        return super().blocks()[:-1]
+
+
+class GlobalStart(Vanilla):
+    def create(self, scene, rng):
+        parameters = super().create(scene, rng)
+        noise = torch.randn_like(parameters["quats"])
+        return parameters | {"quats": noise.requires_grad_()}
+
+
+class NegativeScales(Vanilla):
+    def decode(self, parameters, camera, phase):
+        return replace(super().decode(parameters, camera, phase), scales=-parameters["means"].abs())
+
+
+class FrozenQuats(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, quats=gaussians.quats.detach())
+
+
+class CountsOnItself(Vanilla):
+    calls: list[int] = []
+
+    def decode(self, parameters, camera, phase):
+        self.calls.append(1)
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, means=gaussians.means + len(self.calls))
+
+
+class SortsRows(Vanilla):
+    def prepare(self, parameters, scene, phase):
+        order = parameters["means"].detach()[:, 0].argsort()
+        return parameters | {"means": parameters["means"].detach()[order].requires_grad_()}
+
+
+class NeedsNeighbours(Vanilla):
+    def decode(self, parameters, camera, phase):
+        parameters["means"][1]
+        return super().decode(parameters, camera, phase)
+
+
+class Drifts(Vanilla):
+    def bake(self, parameters, phase, camera=None):
+        parameters["means"].data.add_(1.0)
+        return super().bake(parameters, phase, camera)
+
+
+class BakesAGraph(Vanilla):
+    def bake(self, parameters, phase, camera=None):
+        return self.decode(parameters, camera, phase)
+
+
+class OverridesTheUser(Vanilla):
+    def fitted_to(self, scene):
+        return self.model_copy(update={"sh_degree": 0}), ("no bands",)
+
+
+class Impatient(NoDensification):
+    def densify(self, context, state):
+        return api.Edit(), state
+
+
+class WrongRows(NoDensification):
+    def densify(self, context, state):
+        return api.NO_EDIT, api.PluginState(per_primitive={"sums": torch.zeros(3)})
+
+
+class BeyondTheRows(NoDensification):
+    def densify(self, context, state):
+        means = context.parameters["means"].detach()
+        rows = api.Rows(means[:1], torch.tensor([len(means)]))
+        return api.Edit(values={"means": rows}), state
+
+
+class Greedy(NoDensification):
+    def densify(self, context, state):
+        number = len(context.parameters["means"])
+        return api.Edit(source=torch.arange(2 * number) % number), state
+
+
+class GlobalNoise(NoDensification):
+    def densify(self, context, state):
+        means = context.parameters["means"].detach()
+        return api.Edit(values={"means": api.Rows(means + torch.randn_like(means))}), state
+
+
+class Forgets(NoDensification):
+    calls: list[int] = []
+
+    def densify(self, context, state):
+        self.calls.append(1)
+        means = context.parameters["means"].detach() + len(self.calls)
+        return api.Edit(values={"means": api.Rows(means)}), state
+
+
+class InPlace(NoDensification):
+    def densify(self, context, state):
+        context.parameters["means"].data.add_(1.0)
+        return api.NO_EDIT, state
+
+
+class TakesAnything(api.Reader):
+    def accepts(self, path):
+        return True
+
+    def read(self, path, options):
+        (path / "cache").write_text("") if path.is_dir() else None
+        raise api.UserError("no scene here")
+
+
+class ForeignErrors(TakesAnything):
+    def accepts(self, path):
+        return False
+
+    def read(self, path, options):
+        return Path(path / "cameras.bin").read_bytes()
+
+
+class NeedsAFolder(api.Observer):
+    @api.hookimpl
+    def crossgrad_run_start(self, run):
+        (run.folder / "notes.txt").write_text("notes")
+
+
+class NeedsASession(api.Observer):
+    @api.hookimpl
+    def crossgrad_run_end(self, status):
+        if status == "failed":
+            raise ZeroDivisionError("no steps to average over")
+
+
+class Swallows(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        yield
+
+
+class DropsAView(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_sample_views(self, context):
+        sampled = yield
+        return replace(sampled, draw=api.Draw(sampled.draw.views[:1]))
+
+
+class Mutable(Adding):
+    model_config = ConfigDict(frozen=False)
+
+
+class Tolerant(Adding):
+    model_config = ConfigDict(extra="ignore")
+
+
+class Unhashable(Adding):
+    table: dict[str, int] = api.Field({}, description="a table")
+
+
+class Opaque(Adding):
+    inner: BaseModel = api.Field(Mutable(), description="an operator")
+
+
+class Silent(Adding):
+    share: float = 0.5
+
+
+class Misspelt(Adding):
+    @api.hookimpl
+    def crossgrad_densfy(self, context):
+        return None
+
+
+DEFECTS = [
+    (components.options_are_frozen, Mutable),
+    (components.options_are_frozen, Unhashable),
+    (components.unknown_options_are_refused, Tolerant),
+    (components.options_survive_the_configuration_file, Opaque),
+    (components.options_are_described, Silent),
+    (components.hooks_exist, Misspelt),
+    (aggregation.every_tensor_is_answered, ForgetsATensor),
+    (aggregation.absent_views_have_no_weight, CountsViewsThatAreNotThere),
+    (aggregation.gradients_stay_untouched, ChangesGradients),
+    (aggregation.same_seed_same_aggregation, GlobalRandomness),
+    (operators.matrices_have_the_shape, OneBlockTooFew),
+    (operators.matrices_have_the_shape, SinglePrecision),
+    (operators.matrices_are_finite, DividesByZero),
+    (operators.one_block_is_enough, LooksAtOtherBlocks),
+    (operators.inputs_stay_untouched, ChangesGramians),
+    (operators.inputs_stay_untouched, ChangesLosses),
+    (operators.same_seed_same_answer, GlobalRandomness),
+    (operators.same_seed_same_answer, HiddenCounter),
+    (operators.state_survives_a_checkpoint, HiddenCounter),
+    (operators.state_survives_a_checkpoint, TextKeys),
+    (operators.one_view_keeps_its_direction, Reverses),
+    (operators.scales_with_the_gradients, AbsoluteThreshold),
+    (samplers.usual_views_are_admitted, UsualViewsRefused),
+    (samplers.draws_are_training_views, OneViewTooFew),
+    (samplers.draws_are_training_views, NumpyPositions),
+    (samplers.draws_are_training_views, BeyondTheEnd),
+    (samplers.every_view_comes, NeverTheFirst),
+    (samplers.same_seed_same_draws, GlobalDraws),
+    (samplers.resumes_exactly, RemembersOnItself),
+    (samplers.old_states_stay_untouched, ChangesItsState),
+    (groupings.every_view_has_a_declared_label, ForeignLabel),
+    (groupings.every_view_has_a_declared_label, OneLabelForAll),
+    (groupings.every_group_has_training_views, EmptyGroup),
+    (groupings.the_rule_is_fitted_on_training_views, FittedOnWhatIsAsked),
+    (groupings.same_seed_same_labels, GlobalLabels),
+    (rasterizers.renders_have_the_shape, FlatImage),
+    (rasterizers.the_background_shows_through, ForgetsTheBackground),
+    (rasterizers.nothing_to_draw_is_no_error, ForgetsTheBackground),
+    (rasterizers.gradients_reach_every_input, FrozenOpacities),
+    (rasterizers.statistics_are_filled, NoStatistics),
+    (rasterizers.same_input_same_bits, Flickers),
+    (rasterizers.the_reference_draws_the_same, LessOpaque),
+    (backbones.blocks_cover_the_parameters, LooseTensor),
+    (backbones.created_from_the_scene, GlobalStart),
+    (backbones.decoding_has_the_shape, NegativeScales),
+    (backbones.gradients_reach_every_block, FrozenQuats),
+    (backbones.checkpoints_give_the_same_gaussians, CountsOnItself),
+    (backbones.edits_keep_rows_together, SortsRows),
+    (backbones.parameters_stay_untouched, Drifts),
+    (backbones.baking_gives_plain_gaussians, BakesAGraph),
+    (backbones.fitting_respects_the_user, OverridesTheUser),
+    (densifiers.quiet_before_its_time, Impatient),
+    (densifiers.edits_keep_everything_aligned, WrongRows),
+    (densifiers.edits_keep_everything_aligned, BeyondTheRows),
+    (densifiers.never_outgrows_the_room, Greedy),
+    (densifiers.same_seed_same_edits, GlobalNoise),
+    (densifiers.resumes_exactly, Forgets),
+    (densifiers.inputs_stay_untouched, InPlace),
+    (readers.foreign_folders_are_not_accepted, TakesAnything),
+    (readers.foreign_folders_are_a_user_error, ForeignErrors),
+    (readers.folders_stay_as_they_are, TakesAnything),
+    (observers.seams_stay_answered, DropsAView),
+]
+
+#: What the component itself raises is not caught by the check: `plugins check` reports it.
+RAISING = [
+    (rasterizers.nothing_to_draw_is_no_error, NeedsGaussians, IndexError),
+    (backbones.few_primitives_are_no_error, NeedsNeighbours, IndexError),
+    (observers.survives_every_event, NeedsAFolder, TypeError),
+    (observers.survives_an_early_end, NeedsASession, ZeroDivisionError),
+    (observers.seams_stay_answered, Swallows, api.UserError),
+]
+
+
+def name_of(value):
+    return getattr(value, "__name__", None)
+
+
+@pytest.mark.parametrize(("check", "make"), DEFECTS, ids=name_of)
+def test_a_defect_is_caught(check, make):
+    with pytest.raises(ContractError, match=r"\w+ \w+"):
+        check(make)
+
+
+@pytest.mark.parametrize(("check", "make", "error"), RAISING, ids=name_of)
+def test_an_error_of_the_component_comes_through(check, make, error):
+    with pytest.raises(error):
+        check(make)
+
+
+@pytest.mark.parametrize(
+    ("checks", "make"),
+    [
+        (operators.OPERATOR_CHECKS, Adding),
+        (samplers.SAMPLER_CHECKS, InTurn),
+    ],
+    ids=name_of,
+)
+def test_the_sound_ones_pass(checks, make):
+    for check in checks:
+        check(make)
+
+
+def test_every_check_has_a_defect_that_it_catches():
+    modules = (operators, samplers, groupings, rasterizers, backbones, densifiers, readers)
+    checks = {
+        check
+        for module in (*modules, observers)
+        for name, each in vars(module).items()
+        if name.endswith("_CHECKS")
+        for check in each
+    }
+    caught = {check for check, *_ in (*DEFECTS, *RAISING)}
+    assert {check.__name__ for check in checks - caught} == set()
+
+
+def test_a_check_that_does_not_apply_is_skipped():
+    class Pairs(Adding):
+        views = api.ViewCounts(2, 2)
+
+    with pytest.raises(SkipTest, match="K = 2"):
+        operators.one_view_keeps_its_direction(Pairs)
