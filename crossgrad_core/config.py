@@ -1,12 +1,15 @@
 """The fully resolved configuration of a run: one schema for command line, file and results."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.schedule import ScheduleMode
+
+#: Name of a choice that the run makes at its start.
+AUTO: Final = "auto"
 
 
 class ComponentChoice(BaseModel):
@@ -40,8 +43,8 @@ class RunConfig(BaseModel):
     grouping: ComponentChoice | None = None
     operator: ComponentChoice | tuple[ComponentChoice, ...] = ComponentChoice(name="sum")
     densifier: ComponentChoice | None = None
-    rasterizer: ComponentChoice = ComponentChoice(name="auto")
-    reader: ComponentChoice = ComponentChoice(name="auto")
+    rasterizer: ComponentChoice = ComponentChoice(name=AUTO)
+    reader: ComponentChoice = ComponentChoice(name=AUTO)
     observers: tuple[ComponentChoice, ...] = ()
 
     views: int | None = Field(None, ge=1, description="views per step, K; default: the sampler's")

@@ -12,13 +12,15 @@ from torch import Tensor
 from crossgrad_core.blocks import Block, Parameters
 from crossgrad_core.gaussians import Gaussians, Screen
 from crossgrad_core.scene.types import Scene, View
-from crossgrad_core.schedule import Schedule
+from crossgrad_core.schedule import Phase, Schedule
 from crossgrad_core.state import EMPTY_STATE, PluginState
 from crossgrad_core.topology import Edit, NoEdit
 
 if TYPE_CHECKING:
     from crossgrad_core.backbone import Backbone
     from crossgrad_core.gradients import ViewGradients
+    from crossgrad_core.optimizer import AdamState
+    from crossgrad_core.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -261,6 +263,33 @@ class RunInfo:
     schedule: Schedule
     blocks: tuple[Block, ...]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The model between two steps, for those who measure it. Nothing in it may be changed.
+
+    Attributes:
+        phase: The moment, as training decodes in it; `phase.step` is the last complete step.
+        scene: The scene.
+        backbone: The backbone.
+        rasterizer: The rasterizer.
+        parameters: The parameters.
+        adam: The optimizer's moments.
+        background: [3] RGB that evaluated views are drawn over.
+        ssim_weight: Share of 1 - SSIM in the photometric loss.
+        groups: Group label of each training view, or None.
+    """
+
+    phase: Phase
+    scene: Scene
+    backbone: "Backbone"
+    rasterizer: "Rasterizer"
+    parameters: Parameters
+    adam: "AdamState"
+    background: Tensor
+    ssim_weight: float
+    groups: tuple[str, ...] | None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         Densified,
         DensifyContext,
         EvaluationReport,
+        Model,
         RegularizeContext,
         Regularized,
         RunInfo,
@@ -73,6 +74,10 @@ class HookSpecs:
     @hookspec
     def crossgrad_step_end(self, record: "StepRecord") -> None:
         """Event: the step is complete."""
+
+    @hookspec
+    def crossgrad_model(self, model: "Model") -> None:
+        """Event: the step is complete, and this is the model now. Read only; off the clock."""
 
     @hookspec
     def crossgrad_evaluation(self, report: "EvaluationReport") -> None:

@@ -8,7 +8,7 @@ import typer
 from typer.main import get_command
 
 from crossgrad_core import __version__
-from crossgrad_core.cli import evaluate, export, plugins, render, run
+from crossgrad_core.cli import diagnose, evaluate, export, plugins, render, run, stress
 from crossgrad_core.cli.grouped import GroupedCommand
 from crossgrad_core.errors import UserError
 
@@ -51,6 +51,8 @@ app.command("run", cls=GroupedCommand)(run.run)
 app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
 app.command("render", cls=GroupedCommand)(render.render)
 app.command("export", cls=GroupedCommand)(export.export)
+app.command("diagnose", cls=GroupedCommand)(diagnose.diagnose)
+app.command("stress", cls=GroupedCommand)(stress.stress)
 app.add_typer(plugins.app, name="plugins")
 
 

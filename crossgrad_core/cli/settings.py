@@ -11,7 +11,7 @@ from typing import Any, Final, TypeAlias
 import yaml
 
 from crossgrad_core.cli.yaml_values import read_yaml
-from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.slots import GROUPS
 from crossgrad_core.wording import listed, singular
@@ -84,7 +84,7 @@ def _with_default_name(key: str, value: object) -> object:
     if key not in CHOICES or not isinstance(value, dict) or "name" in value:
         return value
     default = RunConfig.model_fields[key].default
-    return {"name": default.name if isinstance(default, ComponentChoice) else "auto", **value}
+    return {"name": default.name if isinstance(default, ComponentChoice) else AUTO, **value}
 
 
 def _normalized(settings: Settings) -> Settings:
@@ -233,9 +233,10 @@ def _no_options(path: tuple[str, ...], depth: int) -> UserError:
 
 def _whose(links: list[object], path: tuple[str, ...]) -> UserError:
     names = [str(link.get("name")) for link in _links(links)]
+    whole = f"for all of them: --operator chain --set 'operator.links=[{listed(names)}]'"
     return UserError(
         f"{path[0]} is a list; the option must say whose it is",
         where=f"--set {'.'.join(path)}",
         expected=listed(f"{path[0]}.{name}.{path[-1]}" for name in names),
-        todo="--observe NAME adds an observer" if path[0] == OBSERVERS else "",
+        todo="--observe NAME adds an observer" if path[0] == OBSERVERS else whole,
     )

@@ -38,6 +38,7 @@ class StudentisedGap:
 
     @classmethod
     def of(cls, parts: GroupedGramian, groups: Groups, draws: Resamples) -> "StudentisedGap":
+        """From the split Gramian and its resamples."""
         noise = draws.noise[1:]
         # The scale of a resample's noise goes with the square of its spread.
         relative = (draws.spread[1:] / draws.spread[0]) ** 2

@@ -1,13 +1,11 @@
 """Which file, size and calibration every view gets; only headers are read."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration, Pinhole
-from crossgrad_core.scene.decode import RESIZE_FILTER
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.photo_files import (
@@ -17,11 +15,16 @@ from crossgrad_core.scene.photo_files import (
     find_mask_folder,
     find_photo_folders,
 )
+from crossgrad_core.scene.photo_notes import (
+    note_kinds,
+    note_memory,
+    note_pairing,
+    note_sizes,
+    note_undistortion,
+)
 from crossgrad_core.scene.photos import PhotoSource
-from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count, name_some
-
-_MIB = 2**20
 
 
 @dataclass(frozen=True)
@@ -62,29 +65,28 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
     """
     folders = find_photo_folders(raw.images)
     names = sorted(view.name for view in raw.views)
-    found = _read_folder(folders[0], names, raw)
-    notes = _note_missing(found, names)
-    found, more = _prefer_reduced(found, folders[1:], options.max_size)
-    notes += more
-    views = {view.name: view for view in raw.views if view.name in found.paths}
-    masks = _find_masks(raw, options, tuple(views))
-    shared: dict[Calibration, Calibration] = {}
+    full = _read_full(folders[0], names)
+    found, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
+    masks = _find_masks(raw, options, tuple(found.paths))
     sources: dict[str, PhotoSource] = {}
     pinholes: dict[str, Pinhole] = {}
-    for name in sorted(views):
-        view, path, header = views[name], found.paths[name], found.headers[name]
+    shared: dict[Calibration, Calibration] = {}
+    for view in raw.views:
+        if view.name not in found.paths:
+            continue
+        path, header = found.paths[view.name], found.headers[view.name]
         width, height, orientation = _fit(view.calibration, header, path)
         fitted = view.calibration.resized(width, height)
         # Photos of one camera share its undistortion.
         fitted = shared.setdefault(fitted, fitted)
         target = _limit(fitted.pinhole.width, fitted.pinhole.height, options.max_size)
-        pinholes[name] = fitted.pinhole.resized(*target)
-        sources[name] = PhotoSource(
+        pinholes[view.name] = fitted.pinhole.resized(*target)
+        sources[view.name] = PhotoSource(
             path=path,
             width=width,
             height=height,
             orientation=orientation,
-            mask=masks.get(name),
+            mask=masks.get(view.name),
             alpha=header.alpha,
             background=raw.background,
             distorted=None if fitted.is_pinhole else fitted,
@@ -92,13 +94,22 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         )
     for name, mask in masks.items():
         _check_mask(mask, sources[name])
-    notes += _note_sizes(raw, found, sources, pinholes)
-    notes += _note_kinds(raw, found, sources, masks)
-    notes += _note_memory(sources, options)
-    return ChosenPhotos(sources, pinholes, tuple(notes))
+    notes = (
+        *note_pairing(full.folder, full.paths, names),
+        *reduced_notes,
+        *note_undistortion(sources),
+        *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),
+        *note_kinds(sources, found.headers, raw.background),
+        *note_memory(sources, options),
+    )
+    return ChosenPhotos(sources, pinholes, notes)
 
 
-def _read_folder(folder: PhotoFolder, names: Sequence[str], raw: RawScene) -> _Found:
+def _calibrated_sizes(raw: RawScene) -> dict[str, tuple[int, int]]:
+    return {view.name: (view.calibration.width, view.calibration.height) for view in raw.views}
+
+
+def _read_full(folder: PhotoFolder, names: Sequence[str]) -> _Found:
     paths = _pair(folder, names)
     if not paths:
         raise UserError(
@@ -108,6 +119,10 @@ def _read_folder(folder: PhotoFolder, names: Sequence[str], raw: RawScene) -> _F
             found=name_some(folder.names) or "no photo",
             todo="put the photos below the image folder under the names that the model gives them",
         )
+    return _read_found(folder, paths)
+
+
+def _read_found(folder: PhotoFolder, paths: Mapping[str, Path]) -> _Found:
     return _Found(folder, paths, {name: read_header(path) for name, path in paths.items()})
 
 
@@ -136,7 +151,7 @@ def _prefer_reduced(
                 f"missing: {name_some(absent)}"
             )
             continue
-        found = _Found(folder, paths, {name: read_header(path) for name, path in paths.items()})
+        found = _read_found(folder, paths)
         if found.longest <= max_size:
             return (found if 2 * found.longest >= max_size else full), notes
     return full, notes
@@ -203,102 +218,3 @@ def _check_mask(path: Path, source: PhotoSource) -> None:
             expected=f"{source.width} x {source.height} pixels, or in that proportion",
             found=f"{header.width} x {header.height} pixels",
         )
-
-
-def _note_missing(found: _Found, names: Sequence[str]) -> list[str]:
-    notes = []
-    absent = [name for name in names if name not in found.paths]
-    if absent:
-        notes.append(
-            f"photos: {count(len(absent), 'posed image')} left out, the photo is missing: "
-            + name_some(absent)
-        )
-    poseless = found.folder.others(found.paths.values())
-    if poseless:
-        notes.append(
-            f"photos: {count(len(poseless), 'photo')} without a pose left out: "
-            + name_some(poseless)
-        )
-    renamed = [n for n, p in found.paths.items() if p != found.folder.path / n]
-    if renamed:
-        notes.append(
-            f"photos: {count(len(renamed), 'photo')} paired by name without suffix or case: "
-            + name_some(renamed)
-        )
-    return notes
-
-
-def _note_sizes(
-    raw: RawScene,
-    found: _Found,
-    sources: Mapping[str, PhotoSource],
-    pinholes: Mapping[str, Pinhole],
-) -> list[str]:
-    notes = []
-    models = Counter(s.distorted.model for s in sources.values() if s.distorted is not None)
-    if models:
-        kinds = ", ".join(f"{number} from {model}" for model, number in sorted(models.items()))
-        notes.append(
-            f"photos: {count(models.total(), 'photo')} undistorted to PINHOLE with pycolmap "
-            f"({kinds})"
-        )
-    native = {n: s.distorted.pinhole if s.distorted else s for n, s in sources.items()}
-    resized = [n for n, s in sources.items() if s.target != (native[n].width, native[n].height)]
-    sizes = Counter(source.target for source in sources.values())
-    shown = ", ".join(
-        f"{width} x {height} ({number})" for (width, height), number in sizes.most_common(3)
-    )
-    shown += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""  # noqa: PLR2004
-    how = f", {len(resized)} resized ({RESIZE_FILTER})" if resized else ", not resized"
-    notes.append(f"photos: {shown} from {found.folder.path.name}/{how}")
-    calibrated = {v.name: (v.calibration.width, v.calibration.height) for v in raw.views}
-    scaled = sum((s.width, s.height) != calibrated[n] for n, s in sources.items())
-    if scaled:
-        notes.append(
-            f"photos: {count(scaled, 'camera')} scaled to photos of another size than calibrated"
-        )
-    del pinholes
-    return notes
-
-
-def _note_kinds(
-    raw: RawScene,
-    found: _Found,
-    sources: Mapping[str, PhotoSource],
-    masks: Mapping[str, Path],
-) -> list[str]:
-    notes = []
-    turned = sum(source.orientation != 1 for source in sources.values())
-    if turned:
-        notes.append(
-            f"photos: {turned} turned by their EXIF orientation, as the shape of their camera asks"
-        )
-    headers = found.headers.values()
-    alpha = sum(header.alpha for header in headers)
-    if alpha and raw.background is None:
-        notes.append(f"photos: {alpha} with transparency; pixels with alpha < 0.5 do not count")
-    elif alpha:
-        notes.append(f"photos: {alpha} with transparency, blended over RGB {raw.background}")
-    grey = sum(header.grey for header in headers)
-    if grey:
-        notes.append(f"photos: {grey} grey, taken as three equal channels")
-    if masks:
-        notes.append(
-            f"masks: {len(masks)} of {count(len(sources), 'photo')} have one; black pixels do not "
-            "count"
-        )
-    return notes
-
-
-def _note_memory(sources: Mapping[str, PhotoSource], options: SceneOptions) -> list[str]:
-    need = sum(3 * s.target[0] * s.target[1] for s in sources.values()) / _MIB
-    if need <= options.cache_mib:
-        return []
-    return [
-        f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
-        "others are decoded again whenever they are drawn (more memory: cache_mib; smaller photos: "
-        "max_size, or a folder of reduced photos)"
-    ]
-
-
-__all__ = ["ChosenPhotos", "RawView", "choose_photos"]

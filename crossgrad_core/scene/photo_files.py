@@ -115,7 +115,7 @@ def _list_photos(folder: Path) -> tuple[str, ...]:
     for base, _, files in os.walk(folder):
         below = Path(base).relative_to(folder).as_posix()
         prefix = "" if below == "." else below + "/"
-        names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in _SUFFIXES]  # noqa: PTH122
+        names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in _SUFFIXES]
     return tuple(sorted(names))
 
 

@@ -55,6 +55,13 @@ class PhotoSource:
         blank = self.distorted is not None and not self.distorted.fills_frame
         return self.mask is not None or transparent or blank
 
+    @property
+    def undistorted_size(self) -> tuple[int, int]:
+        """(width, height) before resizing."""
+        if self.distorted is None:
+            return self.width, self.height
+        return self.distorted.pinhole.width, self.distorted.pinhole.height
+
     def decode(self) -> _Decoded:
         """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts.
 
@@ -119,7 +126,7 @@ class PhotoCache:
     about half is found.
 
     Args:
-        mib: Memory for decoded photos and masks, MiB. The latest photo is kept even if it is larger.
+        mib: Memory for decoded photos and masks, MiB. The latest photo is kept in any case.
     """
 
     def __init__(self, mib: int) -> None:

@@ -1,4 +1,4 @@
-"""Which way is up in a scene, and how high its cameras are."""
+"""Where cameras are: centres, distances, heights, and how large the scene appears to them."""
 
 from collections.abc import Sequence
 from typing import Literal, TypeAlias
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.scene.types import Camera, Scene, View
 
 #: An axis, or where to take it from.
 Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]
@@ -91,3 +91,30 @@ def _flattest(scene: Scene) -> NDArray[np.float64]:
         rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         downward = np.stack(rows).astype(np.float64).mean(axis=0)
     return np.asarray(-axis if float(axis @ downward) > 0.0 else axis)
+
+
+def footprint_of(scene: Scene, view: View) -> float:
+    """Median of f/z [pixels per local unit] over the SfM points that a view observed.
+
+    Over those in its image where it observed none; NaN where there is none either.
+    """
+    depths = _depths(view.camera, scene.points[view.seen])
+    if len(depths) == 0:
+        depths = _depths(view.camera, scene.points, inside=True)
+    if len(depths) == 0:
+        return float("nan")
+    return float(np.sqrt(view.camera.fx * view.camera.fy) / np.median(depths))
+
+
+def _depths(
+    camera: Camera, points: NDArray[np.float64], *, inside: bool = False
+) -> NDArray[np.float64]:
+    """Depths of the points [P, 3] in front of the camera; with `inside`, in its image only."""
+    pose = camera.world_to_camera.numpy()
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    local = local[local[:, 2] > 0.0]
+    if inside:
+        x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+        y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        local = local[(x >= 0.0) & (x <= camera.width) & (y >= 0.0) & (y <= camera.height)]
+    return np.asarray(local[:, 2])

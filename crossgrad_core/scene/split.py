@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.options import SceneOptions
-from crossgrad_core.scene.wording import name_some
+from crossgrad_core.scene.wording import count, name_some
 
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
@@ -80,21 +80,33 @@ def _split_by_lists(
         )
     train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
     if not train:
-        raise UserError(
-            "no listed view can be trained on",
-            where=root / TRAIN_LIST,
-            expected=f"names below the image folder, such as {min(names)}",
-            found=name_some(sorted(listed[0])) if listed[0] else "no name",
-            todo="mend the lists, or use --split every",
+        raise _matches_nothing(
+            "no listed view can be trained on", TRAIN_LIST, root, names, listed[0]
         )
+    if listed[1] and not test:
+        raise _matches_nothing("no listed view can be held out", TEST_LIST, root, names, listed[1])
     notes = [f"split: {len(train)} train, {len(test)} test ({how})"]
     absent = sorted((listed[0] | listed[1]) - set(names))
     if absent:
         notes.append(f"split: {len(absent)} listed names have no posed photo: {name_some(absent)}")
     unlisted = sorted(set(names) - listed[0] - listed[1])
     if unlisted:
-        notes.append(f"split: {len(unlisted)} views are in no list, left out: {name_some(unlisted)}")
+        notes.append(
+            f"split: {count(len(unlisted), 'view')} in no list left out: {name_some(unlisted)}"
+        )
     return Split(train, test, tuple(notes))
+
+
+def _matches_nothing(
+    what: str, file: str, root: Path, names: Sequence[str], listed: frozenset[str]
+) -> UserError:
+    return UserError(
+        what,
+        where=root / file,
+        expected=f"names below the image folder, such as {min(names)}",
+        found=name_some(sorted(listed)) if listed else "no name",
+        todo="mend the lists, or use --split every",
+    )
 
 
 def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], frozenset[str]] | None:
@@ -114,8 +126,6 @@ def _read_list(path: Path) -> frozenset[str] | None:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            "the list of views cannot be read", where=path, found=str(error)
-        ) from error
+        raise UserError("the list of views cannot be read", where=path, found=str(error)) from error
     names = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
     return frozenset(name for name in names if name and not name.startswith("#"))

@@ -24,7 +24,7 @@ def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
 
 
 def form(matrix: Matrix, x: Sequence[Number]) -> Number:
-    """x^T M x."""
+    """The quadratic form x^T M x."""
     return dot(x, apply(matrix, x))
 
 
@@ -35,14 +35,17 @@ def supports(count: int) -> Iterator[tuple[int, ...]]:
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
-    """x on the support with (M x)_S = right_S, zero elsewhere; None where M_SS is singular."""
+    """Solution x on the support with (M x)_S = right_S, zero elsewhere; None where M_SS is singular."""
     mp = require_mpmath().mp
     size = len(support)
-    rows = [[matrix[i][j] for j in support] + [right[i]] for i in support]
-    largest = max(abs(matrix[i][i]) for i in support)
+    # In units of the diagonal, so that no ratio of norms looks singular.
+    unit = {i: mp.sqrt(matrix[i][i]) for i in support}
+    rows = [
+        [matrix[i][j] / unit[i] / unit[j] for j in support] + [right[i] / unit[i]] for i in support
+    ]
     for column in range(size):
         pivot = max(range(column, size), key=lambda r: abs(rows[r][column]))
-        if abs(rows[pivot][column]) <= largest * mp.mpf(SINGULAR):
+        if abs(rows[pivot][column]) <= mp.mpf(SINGULAR):
             return None
         rows[column], rows[pivot] = rows[pivot], rows[column]
         for other in range(size):
@@ -53,12 +56,12 @@ def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Ve
                 ]
     x = [mp.mpf(0)] * len(matrix)
     for place, i in enumerate(support):
-        x[i] = rows[place][size] / rows[place][place]
+        x[i] = rows[place][size] / rows[place][place] / unit[i]
     return x
 
 
 def null_vector(matrix: Matrix, support: Sequence[int]) -> Vector | None:
-    """x on a minimal dependent support with (M x)_S = 0; None where M_SS is regular."""
+    """Vector x on a minimal dependent support with (M x)_S = 0; None where M_SS is regular."""
     mp = require_mpmath().mp
     *rest, last = support
     right = [-row[last] for row in matrix]
@@ -71,7 +74,7 @@ def null_vector(matrix: Matrix, support: Sequence[int]) -> Vector | None:
 
 
 def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
-    """x >= 0 with s = M x + offset >= 0 and x.s = 0: the optimality conditions of a QP.
+    """Solution x >= 0 with s = M x + offset >= 0 and x.s = 0: the optimality conditions of a QP.
 
     Murty's least-index pivoting, which ends for every positive definite M; None where it does not
     (M is singular), up to `ENUMERATED` rows all supports are tried instead.

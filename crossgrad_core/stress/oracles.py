@@ -44,7 +44,7 @@ class Question:
 
     @property
     def count(self) -> int:
-        """n."""
+        """Number n of views that have a gradient."""
         return len(self.places)
 
 
@@ -180,8 +180,8 @@ def anchors(question: Question) -> Vector:
 def confgate(question: Question) -> Vector:
     """Projection where the averaged cosine says so."""
     mp = require_mpmath().mp
-    beta = number(question.options["beta"])
-    tau = question.options["tau"] or {"v2": 0.9, "low": 0.6}[question.options["preset"]]
+    beta: Number = number(question.options["beta"])
+    tau: float = question.options["tau"] or {"v2": 0.9, "low": 0.6}[question.options["preset"]]
     cosine = cosines(question.gramian)
     confident = {}
     for i in range(question.count):
@@ -190,7 +190,8 @@ def confgate(question: Question) -> Vector:
                 confident[i, j] = False
                 continue
             key = (question.places[i], question.places[j])
-            first, second, updates = question.memory.get(key, (number(0), number(0), 0))
+            seen: tuple[Number, Number, int] = question.memory.get(key, (number(0), number(0), 0))
+            first, second, updates = seen
             c = cosine[i][j]
             first, second = beta * first + (1 - beta) * c, beta * second + (1 - beta) * c * c
             question.memory[key] = (first, second, updates + 1)
@@ -198,7 +199,8 @@ def confgate(question: Question) -> Vector:
             mean = first / missing
             variance = max(second / missing - mean**2, number(0))
             effective = (1 + beta) / (1 - beta)
-            believed = mp.ncdf(-mean / mp.sqrt(variance / effective + number("1e-12"))) >= tau
+            score = -mean / mp.sqrt(variance / effective + number("1e-12"))
+            believed = mp.ncdf(score) >= tau
             confident[i, j] = believed and updates + 1 > question.options["warmup"]
     return column_sums(projected_rows(question, lambda i, j: confident[i, j]))
 
@@ -248,9 +250,9 @@ def gradnorm(question: Question) -> Vector:
     mean = sum(weights[g] * norms[g] for g in groups) / max(len(groups), 1)
     if len(groups) > 1:
         step = number(question.options["lr"])
-        logs = {
-            g: mp.log(weights[g]) - step * mp.sign(weights[g] * norms[g] - mean) for g in groups
-        }
+        off = {g: weights[g] * norms[g] - mean for g in groups}
+        signs = {g: mp.sign(v) if abs(v) > number("1e-9") * mean else 0 for g, v in off.items()}
+        logs = {g: mp.log(weights[g]) - step * signs[g] for g in groups}
     question.memory.update({g: mp.log(w) for g, w in _adding_up(logs).items()})
     return [weights.get(label, number(1)) for label in question.labels]
 

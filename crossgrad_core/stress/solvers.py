@@ -4,7 +4,7 @@ The operators enumerate supports or follow active sets in float64; here optimali
 solved as complementarity problems, and checked.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from crossgrad_core.stress.algebra import (
     ENUMERATED,
@@ -102,7 +102,15 @@ def cagrad(question: Question) -> Vector:
     length = mp.sqrt(max(form(gramian, mean), number(0)))
     if length <= mp.sqrt(max(gramian[k][k] for k in range(question.count))) * number("1e-40"):
         return zeros(question.count)
-    w = _worst_off(gramian, apply(gramian, mean), c * length)
+    try:
+        w = _worst_off(gramian, apply(gramian, mean), c * length)
+    except UnprovenError:
+        if _meets_zero(cosine):
+            return zeros(question.count)
+        raise
+    n = lengths(gramian)
+    if question.count > 2 and is_noise(cosine, [v * x for v, x in zip(w, n, strict=True)]):  # noqa: PLR2004
+        return zeros(question.count)
     factor = c * length / mp.sqrt(form(gramian, w))
     return [share * (m + factor * v) for m, v in zip(mean, w, strict=True)]
 
@@ -110,7 +118,7 @@ def cagrad(question: Question) -> Vector:
 def _worst_off(gramian: Matrix, q: Vector, rho: Number) -> Vector:
     """Minimum of w.q + rho |g_w| on the simplex."""
     size = len(gramian)
-    candidates = supports(size) if size <= ENUMERATED else _descending_supports(gramian, q, rho)
+    candidates = supports(size) if size <= ENUMERATED else _growing_supports(gramian, q, rho)
     for support in candidates:
         w = _stationary(gramian, q, rho, support)
         if w is not None and _optimal(gramian, q, rho, w):
@@ -118,8 +126,26 @@ def _worst_off(gramian: Matrix, q: Vector, rho: Number) -> Vector:
     raise UnprovenError
 
 
+def _growing_supports(gramian: Matrix, q: Vector, rho: Number) -> Iterator[tuple[int, ...]]:
+    """Supports that take up the most violated view and let go of the most negative weight."""
+    size = len(gramian)
+    support = {min(range(size), key=lambda k: q[k])}
+    for _ in range(20 * size):
+        chosen = tuple(sorted(support))
+        yield chosen
+        w = _stationary(gramian, q, rho, chosen)
+        lowest = min(chosen, key=lambda k: w[k]) if w is not None else chosen[0]
+        if w is None or w[lowest] < 0:
+            support -= {lowest}
+        else:
+            slope = _slope(gramian, q, rho, w)
+            support |= {min(range(size), key=lambda k: slope[k])}
+        if not support:
+            return
+
+
 def _stationary(gramian: Matrix, q: Vector, rho: Number, support: Sequence[int]) -> Vector | None:
-    """q + rho G w / |g_w| = lambda on the support, weights adding up to 1."""
+    """Weights with q + rho G w / |g_w| = lambda on the support, adding up to 1."""
     mp = require_mpmath().mp
     size = len(gramian)
     if len(support) == 1:
@@ -152,20 +178,6 @@ def _slope(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> Vector:
     return [a + rho * b / length for a, b in zip(q, apply(gramian, w), strict=True)]
 
 
-def _descending_supports(gramian: Matrix, q: Vector, rho: Number) -> list[tuple[int, ...]]:
-    """Supports from all views downwards, dropping the most negative weight each time."""
-    support = tuple(range(len(gramian)))
-    found = []
-    while support:
-        found.append(support)
-        w = _stationary(gramian, q, rho, support)
-        if w is None:
-            break
-        lowest = min(support, key=lambda k: w[k])
-        support = tuple(k for k in support if k != lowest)
-    return found
-
-
 def imtl_g(question: Question) -> Vector:
     """Equal projections, weights adding up to 1; pseudo-inverse where the rank is not full."""
     mp = require_mpmath().mp
@@ -193,9 +205,9 @@ def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
     rank = sum(1 for v in values if v > number(OPPOSITE) * max(values))
     count = len(n)
     if rank == count:
-        v = solve(gramian, range(count), n)
+        v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
-            return v
+            return [x / y for x, y in zip(v, n, strict=True)]
     values, vectors = mp.eigsy(mp.matrix(gramian))
     largest = sorted(range(count), key=lambda i: values[i])[count - rank :]
     v = zeros(count)

@@ -3,9 +3,10 @@
 from pydantic import ValidationError
 
 from crossgrad_core.component import Component
+from crossgrad_core.errors import UserError
 from crossgrad_core.manager import make_manager
 from crossgrad_core.testing.contract import Check, ContractError, Make, require
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import in_one_line, listed
 
 
 def options_are_frozen(make: Make[Component]) -> None:
@@ -34,7 +35,10 @@ def unknown_options_are_refused(make: Make[Component]) -> None:
 def options_survive_the_configuration_file(make: Make[Component]) -> None:
     """Written to config.yaml and read again, the options are the same."""
     component = make()
-    again = type(component).model_validate(component.model_dump(mode="json"))
+    try:
+        again = type(component).model_validate(component.model_dump(mode="json"))
+    except ValidationError as error:
+        raise ContractError(f"options are refused when read back: {in_one_line(error)}") from error
     require(again == component, f"the options {component!r} are read back as {again!r}")
 
 
@@ -49,7 +53,10 @@ def options_are_described(make: Make[Component]) -> None:
 
 def hooks_exist(make: Make[Component]) -> None:
     """Every hook that it implements exists, is marked and takes the hook's arguments."""
-    make_manager({"component": make()})
+    try:
+        make_manager({"component": make()})
+    except UserError as error:
+        raise ContractError(f"{error.what}: {error.todo or error.found}") from error
 
 
 COMPONENT_CHECKS: tuple[Check[Component], ...] = (

@@ -18,6 +18,7 @@ WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
 #: Steps of the schedule that contexts carry: the published one.
 STEPS = 30_000
 
+_VIEWS, _POINTS = 12, 40
 _NEAR_RADIUS, _FAR_RADIUS, _STEP = 0.4, 0.8, 0.02
 _CLOUD = 0.1
 
@@ -28,11 +29,9 @@ class NoisePhoto:
 
     Attributes:
         seed: Seed of the pixels.
-        masked: Whether the left half does not count.
     """
 
     seed: int
-    masked: bool = False
 
     def image(self) -> Tensor:
         """[H, W, 3] uint8."""
@@ -40,42 +39,34 @@ class NoisePhoto:
         return torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
 
     def mask(self) -> Tensor | None:
-        """[H, W] bool, or None."""
-        if not self.masked:
-            return None
-        mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-        mask[:, : WIDTH // 2] = False
-        return mask
+        """None: every pixel counts."""
+        return None
 
 
 @cache
-def sample_scene(views: int = 12, points: int = 40) -> Scene:
-    """A scene of near and far cameras around a small cloud; every fourth view is held out.
+def sample_scene() -> Scene:
+    """Six near and six far cameras around a small cloud; every fourth view is held out.
 
     The cameras of each regime are in a folder of their own, at different distances, so that every
     grouping finds its groups. The frame is a local one: extent 1.
     """
     rng = np.random.default_rng(7)
-    cloud = rng.uniform(-_CLOUD, _CLOUD, (points, 3))
-    scene = posed_scene(
-        [_view(index, views, points) for index in range(views)],
-        cloud,
-        [index for index in range(views) if index % 4 == 3],  # noqa: PLR2004 - every fourth
-    )
-    colors = rng.integers(0, 256, (points, 3), dtype=np.uint8)
+    cloud = rng.uniform(-_CLOUD, _CLOUD, (_POINTS, 3))
+    scene = posed_scene([_view(index) for index in range(_VIEWS)], cloud, range(3, _VIEWS, 4))
+    colors = rng.integers(0, 256, (_POINTS, 3), dtype=np.uint8)
     return replace(scene, name="sample", point_colors=colors)
 
 
-def _view(index: int, views: int, points: int) -> View:
+def _view(index: int) -> View:
     """View `index`: the first half far and high, the second half near and low."""
-    far = index < (views + 1) // 2
+    far = index < _VIEWS // 2
     angle = 2.4 * index
     radius = (_FAR_RADIUS if far else _NEAR_RADIUS) + _STEP * index
     height = 0.8 if far else 0.2
     flat = radius * np.sqrt(1.0 - height**2)
     center = np.array([flat * np.cos(angle), flat * np.sin(angle), radius * height])
     folder = "far" if far else "near"
-    view = posed_view(center, f"{folder}/{index:03}.png", forward=-center, seen=range(points))
+    view = posed_view(center, f"{folder}/{index:03}.png", forward=-center, seen=range(_POINTS))
     camera = replace(
         view.camera, width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2
     )
@@ -87,9 +78,9 @@ def sample_camera() -> Camera:
     return sample_scene().train_views[0].camera
 
 
-def sample_gaussians(number: int = 30, *, harmonics: bool = False, seed: int = 3) -> Gaussians:
+def sample_gaussians(number: int = 30, *, harmonics: bool = False) -> Gaussians:
     """Gaussians of a few pixels in the sample scene, float32; all are leaves with gradients."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
 
     def leaf(values: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(values.astype(np.float32)).requires_grad_()
@@ -115,12 +106,12 @@ def sample_phase(step: int = STEPS, *, training: bool = True) -> Phase:
     return Phase(step, training, Schedule.for_run(STEPS))
 
 
-def step_fields(step: int = 1, seed: int = 0, scene: Scene | None = None) -> dict[str, Any]:
+def step_fields(step: int = 1) -> dict[str, Any]:
     """The fields that every seam's context shares."""
     return {
         "step": step,
         "schedule": Schedule.for_run(STEPS),
-        "scene": scene or sample_scene(),
+        "scene": sample_scene(),
         "states": {},
-        "rng": np.random.default_rng(seed),
+        "rng": np.random.default_rng(0),
     }

@@ -8,7 +8,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias, cast
 
 import numpy as np
+import torch
 
+from crossgrad_core.backbone import Backbone
 from crossgrad_core.contexts import (
     AggregateContext,
     Aggregated,
@@ -17,6 +19,7 @@ from crossgrad_core.contexts import (
     DensifyContext,
     Draw,
     EvaluationReport,
+    Model,
     RunInfo,
     SampleContext,
     Sampled,
@@ -26,13 +29,16 @@ from crossgrad_core.densifier import Densifier
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.manager import call_seam, make_manager
 from crossgrad_core.observer import Observer
+from crossgrad_core.optimizer import AdamState
+from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.registry import build
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
+from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, require, revived
 from crossgrad_core.testing.densifiers import DensifierRun
-from crossgrad_core.testing.fixtures import STEPS, sample_scene, step_fields
+from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
 from crossgrad_core.topology import NO_EDIT
 
 #: The hooks of one run's manager; pluggy gives them no types.
@@ -96,11 +102,26 @@ def survives_every_event(make: Make[Observer]) -> None:
                 _start(hooks, place)
                 for step in (1, 2):
                     _step_end(hooks, step, _seams(hooks, step))
+                    hooks.crossgrad_model(model=_model(step))
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
                 )
                 hooks.crossgrad_message(text="a line of text")
                 hooks.crossgrad_run_end(status="finished")
+
+
+def the_model_stays_untouched(make: Make[Observer]) -> None:
+    """Looking at the model changes none of its tensors."""
+    model, copy = _model(1), _model(1)
+    with _hooks(make()) as hooks:
+        _start(hooks, None)
+        _step_end(hooks, 1, [])
+        hooks.crossgrad_model(model=model)
+    for name, tensor in model.parameters.items():
+        same = torch.equal(tensor.detach(), copy.parameters[name].detach())
+        require(same, f"the observer changes the parameters {name}")
+    for name, moment in model.adam.exp_avg.items():
+        require(not moment.any(), f"the observer changes the optimizer's moments of {name}")
 
 
 def survives_an_early_end(make: Make[Observer]) -> None:
@@ -132,6 +153,23 @@ def seams_stay_answered(make: Make[Observer]) -> None:
         require(finite, f"the aggregated gradient of {name} is not finite")
 
 
+def _model(step: int) -> Model:
+    """The model of a new run on the sample scene."""
+    backbone = cast("Backbone", build("backbones", "vanilla", {}))
+    parameters = created(backbone)
+    return Model(
+        phase=sample_phase(step),
+        scene=sample_scene(),
+        backbone=backbone,
+        rasterizer=cast("Rasterizer", build("rasterizers", "torch", {})),
+        parameters=parameters,
+        adam=AdamState.zeros(parameters),
+        background=torch.zeros(3),
+        ssim_weight=0.2,
+        groups=None,
+    )
+
+
 def _seams(hooks: Hooks, step: int) -> list[Answer]:
     """The answers of the three seams of a step, as the training loop asks for them."""
     scene = sample_scene()
@@ -155,5 +193,6 @@ OBSERVER_CHECKS: tuple[Check[Observer], ...] = (
     *COMPONENT_CHECKS,
     survives_every_event,
     survives_an_early_end,
+    the_model_stays_untouched,
     seams_stay_answered,
 )

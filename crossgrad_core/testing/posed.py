@@ -85,7 +85,7 @@ class SamplerRun:
     def draw(self) -> Draw:
         """The views of the next step."""
         self.step += 1
-        draw, self.state = self.sampler.sample(self._context(), self.state)
+        draw, self.state = self.sampler.sample(self.context(), self.state)
         losses = self.losses or [1.0] * len(self.scene.train)
         self.last = StepRecord(
             step=self.step,
@@ -104,7 +104,8 @@ class SamplerRun:
         for _ in range(count):
             yield self.draw()
 
-    def _context(self) -> SampleContext:
+    def context(self) -> SampleContext:
+        """What the sampler is offered in the present step."""
         views = self.scene.train_views
         centers = [view.camera.center.numpy() for view in views]
         return SampleContext(

@@ -58,8 +58,11 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
     sampler = make()
     for views in admitted(sampler.view_counts):
         run = sampler_run(sampler, views)
-        for draw in run.draws(_AFTER):
+        for _ in range(_AFTER):
+            # Looked at before the run takes it, which needs a good one.
+            draw, _ = sampler.sample(run.context(), run.state)
             _require_good(draw, views, len(run.scene.train))
+            run.draw()
 
 
 def _require_good(draw: Draw, views: int, available: int) -> None:

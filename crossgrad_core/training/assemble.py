@@ -8,7 +8,7 @@ import torch
 
 from crossgrad_core.backbone import Backbone
 from crossgrad_core.component import Component, Selection
-from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.grouping import Grouping
@@ -33,10 +33,10 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     Raises:
         UserError: No reader accepts the folder, or the one that does cannot read it.
     """
-    names = [config.reader.name] if config.reader.name != "auto" else list(entries("readers"))
+    names = [config.reader.name] if config.reader.name != AUTO else list(entries("readers"))
     for name in names:
         reader = cast("Reader", build("readers", name, config.reader.options))
-        if config.reader.name != "auto" or reader.accepts(path):
+        if config.reader.name != AUTO or reader.accepts(path):
             return reader.read(path, config.reading), name
     # No reader recognises it: the first one explains what it misses.
     reader = cast("Reader", build("readers", "colmap", {}))
@@ -77,7 +77,7 @@ def choose_device(name: str) -> torch.device:
 
 def choose_rasterizer(choice: ComponentChoice, device: torch.device) -> tuple[str, str]:
     """The name of the rasterizer and why it was chosen."""
-    if choice.name != "auto":
+    if choice.name != AUTO:
         return choice.name, f"rasterizer {choice.name}: asked for"
     if device.type == "cpu":
         return "numba", "rasterizer numba: the fast one on a CPU"
@@ -98,7 +98,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     backbone = cast("Backbone", _built("backbones", config.backbone))
     backbone, left_out = backbone.fitted_to(scene)
     notes += left_out
-    densifier_choice = config.densifier or ComponentChoice(name=backbone.default_densifier)
+    densifier_choice = _or_default(config.densifier, backbone.default_densifier)
     densifier = cast("Densifier", _built("densifiers", densifier_choice))
     rasterizer_name, why = choose_rasterizer(config.rasterizer, device)
     notes.append(why)
@@ -160,6 +160,13 @@ def _built(slot: str, choice: ComponentChoice) -> Component:
     return build(slot, choice.name, choice.options)
 
 
+def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
+    """The choice, where its name is left open with the default one."""
+    if choice is None:
+        return ComponentChoice(name=name)
+    return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
+
+
 def _operator(config: RunConfig) -> tuple[Operator, str]:
     links = config.operators
     if len(links) == 1:
@@ -180,10 +187,16 @@ def _rasterizer_options(config: RunConfig, scene: Scene) -> dict[str, Any]:
 def _grouping_choice(
     config: RunConfig, sampler: Sampler, notes: list[str]
 ) -> ComponentChoice | None:
-    if config.grouping is not None:
+    if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
     if sampler.default_grouping is not None:
-        return ComponentChoice(name=sampler.default_grouping)
+        return _or_default(config.grouping, sampler.default_grouping)
+    if config.grouping is not None:
+        raise UserError(
+            f"sampler {config.sampler.name} uses no grouping that could have options",
+            where="grouping",
+            todo="name the grouping with --grouping, or leave its options out",
+        )
     notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
     return None
 

@@ -15,10 +15,14 @@ from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Snapshot, TrainState
 from crossgrad_core.training.step import take_step
+from crossgrad_core.training.views import model_of
 
 Status = Literal["finished", "stopped"]
 
-#: Steps between copies of the last good state.
+#: Steps between looks at all parameters. Losses and gradients are looked at in every step; a bad
+#: parameter that touches neither (a Gaussian that is not drawn any more) can wait so long.
+CHECK_EVERY = 10
+#: Steps between copies of the last good state; a multiple of `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 
@@ -73,14 +77,18 @@ def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Stat
     while state.step < last and not stopper.requested:
         try:
             record = timed_step(setup, state)
-            if state.step % SNAPSHOT_EVERY == 0 or state.step == last or stopper.requested:
+            leaves = state.step == last or stopper.requested
+            if state.step % CHECK_EVERY == 0 or leaves:
                 check_parameters(state, record)
+            if state.step % SNAPSHOT_EVERY == 0:
                 snapshot = Snapshot.of(state)
         except NonFiniteError as error:
             _rewind(setup, state, snapshot, error)
             continue
         check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)
+        if setup.shows_model:
+            setup.hook.crossgrad_model(model=model_of(setup, state))
         _tell_held_back(setup, record)
         _record(setup, state, sink)
     return "finished" if state.step >= total else "stopped"

@@ -117,6 +117,11 @@ class Setup:
         return bool(self.hook.crossgrad_regularize.get_hookimpls())
 
     @cached_property
+    def shows_model(self) -> bool:
+        """Whether any plugin looks at the model after a step."""
+        return bool(self.hook.crossgrad_model.get_hookimpls())
+
+    @cached_property
     def acts_after_step(self) -> bool:
         """Whether any plugin acts after the step."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contexts import Draw, RegularizeContext, ViewRecord
+from crossgrad_core.contexts import Draw, Model, RegularizeContext, ViewRecord
 from crossgrad_core.gaussians import Gaussians, Render
 from crossgrad_core.photometric import photometric_loss
 from crossgrad_core.scene.types import View
@@ -134,6 +134,21 @@ def eval_background(setup: Setup) -> Tensor:
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
     return torch.tensor(rgb, dtype=torch.float32, device=setup.device)
+
+
+def model_of(setup: Setup, state: TrainState) -> Model:
+    """The model as it is after the last step, shared, not copied."""
+    return Model(
+        phase=setup.phase(state.step, training=True),
+        scene=setup.scene,
+        backbone=setup.backbone,
+        rasterizer=setup.rasterizer,
+        parameters=state.parameters,
+        adam=state.adam,
+        background=eval_background(setup),
+        ssim_weight=setup.config.ssim_weight,
+        groups=setup.groups,
+    )
 
 
 def detached(gaussians: Gaussians) -> Gaussians:

@@ -121,9 +121,12 @@ def test_the_order_of_assignments_does_not_matter(config, assignments):
 
 
 def test_options_alone_belong_to_the_component_that_is_taken_by_default():
-    settings = merged(None, {}, ["rasterizer.max_alpha=0.999", "sampler.order=epoch"])
-    assert settings["rasterizer"] == {"name": "auto", "max_alpha": 0.999}
-    assert settings["sampler"] == {"name": "random", "order": "epoch"}
+    assignments = ["rasterizer.max_alpha=0.999", "sampler.order=epoch", "densifier.x=1"]
+    assert merged(None, {}, assignments) == {
+        "rasterizer": {"name": "auto", "max_alpha": 0.999},
+        "sampler": {"name": "random", "order": "epoch"},
+        "densifier": {"name": "auto", "x": 1},
+    }
 
 
 def test_options_alone_in_a_file_belong_to_what_is_chosen_later(tmp_path):

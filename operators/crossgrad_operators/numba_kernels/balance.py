@@ -1,5 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL)."""
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -144,6 +146,20 @@ def _bargain(cosines: Floats) -> Floats:
 
 
 @njit(cache=True)
+def _geometric_mean(values: Floats) -> float:
+    """The n-th root of a product, with the exponents apart so that it neither fades nor loses."""
+    mantissa, exponent = 1.0, 0
+    for value in values:
+        part, power = math.frexp(value)
+        mantissa *= part
+        exponent += power
+    n = values.size
+    whole = exponent // n
+    # The rest of the exponent, from 0 to n - 1, goes under the root.
+    return math.ldexp(math.ldexp(mantissa, exponent - whole * n) ** (1.0 / n), whole)
+
+
+@njit(cache=True)
 def nash(gramians: Floats, present: Flags) -> Floats:
     """[B, K] weights alpha with G alpha = 1 / alpha, times the geometric mean of the norms."""
     blocks, views, _ = gramians.shape
@@ -163,7 +179,7 @@ def nash(gramians: Floats, present: Flags) -> Floats:
         if n > 1 and n <= 2.0 * OPPOSITE * beta.max() * beta.max():
             continue
         longest = norms[:n].max()
-        mean = np.exp(np.log(norms[:n] / longest).sum() / n)
+        mean = _geometric_mean(norms[:n] / longest)
         for i in range(n):
             result[b, places[i]] = beta[i] * mean * (longest / norms[i])
     return result

@@ -5,6 +5,9 @@ from numba import njit
 
 from crossgrad_operators.numba_kernels.normal import Flags, Floats, Indices, normalised
 
+#: A norm this close to its target, relative to the mean norm, has met it.
+MET = 1e-9
+
 
 @njit(cache=True)
 def confident(
@@ -110,6 +113,7 @@ def follow_losses(
         for s in range(groups):
             if active[s]:
                 target = mean * (rates[s] * count / rate) ** alpha if rate > 0.0 else mean
-                logs[b, s] -= lr * np.sign(lengths[s] - target)
+                if abs(lengths[s] - target) > MET * mean:
+                    logs[b, s] -= lr * np.sign(lengths[s] - target)
         _scale(logs[b], active)
     return weights

@@ -271,10 +271,11 @@ def _reciprocals(norms: Floats, present: Flags, members: Indices, r: Floats) -> 
 
 @njit(cache=True)
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of the two), for norms up to 1.
+    """Weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of the two), for 1 = n1 >= n2.
 
-    The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x; sums of squares
-    are arranged so that nothing cancels but the cosine itself.
+    The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
+    are arranged so that nothing cancels but the cosine itself, and the weight that may be tiny is
+    that of the longer gradient.
     """
     product = n1 * n2
     gap = (n1 - n2) * (n1 - n2)
@@ -283,18 +284,17 @@ def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, 
     if between <= 0.0:
         return 0.5, mean, mean
     x0 = n2 * (n2 - cosine * n1) / between
-    h = product * np.sqrt((1.0 - cosine) * (1.0 + cosine) / between)
     slope = (n1 - n2) * (n1 + n2)
     steep = 2.0 * c * mean * np.sqrt(between)
-    if abs(slope) >= steep:
-        x = 0.0 if slope > 0.0 else 1.0
-        if slope == 0.0:
-            x = min(max(x0, 0.0), 1.0)
-    else:
+    x = 0.0
+    if slope < steep:
+        h = product * np.sqrt((1.0 - cosine) * (1.0 + cosine) / between)
         ratio = slope / steep
         x = x0 - h * ratio / np.sqrt((1.0 - ratio) * (1.0 + ratio)) / np.sqrt(between)
         x = min(max(x, 0.0), 1.0)
-    return x, np.sqrt(between * (x - x0) * (x - x0) + h * h), mean
+    one, other = x * n1, (1.0 - x) * n2
+    length = np.sqrt((one - other) * (one - other) + 2.0 * one * other * (1.0 + cosine))
+    return x, length, mean
 
 
 @njit(cache=True)
@@ -317,6 +317,8 @@ def cagrad(gramians: Floats, present: Flags, c: float) -> Floats:
         longest = norms.max()
         if count == 2:
             i, j = members[0], members[1]
+            if norms[i] < norms[j]:
+                i, j = j, i
             if 1.0 + cosines[i, j] <= OPPOSITE:
                 result[b, i] = result[b, j] = max(1.0 - c, 0.0) / views
                 continue
@@ -334,7 +336,8 @@ def cagrad(gramians: Floats, present: Flags, c: float) -> Floats:
         mean = np.sqrt(max(form(lengths, cosines, lengths), 0.0))
         x = _minimum(cosines, r, q, c * mean, members, count, present[b])
         length = np.sqrt(max(form(x, cosines, x), 0.0))
-        if c >= 1.0 and _is_noise(cosines, x):
+        # Where a convex combination vanishes the direction is undefined, and zero by convention.
+        if _is_noise(cosines, x):
             continue
         for i in range(count):
             k = members[i]

@@ -8,7 +8,8 @@ from typing_extensions import override
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.scene.types import Camera, Scene, View
+from crossgrad_core.scene.poses import footprint_of
+from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -37,44 +38,29 @@ class Footprint(Grouping):
         probe: GradientProbe | None = None,
     ) -> Labelling:
         require_training_views(scene, "footprint")
-        train = np.array([footprint_of(scene, view) for view in scene.train_views])
+        train = _footprints(scene, scene.train_views)
         threshold = float(np.median(train))
         # halves() calls small values near: a large footprint is a near camera.
         train_labels = halves(-train, -threshold)
         require_groups("footprint", train_labels, (NEAR, FAR), "projected footprint")
-        values = np.array([footprint_of(scene, view) for view in views])
+        values = _footprints(scene, views)
         note = f"grouping footprint: near from {threshold:.4g} pixels per local unit"
         return Labelling(halves(-values, -threshold), (note,))
 
 
-def footprint_of(scene: Scene, view: View) -> float:
-    """Median of f/z [pixels per local unit] over the SfM points in front of a view.
+def _footprints(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
+    """[V] footprints.
 
     Raises:
-        UserError: No SfM point lies in the view's image.
+        UserError: A view has no SfM point in its image.
     """
-    depths = _depths(view.camera, scene.points[view.seen])
-    if len(depths) == 0:
-        depths = _depths(view.camera, scene.points, inside=True)
-    if len(depths) == 0:
-        raise UserError(
-            "grouping footprint needs SfM points in every view",
-            where=view.name,
-            found="no SfM point in this image",
-            todo="choose grouping radial, which needs camera positions only",
-        )
-    return float(np.sqrt(view.camera.fx * view.camera.fy) / np.median(depths))
-
-
-def _depths(
-    camera: Camera, points: NDArray[np.float64], *, inside: bool = False
-) -> NDArray[np.float64]:
-    """Depths of the points [P, 3] in front of the camera; with `inside`, in its image only."""
-    pose = camera.world_to_camera.numpy()
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    local = local[local[:, 2] > 0.0]
-    if inside:
-        x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-        y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-        local = local[(x >= 0.0) & (x <= camera.width) & (y >= 0.0) & (y <= camera.height)]
-    return np.asarray(local[:, 2])
+    footprints = np.array([footprint_of(scene, view) for view in views])
+    for view, footprint in zip(views, footprints, strict=True):
+        if np.isnan(footprint):
+            raise UserError(
+                "grouping footprint needs SfM points in every view",
+                where=view.name,
+                found="no SfM point in this image",
+                todo="choose grouping radial, which needs camera positions only",
+            )
+    return footprints

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.poses import footprint_of
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.groupings.conflict_signature import (
     ConflictSignature,
     mean_cosines,
     spectral_cut,
 )
-from crossgrad_plugins.groupings.footprint import Footprint, footprint_of
+from crossgrad_plugins.groupings.footprint import Footprint
 from crossgrad_plugins.groupings.lists import Lists
 
 RNG = np.random.default_rng(0)
@@ -34,8 +35,10 @@ def test_a_view_that_observed_nothing_takes_the_points_in_its_image():
 
 def test_a_view_of_nothing_at_all_is_a_user_error():
     view = posed_view((0, 0, 0))
+    scene = posed_scene([view], [(0, -5, 0)])
+    assert np.isnan(footprint_of(scene, view))
     with pytest.raises(UserError, match=r"view\.png"):
-        footprint_of(posed_scene([view], [(0, -5, 0)]), view)
+        Footprint().label(scene, scene.views, RNG)
 
 
 def test_the_focal_length_decides_at_one_place():

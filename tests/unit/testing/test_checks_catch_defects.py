@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 from unittest import SkipTest
 
 import numpy as np
 import pytest
 import torch
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict, field_serializer
 
 from crossgrad_core import plugin as api
 from crossgrad_core.registry import load
@@ -81,7 +82,7 @@ class GlobalRandomness(Adding):
 
 
 class HiddenCounter(Adding):
-    calls: dict[str, int] = {}
+    calls: ClassVar[dict[str, int]] = {}
 
     def weights(self, gramians, context, rng):
         self.calls["n"] = self.calls.get("n", 0) + 1
@@ -122,11 +123,11 @@ class CountsViewsThatAreNotThere(Adding):
 
 class ChangesGradients(Adding):
     def aggregate(self, context, state):
-        context.gradients.elementwise(lambda name, gradients: double(gradients))
+        context.gradients.elementwise(double)
         return super().aggregate(context, state)
 
 
-def double(gradients):
+def double(_, gradients):
     for gradient in gradients:
         if gradient is not None:
             gradient.mul_(2.0)
@@ -180,7 +181,7 @@ class GlobalDraws(InTurn):
 
 
 class RemembersOnItself(InTurn):
-    seen: list[int] = []
+    seen: ClassVar[list[int]] = []
 
     def sample(self, context, state):
         self.seen.append(1)
@@ -287,7 +288,7 @@ class FrozenQuats(Vanilla):
 
 
 class CountsOnItself(Vanilla):
-    calls: list[int] = []
+    calls: ClassVar[list[int]] = []
 
     def decode(self, parameters, camera, phase):
         self.calls.append(1)
@@ -353,7 +354,7 @@ class GlobalNoise(NoDensification):
 
 
 class Forgets(NoDensification):
-    calls: list[int] = []
+    calls: ClassVar[list[int]] = []
 
     def densify(self, context, state):
         self.calls.append(1)
@@ -410,6 +411,12 @@ class DropsAView(api.Observer):
         return replace(sampled, draw=api.Draw(sampled.draw.views[:1]))
 
 
+class Shifts(api.Observer):
+    @api.hookimpl
+    def crossgrad_model(self, model):
+        model.parameters["means"].data.add_(1.0)
+
+
 class Mutable(Adding):
     model_config = ConfigDict(frozen=False)
 
@@ -422,8 +429,18 @@ class Unhashable(Adding):
     table: dict[str, int] = api.Field({}, description="a table")
 
 
-class Opaque(Adding):
-    inner: BaseModel = api.Field(Mutable(), description="an operator")
+class Rounds(Adding):
+    share: float = api.Field(0.123, description="a share")
+
+    @field_serializer("share")
+    def in_short(self, share):
+        return round(share, 1)
+
+
+class ReadsNumbersOnly(Rounds):
+    @field_serializer("share")
+    def in_short(self, share):
+        return f"{share:%}"
 
 
 class Silent(Adding):
@@ -440,7 +457,8 @@ DEFECTS = [
     (components.options_are_frozen, Mutable),
     (components.options_are_frozen, Unhashable),
     (components.unknown_options_are_refused, Tolerant),
-    (components.options_survive_the_configuration_file, Opaque),
+    (components.options_survive_the_configuration_file, Rounds),
+    (components.options_survive_the_configuration_file, ReadsNumbersOnly),
     (components.options_are_described, Silent),
     (components.hooks_exist, Misspelt),
     (aggregation.every_tensor_is_answered, ForgetsATensor),
@@ -498,6 +516,7 @@ DEFECTS = [
     (readers.foreign_folders_are_not_accepted, TakesAnything),
     (readers.foreign_folders_are_a_user_error, ForeignErrors),
     (readers.folders_stay_as_they_are, TakesAnything),
+    (observers.the_model_stays_untouched, Shifts),
     (observers.seams_stay_answered, DropsAView),
 ]
 

@@ -60,6 +60,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.simd import (
     lowest_bit,
     magnitude,
     prefetch,
+    prefetch_write,
     smaller,
     splat,
     store,
@@ -215,6 +216,7 @@ def _backward(
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
     partials: NDArray[np.float32],
+    written: NDArray[np.uint8],
 ) -> None:
     """Sums the gradients of one tile's entries."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
@@ -228,18 +230,21 @@ def _backward(
     while entry < stop:
         filled = 0
         while filled < BATCH and entry < stop:
-            prefetch(records, np.intp(entries[min(entry + BATCH, stop - 1)]) * RECORD)
-            record = np.intp(entries[entry]) * RECORD
+            prefetch(records, np.intp(entries[min(entry + BATCH, stop - 1), 0]) * RECORD)
+            record = np.intp(entries[entry, 0]) * RECORD
             fill_rows(records, record, np.float32(left), np.float32(top), rows, filled * ROWS)
             batch[filled] = entry
+            prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             filled += np.intp(masks[entry] != 0)
             entry += 1
         for k in range(filled):
             at = batch[k]
+            slot = np.intp(entries[at, 1])
+            written[slot] = 1
             _gather(
                 np.uint64(masks[at]),
                 records,
-                np.intp(entries[at]) * RECORD,
+                np.intp(entries[at, 0]) * RECORD,
                 rows,
                 k * ROWS,
                 state,
@@ -247,7 +252,7 @@ def _backward(
                 v_depth,
                 absolute,
                 partials,
-                at * PARTIAL,
+                slot * PARTIAL,
             )
 
 
@@ -267,13 +272,14 @@ def differentiate(
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
     partials: NDArray[np.float32],
+    written: NDArray[np.uint8],
 ) -> None:
     """Sums the gradients of every entry with a mask over its tile's pixels.
 
     Args:
         tiles: [T] every tile once.
         starts: [T + 1] first entry of each tile.
-        entries: [E] records of each tile, front to back.
+        entries: [E, 2] records and slots of each tile, front to back.
         masks: [E] segments per entry, as the forward pass left them.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
@@ -284,7 +290,8 @@ def differentiate(
         v_alpha: [H, W] gradient by alpha, or None.
         v_depth: [H, W] gradient by the depth, or None.
         absolute: Any vector asks for the sums of absolute gradients; None leaves them out.
-        partials: [E * PARTIAL] written where the mask is not zero.
+        partials: [slots * PARTIAL] written for slots of entries with a mask.
+        written: [slots] 1 written for these; zero before.
     """
     for job in prange(tiles.shape[0]):
         _backward(
@@ -302,4 +309,5 @@ def differentiate(
             v_depth,
             absolute,
             partials,
+            written,
         )

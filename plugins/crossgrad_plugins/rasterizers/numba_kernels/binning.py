@@ -239,7 +239,6 @@ def fill_tiles(
     tile_of_slot: NDArray[np.int32],
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
-    entry_of_slot: NDArray[np.int32],
 ) -> None:
     """Writes the tile lists, each band of rows of tiles by one job.
 
@@ -250,8 +249,8 @@ def fill_tiles(
         shelves: [N, SHELF] per record.
         tile_of_slot: [slots] from `find_tiles`.
         starts: [T + 1] first entry of each tile.
-        entries: [E] written: the record of each entry, tile by tile, front to back.
-        entry_of_slot: [slots] written.
+        entries: [E, 2] written: the record and the slot of each entry, tile by tile, front to
+            back.
     """
     count = order.shape[0]
     for band in prange(bands.shape[0] - 1):
@@ -261,7 +260,6 @@ def fill_tiles(
             prefetch(shelves, SHELF * np.intp(order[min(rank + _FAR, count - 1)]))
             ahead = order[min(rank + _NEAR, count - 1)]
             prefetch(tile_of_slot, np.intp(shelves[ahead, FIRST_SLOT]))
-            prefetch(entry_of_slot, np.intp(shelves[ahead, FIRST_SLOT]))
             j = order[rank]
             if shelves[j, LAST_ROW] < bands[band] or shelves[j, FIRST_ROW] >= bands[band + 1]:
                 continue
@@ -271,5 +269,5 @@ def fill_tiles(
                 if first_tile <= tile < end_tile:
                     entry = positions[tile - first_tile]
                     positions[tile - first_tile] = entry + 1
-                    entries[entry] = j
-                    entry_of_slot[slot] = entry
+                    entries[entry, 0] = j
+                    entries[entry, 1] = slot

@@ -18,6 +18,11 @@ _MARGIN = 0.3
 LEAST_DET = 1e-6
 
 
+Triple = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Pose = tuple[Row, Row, Row]
+
+
 class Pinhole(NamedTuple):
     """A camera as the kernels take it (all float64).
 
@@ -49,7 +54,7 @@ def pinhole(
     """Makes a camera from a world-to-camera matrix [4, 4] and K [3, 3]."""
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     extra_x, extra_y = _MARGIN * width / (2.0 * fx), _MARGIN * height / (2.0 * fy)
-    pose = np.ascontiguousarray(viewmat[:3, :4], dtype=np.float64)
+    pose = np.array(viewmat, dtype=np.float64, order="C")[:3]
     return Pinhole(
         pose=pose,
         fx=fx,
@@ -67,37 +72,37 @@ def pinhole(
 
 
 @device
-def to_camera(
-    camera: Pinhole, means: NDArray[np.float32], i: int
-) -> tuple[float, float, float]:
-    """Returns the centre of Gaussian i in the camera's frame."""
-    pose = camera.pose
-    mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+def in_registers(pose: NDArray[np.float64]) -> Pose:
+    """Returns a [3, 4] matrix as numbers: loops that write to memory need not read it again."""
     return (
-        pose[0, 0] * mx + pose[0, 1] * my + pose[0, 2] * mz + pose[0, 3],
-        pose[1, 0] * mx + pose[1, 1] * my + pose[1, 2] * mz + pose[1, 3],
-        pose[2, 0] * mx + pose[2, 1] * my + pose[2, 2] * mz + pose[2, 3],
+        (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
+        (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
+        (pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]),
+    )
+
+
+@device
+def to_camera(pose: Pose, x: float, y: float, z: float) -> Triple:
+    """Returns a point in the camera's frame."""
+    return (
+        pose[0][0] * x + pose[0][1] * y + pose[0][2] * z + pose[0][3],
+        pose[1][0] * x + pose[1][1] * y + pose[1][2] * z + pose[1][3],
+        pose[2][0] * x + pose[2][1] * y + pose[2][2] * z + pose[2][3],
     )
 
 
 @device
 def unit_quaternion(
-    quats: NDArray[np.float32], i: int
+    w: float, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float]:
-    """Returns the quaternion wxyz of Gaussian i and the inverse of its norm (0 for a zero one)."""
-    w, x, y, z = (
-        np.float64(quats[i, 0]),
-        np.float64(quats[i, 1]),
-        np.float64(quats[i, 2]),
-        np.float64(quats[i, 3]),
-    )
+    """Returns the quaternion at unit length and the inverse of its norm (0 for a zero one)."""
     square = w * w + x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
 @device
-def rotation(w: float, x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
+def rotation(w: float, x: float, y: float, z: float) -> tuple[Triple, Triple, Triple]:
     """Returns the columns of the rotation matrix of a unit quaternion."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
@@ -108,27 +113,27 @@ def rotation(w: float, x: float, y: float, z: float) -> tuple[tuple[float, float
 
 @device
 def jacobian_rows(
-    camera: Pinhole, inverse_z: float, slope_x: float, slope_y: float
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    camera: Pinhole, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
+) -> tuple[Triple, Triple]:
     """Returns both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
     pose = camera.pose
     a, b = camera.fx * inverse_z, camera.fy * inverse_z
     return (
         (
-            a * (pose[0, 0] - slope_x * pose[2, 0]),
-            a * (pose[0, 1] - slope_x * pose[2, 1]),
-            a * (pose[0, 2] - slope_x * pose[2, 2]),
+            a * (pose[0][0] - slope_x * pose[2][0]),
+            a * (pose[0][1] - slope_x * pose[2][1]),
+            a * (pose[0][2] - slope_x * pose[2][2]),
         ),
         (
-            b * (pose[1, 0] - slope_y * pose[2, 0]),
-            b * (pose[1, 1] - slope_y * pose[2, 1]),
-            b * (pose[1, 2] - slope_y * pose[2, 2]),
+            b * (pose[1][0] - slope_y * pose[2][0]),
+            b * (pose[1][1] - slope_y * pose[2][1]),
+            b * (pose[1][2] - slope_y * pose[2][2]),
         ),
     )
 
 
 @device
-def dot(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+def dot(a: Triple, b: Triple) -> float:
     """Returns the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -140,27 +145,15 @@ def clamped(value: float, low: float, high: float) -> float:
 
 
 @device
-def axis_lengths(
-    row: tuple[float, float, float], columns: tuple[tuple[float, float, float], ...]
-) -> tuple[float, float, float]:
-    """Returns the image of the Gaussian's three unit axes under one row of the projection."""
+def in_axes(row: Triple, columns: tuple[Triple, Triple, Triple]) -> Triple:
+    """Returns one row of (projection x rotation): the images of the Gaussian's unit axes."""
     return dot(row, columns[0]), dot(row, columns[1]), dot(row, columns[2])
 
 
 @device
-def scaled_axes(
-    row: tuple[float, float, float],
-    columns: tuple[tuple[float, float, float], ...],
-    scales: NDArray[np.float32],
-    i: int,
-) -> tuple[float, float, float]:
-    """Returns one row of (projection x rotation x scale) of Gaussian i, pixels."""
-    p, q, r = axis_lengths(row, columns)
-    return (
-        p * np.float64(scales[i, 0]),
-        q * np.float64(scales[i, 1]),
-        r * np.float64(scales[i, 2]),
-    )
+def times(a: Triple, b: Triple) -> Triple:
+    """Returns the products, number by number."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @device
@@ -173,7 +166,7 @@ def opacity_factor(raw_det: float, det: float) -> float:
 
 @device
 def covariance(
-    m: tuple[float, float, float], n: tuple[float, float, float], dilation: float, antialiased: bool
+    m: Triple, n: Triple, dilation: float, antialiased: bool
 ) -> tuple[float, float, float, float, float]:
     """Returns A, B, C and the determinant of [m; n] [m; n]^T + dilation I, and its opacity factor.
 
@@ -186,7 +179,5 @@ def covariance(
         + (m[1] * n[2] - m[2] * n[1]) ** 2
     )
     det = raw_det + dilation * (raw_a + raw_c) + dilation * dilation
-    factor = 1.0
-    if antialiased:
-        factor = opacity_factor(raw_det, det)
+    factor = opacity_factor(raw_det, det) if antialiased else 1.0
     return raw_a + dilation, b, raw_c + dilation, det, factor

@@ -186,8 +186,8 @@ def _composite(
         end = min(entry + BATCH, stop)
         filled = 0
         for k in range(entry, end):
-            prefetch(records, np.intp(entries[min(k + BATCH, stop - 1)]) * RECORD)
-            record = np.intp(entries[k]) * RECORD
+            prefetch(records, np.intp(entries[min(k + BATCH, stop - 1), 0]) * RECORD)
+            record = np.intp(entries[k, 0]) * RECORD
             reached = live & fill_rows(
                 records, record, np.float32(left), np.float32(top), rows, filled * ROWS
             )
@@ -196,13 +196,13 @@ def _composite(
             # No branch: an entry that reaches nothing is overwritten by the next one.
             filled += np.intp(reached != np.uint64(0))
         for k in range(filled):
-            record = np.intp(entries[batch[k]]) * RECORD
+            record = np.intp(entries[batch[k], 0]) * RECORD
             reached = np.uint64(masks[batch[k]])
             pixels = _blend(
                 reached, records, record, rows, k * ROWS, state, constants, depth, counts
             )
             if counts is not None:
-                counts[batch[k]] = pixels
+                counts[entries[batch[k], 1]] = pixels
         live = _unfinished(state, live)
         entry = end
     _finish(state, top, left, background, image, alpha, depth)
@@ -227,14 +227,14 @@ def composite(
     Args:
         tiles: [T] every tile once.
         starts: [T + 1] first entry of each tile.
-        entries: [E] records of each tile, front to back.
+        entries: [E, 2] records and slots of each tile, front to back.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
         background: [3] RGB.
         image: [H, W, 3] written.
         alpha: [H, W] written.
         depth: [H, W] written, or None.
-        counts: [E] pixels blended per entry, written; zero before. None: not counted.
+        counts: [slots] pixels blended per slot, written; zero before. None: not counted.
         masks: [E] segments per entry, written; zero before.
     """
     for job in prange(tiles.shape[0]):

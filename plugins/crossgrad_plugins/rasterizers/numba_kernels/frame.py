@@ -126,16 +126,16 @@ class TileLists:
     Attributes:
         tiles: [T] int32, the order in which tiles are worked on.
         starts: [T + 1] int64, first entry of each tile.
-        entries: [E] int32, records.
+        entries: [E, 2] int32, records and slots.
         shelves: [N, SHELF] int32, the slots of each record.
-        entry_of_slot: [slots] int32.
+        slots: Number of slots.
     """
 
     tiles: Int32
     starts: Int64
     entries: Int32
     shelves: Int32
-    entry_of_slot: Int32
+    slots: int
 
 
 @dataclass(frozen=True)
@@ -202,9 +202,8 @@ def forward(
     image = np.empty((*shape, 3), np.float32)
     alpha = np.empty(shape, np.float32)
     depth = np.empty(shape, np.float32) if options.depth else None
-    entries = lists.entries.shape[0]
-    counts = np.zeros(entries, np.int32) if options.pixels else None
-    masks = np.zeros(entries, np.uint64)
+    counts = np.zeros(lists.slots, np.int32) if options.pixels else None
+    masks = np.zeros(lists.entries.shape[0], np.uint64)
     composite(
         lists.tiles,
         lists.starts,
@@ -225,7 +224,6 @@ def forward(
             projected.drawn,
             projected.owners,
             lists.shelves,
-            lists.entry_of_slot,
             counts,
             pixels,
         )
@@ -255,8 +253,9 @@ def backward(
         frame.projected,
         frame.lists,
     )
-    partials = np.empty((lists.entries.shape[0] + 1) * PARTIAL, np.float32)
+    partials = np.empty((lists.slots + 1) * PARTIAL, np.float32)
     partials[-PARTIAL:] = 0.0
+    written = np.zeros(lists.slots, np.uint8)
     differentiate(
         lists.tiles,
         lists.starts,
@@ -272,6 +271,7 @@ def backward(
         None if v_depth is None else np.ascontiguousarray(v_depth, np.float32),
         np.empty(0, np.float32) if absolute else None,
         partials,
+        written,
     )
     count = gaussians.means.shape[0]
     gradients = GaussianGradients(
@@ -297,8 +297,7 @@ def backward(
         projected.drawn,
         projected.owners,
         lists.shelves,
-        lists.entry_of_slot,
-        frame.masks,
+        written,
         partials,
         gradients.means,
         gradients.quats,
@@ -384,16 +383,15 @@ def _bin(
     items, keys, slots = collect(projected.drawn, room, depths, shelves)
     order = order_by_depth(keys, items)
     tile_of_slot = np.empty(slots, np.int32)
-    entry_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
     find_tiles(columns, projected.records, boxes, projected.drawn, shelves, tile_of_slot, counts)
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
-    entries = np.empty(int(starts[-1]), np.int32)
+    entries = np.empty((int(starts[-1]), 2), np.int32)
     fill_tiles(
-        order, columns, bands, shelves, tile_of_slot, starts, entries, entry_of_slot
+        order, columns, bands, shelves, tile_of_slot, starts, entries
     )
-    return TileLists(_tile_order(columns, rows), starts, entries, shelves, entry_of_slot)
+    return TileLists(_tile_order(columns, rows), starts, entries, shelves, slots)
 
 
 def _tile_order(columns: int, rows: int) -> Int32:

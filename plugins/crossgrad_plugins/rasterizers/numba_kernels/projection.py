@@ -11,14 +11,17 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     Pinhole,
     clamped,
     covariance,
+    in_axes,
+    in_registers,
     jacobian_rows,
     rotation,
-    scaled_axes,
+    times,
     to_camera,
     unit_quaternion,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    BLOCK,
     BLUE,
     CHUNK,
     DECAY,
@@ -39,6 +42,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_WHOLE,
     WIDTH,
 )
+
+# What is known of each Gaussian of a block, seen or not.
+_Z, _U, _V, _A, _B, _C, _DET, _FACTOR = range(8)
+_FOUND = 8
 
 _LEAST_OPACITY = 1.0 / 255.0
 _LARGEST_RADIUS = 2.0**30
@@ -107,52 +114,78 @@ def _hits(
 
 
 @device
-def _project_one(
-    i: int,
-    j: int,
+def _project_block(
+    count: int,
     camera: Pinhole,
-    near: float,
     dilation: float,
     antialiased: bool,
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
-    opacities: NDArray[np.float32],
+    found: NDArray[np.float64],
+) -> None:
+    """Projects the first `count` Gaussians, seen or not; no branches, so it is vectorised.
+
+    All arrays are flat: LLVM must see the strides.
+    """
+    pose = in_registers(camera.pose)
+    for k in range(count):
+        x, y, z = to_camera(
+            pose, np.float64(means[3 * k]), np.float64(means[3 * k + 1]), np.float64(means[3 * k + 2])
+        )
+        qw, qx, qy, qz, inverse_norm = unit_quaternion(
+            np.float64(quats[4 * k]),
+            np.float64(quats[4 * k + 1]),
+            np.float64(quats[4 * k + 2]),
+            np.float64(quats[4 * k + 3]),
+        )
+        scale = np.float64(scales[3 * k]), np.float64(scales[3 * k + 1]), np.float64(scales[3 * k + 2])
+        inverse_z = 1.0 / z
+        row_x, row_y = jacobian_rows(
+            camera,
+            pose,
+            inverse_z,
+            clamped(x * inverse_z, camera.left, camera.right),
+            clamped(y * inverse_z, camera.top, camera.bottom),
+        )
+        turned = rotation(qw, qx, qy, qz)
+        m = times(in_axes(row_x, turned), scale)
+        n = times(in_axes(row_y, turned), scale)
+        a, b, c, det, factor = covariance(m, n, dilation, antialiased)
+        found[_Z * BLOCK + k] = z
+        found[_U * BLOCK + k] = camera.fx * x * inverse_z + camera.cx
+        found[_V * BLOCK + k] = camera.fy * y * inverse_z + camera.cy
+        found[_A * BLOCK + k] = a
+        found[_B * BLOCK + k] = b
+        found[_C * BLOCK + k] = c
+        # Not positive for what cannot be drawn.
+        found[_DET * BLOCK + k] = det if inverse_norm > 0.0 else 0.0
+        found[_FACTOR * BLOCK + k] = factor
+
+
+@device
+def _record(
+    k: int,
+    j: int,
+    opacity: float,
+    width: int,
+    height: int,
+    found: NDArray[np.float64],
     records: NDArray[np.float32],
     depths: NDArray[np.float64],
     boxes: NDArray[np.int32],
 ) -> int:
-    """Projects Gaussian i into record j; returns its radius, 0 where it touches no pixel."""
-    opacity = np.float64(opacities[i])
-    if not (opacity >= _LEAST_OPACITY and opacity < math.inf):
-        return 0
-    x, y, z = to_camera(camera, means, i)
-    if not (z > near and z < math.inf):
-        return 0
-    qw, qx, qy, qz, inverse_norm = unit_quaternion(quats, i)
-    inverse_z = 1.0 / z
-    u = camera.fx * x * inverse_z + camera.cx
-    v = camera.fy * y * inverse_z + camera.cy
-    row_x, row_y = jacobian_rows(
-        camera,
-        inverse_z,
-        clamped(x * inverse_z, camera.left, camera.right),
-        clamped(y * inverse_z, camera.top, camera.bottom),
-    )
-    turned = rotation(qw, qx, qy, qz)
-    m = scaled_axes(row_x, turned, scales, i)
-    n = scaled_axes(row_y, turned, scales, i)
-    a, b, c, det, factor = covariance(m, n, dilation, antialiased)
+    """Makes record j of projected Gaussian k; returns its radius, 0 where it touches no pixel."""
+    u, v = found[_U * BLOCK + k], found[_V * BLOCK + k]
+    a, c, det = found[_A * BLOCK + k], found[_C * BLOCK + k], found[_DET * BLOCK + k]
     inverse_c = 1.0 / c
-    slope, variance = b * inverse_c, det * inverse_c
-    log_opacity = math.log2(opacity * factor)
+    slope, variance = found[_B * BLOCK + k] * inverse_c, det * inverse_c
+    log_opacity = math.log2(opacity * found[_FACTOR * BLOCK + k])
     reach = 2.0 / LOG2_E * (log_opacity - TOUCH)  # largest squared distance in standard deviations
     decay = 0.5 * LOG2_E / variance
     # The sums are NaN or infinite if any term is, and then fail the comparison.
     if not (
-        inverse_norm > 0.0
-        and det > 0.0
-        and variance > 0.0
+        det > 0.0
         and reach >= 0.0
         and a + c + det < math.inf
         and abs(u) + abs(v) + decay + inverse_c < _LARGEST
@@ -160,11 +193,11 @@ def _project_one(
     ):
         return 0
     extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
-    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, camera.width)
-    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, camera.height)
+    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, width)
+    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, height)
     if x0 > x1 or y0 > y1:
         return 0
-    if not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, camera.width):
+    if not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
         return 0
     at = j * RECORD
     records[at + U_WHOLE] = np.floor(u)
@@ -176,8 +209,8 @@ def _project_one(
     records[at + DECAY] = max(decay, _FLAT)
     records[at + WIDTH] = min(2.0 / LOG2_E * variance, 1.0 / _FLAT)
     records[at + LOG_OPACITY] = log_opacity
-    records[at + DEPTH] = z
-    depths[j] = z
+    records[at + DEPTH] = found[_Z * BLOCK + k]
+    depths[j] = found[_Z * BLOCK + k]
     boxes[j, 0] = np.int32(x0) // TILE_WIDTH
     boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
     boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
@@ -241,32 +274,41 @@ def project(
     """
     count = means.shape[0]
     for chunk in prange(drawn.shape[0]):
-        begin = chunk * CHUNK
-        j = begin
+        found = np.empty(_FOUND * BLOCK, np.float64)
+        first = chunk * CHUNK
+        j = first
         tiles = 0
-        for i in range(begin, min(begin + CHUNK, count)):
-            radius = _project_one(
-                i,
-                j,
+        for begin in range(first, min(first + CHUNK, count), BLOCK):
+            size = min(BLOCK, count - begin)
+            _project_block(
+                size,
                 camera,
-                near,
                 dilation,
                 antialiased,
-                means,
-                quats,
-                scales,
-                opacities,
-                records,
-                depths,
-                boxes,
+                means.reshape(-1)[3 * begin :],
+                quats.reshape(-1)[4 * begin :],
+                scales.reshape(-1)[3 * begin :],
+                found,
             )
-            if radius > 0 and colors is not None and not _tint(i, j, colors, records):
-                radius = 0
-            radii[i] = radius
-            if radius > 0:
+            for k in range(size):
+                i = begin + k
+                radii[i] = 0
+                opacity = np.float64(opacities[i])
+                if not (found[_Z * BLOCK + k] > near and found[_Z * BLOCK + k] < math.inf):
+                    continue
+                if not (opacity >= _LEAST_OPACITY and opacity < math.inf):
+                    continue
+                radius = _record(
+                    k, j, opacity, camera.width, camera.height, found, records, depths, boxes
+                )
+                if radius == 0:
+                    continue
+                if colors is not None and not _tint(i, j, colors, records):
+                    continue
+                radii[i] = radius
                 owners[j] = i
                 shelves[j, FIRST_SLOT] = tiles
                 tiles += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])
                 j += 1
-        drawn[chunk] = j - begin
+        drawn[chunk] = j - first
         room[chunk] = tiles

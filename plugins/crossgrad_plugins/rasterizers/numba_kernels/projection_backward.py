@@ -10,17 +10,22 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     LEAST_DET,
     Pinhole,
-    axis_lengths,
+    Row,
+    Triple,
     clamped,
     covariance,
     dot,
+    in_axes,
+    in_registers,
     jacobian_rows,
     rotation,
+    times,
     to_camera,
     unit_quaternion,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    BLOCK,
     CHUNK,
     PARTIAL,
     SUM_1,
@@ -38,24 +43,36 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
 
+# Rows of a block: the sums by their own numbers, what its Gaussians bring along, what is found.
+_MEAN = PARTIAL
+_QUAT = _MEAN + 3
+_SCALE = _QUAT + 4
+_V_MEAN = _SCALE + 3
+_V_QUAT = _V_MEAN + 3
+_V_SCALE = _V_QUAT + 4
+_V_CENTRE = _V_SCALE + 3
+_INVERSE_VARIANCE = _V_CENTRE + 2
+_ROWS = _INVERSE_VARIANCE + 1
+
+
 @device
 def _outer_sum(
-    a: tuple[float, float, float], p: float, b: tuple[float, float, float], q: float
-) -> tuple[float, float, float]:
+    a: Triple, p: float, b: Triple, q: float
+) -> Triple:
     """Returns a p + b q."""
     return a[0] * p + b[0] * q, a[1] * p + b[1] * q, a[2] * p + b[2] * q
 
 
 @device
 def _covariance_gradient(
-    b: float, c: float, det: float, sums: NDArray[np.float32]
-) -> tuple[float, float, float]:
+    b: float, c: float, det: float, sum_dd: float, sum_dy: float, sum_yy: float
+) -> Triple:
     """Returns the gradients of A, B (as one number) and C of the dilated covariance."""
     inverse_c = 1.0 / c
     slope, inverse_variance = b * inverse_c, c / det
-    v_variance = 0.5 * inverse_variance * inverse_variance * np.float64(sums[SUM_DD])
-    v_slope = inverse_variance * inverse_c * np.float64(sums[SUM_DY])
-    v_decay = 0.5 * inverse_c * inverse_c * np.float64(sums[SUM_YY])
+    v_variance = 0.5 * inverse_variance * inverse_variance * sum_dd
+    v_slope = inverse_variance * inverse_c * sum_dy
+    v_decay = 0.5 * inverse_c * inverse_c * sum_yy
     return (
         v_variance,
         v_slope - 2.0 * slope * v_variance,
@@ -65,22 +82,11 @@ def _covariance_gradient(
 
 @device
 def _factor_gradient(
-    m: tuple[float, float, float],
-    n: tuple[float, float, float],
-    dilation: float,
-    det: float,
-    factor: float,
-    v_log_factor: float,
-) -> tuple[float, float, float]:
+    m: Triple, n: Triple, dilation: float, det: float, factor: float, v_log_factor: float
+) -> Triple:
     """Returns what the antialiasing factor adds to the gradients of A, B and C."""
-    if factor <= 0.0:
-        return 0.0, 0.0, 0.0
     a, b, c = dot(m, m), dot(m, n), dot(n, n)
-    raw_det = (
-        (m[0] * n[1] - m[1] * n[0]) ** 2
-        + (m[0] * n[2] - m[2] * n[0]) ** 2
-        + (m[1] * n[2] - m[2] * n[1]) ** 2
-    )
+    raw_det = det - dilation * (a + c) - dilation * dilation
     # factor^2 = raw_det / (det + e) + e, so d(log factor) = d(factor^2) / (2 factor^2)
     v_square = 0.5 * v_log_factor / (factor * factor)
     v_raw_det = v_square / (det + LEAST_DET)
@@ -94,12 +100,12 @@ def _factor_gradient(
 
 @device
 def _turn_gradient(
-    q: tuple[float, float, float, float],
+    q: Row,
     inverse_norm: float,
-    x: tuple[float, float, float],
-    y: tuple[float, float, float],
-    z: tuple[float, float, float],
-) -> tuple[float, float, float, float]:
+    x: Triple,
+    y: Triple,
+    z: Triple,
+) -> Row:
     """Returns the gradient of a quaternion, given those of its rotation matrix' columns."""
     w, a, b, c = q
     v_w = 2.0 * (a * (y[2] - z[1]) + b * (z[0] - x[2]) + c * (x[1] - y[0]))
@@ -123,8 +129,8 @@ def _turn_gradient(
 
 @device
 def _weighted(
-    columns: tuple[tuple[float, float, float], ...], weights: tuple[float, float, float]
-) -> tuple[float, float, float]:
+    columns: tuple[Triple, Triple, Triple], weights: Triple
+) -> Triple:
     """Returns the sum of the three columns times their weights."""
     a, b, c = columns
     p, q, r = weights
@@ -136,94 +142,100 @@ def _weighted(
 
 
 @device
-def _unproject_one(
-    i: int,
+def _unproject_block(
+    count: int,
     camera: Pinhole,
     dilation: float,
     antialiased: bool,
+    block: NDArray[np.float64],
+) -> None:
+    """Finds the gradients of `count` Gaussians; no branches on them, so it is vectorised."""
+    pose = in_registers(camera.pose)
+    pose_z = (pose[2][0], pose[2][1], pose[2][2])
+    for k in range(count):
+        x, y, z = to_camera(pose, block[_MEAN * BLOCK + k], block[(_MEAN + 1) * BLOCK + k], block[(_MEAN + 2) * BLOCK + k])
+        qw, qx, qy, qz, inverse_norm = unit_quaternion(
+            block[_QUAT * BLOCK + k], block[(_QUAT + 1) * BLOCK + k], block[(_QUAT + 2) * BLOCK + k], block[(_QUAT + 3) * BLOCK + k]
+        )
+        scale = block[_SCALE * BLOCK + k], block[(_SCALE + 1) * BLOCK + k], block[(_SCALE + 2) * BLOCK + k]
+        inverse_z = 1.0 / z
+        ratio_x, ratio_y = x * inverse_z, y * inverse_z
+        slope_x = clamped(ratio_x, camera.left, camera.right)
+        slope_y = clamped(ratio_y, camera.top, camera.bottom)
+        row_x, row_y = jacobian_rows(camera, pose, inverse_z, slope_x, slope_y)
+        columns = rotation(qw, qx, qy, qz)
+        p, q = in_axes(row_x, columns), in_axes(row_y, columns)
+        m, n = times(p, scale), times(q, scale)
+        _, b, c, det, factor = covariance(m, n, dilation, antialiased)
+
+        v_a, v_b, v_c = _covariance_gradient(
+            b, c, det, block[SUM_DD * BLOCK + k], block[SUM_DY * BLOCK + k], block[SUM_YY * BLOCK + k]
+        )
+        if antialiased:
+            add_a, add_b, add_c = _factor_gradient(m, n, dilation, det, factor, block[SUM_1 * BLOCK + k])
+            v_a += add_a
+            v_b += add_b
+            v_c += add_c
+        v_m = _outer_sum(m, 2.0 * v_a, n, v_b)
+        v_n = _outer_sum(n, 2.0 * v_c, m, v_b)
+        v_p, v_q = times(v_m, scale), times(v_n, scale)
+        block[_V_SCALE * BLOCK + k] = v_m[0] * p[0] + v_n[0] * q[0]
+        block[(_V_SCALE + 1) * BLOCK + k] = v_m[1] * p[1] + v_n[1] * q[1]
+        block[(_V_SCALE + 2) * BLOCK + k] = v_m[2] * p[2] + v_n[2] * q[2]
+        v_quat = _turn_gradient(
+            (qw, qx, qy, qz),
+            inverse_norm,
+            _outer_sum(row_x, v_p[0], row_y, v_q[0]),
+            _outer_sum(row_x, v_p[1], row_y, v_q[1]),
+            _outer_sum(row_x, v_p[2], row_y, v_q[2]),
+        )
+        block[_V_QUAT * BLOCK + k] = v_quat[0]
+        block[(_V_QUAT + 1) * BLOCK + k] = v_quat[1]
+        block[(_V_QUAT + 2) * BLOCK + k] = v_quat[2]
+        block[(_V_QUAT + 3) * BLOCK + k] = v_quat[3]
+
+        inverse_det = 1.0 / det
+        v_u = c * inverse_det * block[SUM_D * BLOCK + k]
+        v_v = block[SUM_Y * BLOCK + k] / c - b * inverse_det * block[SUM_D * BLOCK + k]
+        block[_V_CENTRE * BLOCK + k] = v_u
+        block[(_V_CENTRE + 1) * BLOCK + k] = v_v
+        block[_INVERSE_VARIANCE * BLOCK + k] = c * inverse_det
+
+        # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
+        v_row_x, v_row_y = _weighted(columns, v_p), _weighted(columns, v_q)
+        v_slope_x = -camera.fx * inverse_z * dot(pose_z, v_row_x)
+        v_slope_y = -camera.fy * inverse_z * dot(pose_z, v_row_y)
+        # u = fx x / z + cx; the Jacobian's slope is x / z only inside its bounds
+        v_ratio_x = camera.fx * v_u + (v_slope_x if slope_x == ratio_x else 0.0)
+        v_ratio_y = camera.fy * v_v + (v_slope_y if slope_y == ratio_y else 0.0)
+        v_inverse_z = z * (dot(row_x, v_row_x) + dot(row_y, v_row_y))
+        v_inverse_z += v_ratio_x * x + v_ratio_y * y
+        v_x, v_y = v_ratio_x * inverse_z, v_ratio_y * inverse_z
+        v_z = block[SUM_DEPTH * BLOCK + k] - inverse_z * inverse_z * v_inverse_z
+        block[_V_MEAN * BLOCK + k] = pose[0][0] * v_x + pose[1][0] * v_y + pose[2][0] * v_z
+        block[(_V_MEAN + 1) * BLOCK + k] = pose[0][1] * v_x + pose[1][1] * v_y + pose[2][1] * v_z
+        block[(_V_MEAN + 2) * BLOCK + k] = pose[0][2] * v_x + pose[1][2] * v_y + pose[2][2] * v_z
+
+
+@device
+def _bring(
+    i: int,
+    k: int,
+    used: int,
+    sums: NDArray[np.float32],
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
-    opacities: NDArray[np.float32],
-    sums: NDArray[np.float32],
-    v_depth: float,
-    v_means: NDArray[np.float32],
-    v_quats: NDArray[np.float32],
-    v_scales: NDArray[np.float32],
-    v_opacities: NDArray[np.float32],
-    v_centres: NDArray[np.float32],
-    v_absolute: NDArray[np.float32],
+    block: NDArray[np.float64],
 ) -> None:
-    """Writes the gradients of Gaussian i, given its sums over all pixels."""
-    x, y, z = to_camera(camera, means, i)
-    qw, qx, qy, qz, inverse_norm = unit_quaternion(quats, i)
-    inverse_z = 1.0 / z
-    ratio_x, ratio_y = x * inverse_z, y * inverse_z
-    slope_x = clamped(ratio_x, camera.left, camera.right)
-    slope_y = clamped(ratio_y, camera.top, camera.bottom)
-    row_x, row_y = jacobian_rows(camera, inverse_z, slope_x, slope_y)
-    columns = rotation(qw, qx, qy, qz)
-    p, q = axis_lengths(row_x, columns), axis_lengths(row_y, columns)
-    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-    m = (p[0] * s0, p[1] * s1, p[2] * s2)
-    n = (q[0] * s0, q[1] * s1, q[2] * s2)
-    _, b, c, det, factor = covariance(m, n, dilation, antialiased)
-
-    v_a, v_b, v_c = _covariance_gradient(b, c, det, sums)
-    if antialiased:
-        add_a, add_b, add_c = _factor_gradient(m, n, dilation, det, factor, np.float64(sums[SUM_1]))
-        v_a += add_a
-        v_b += add_b
-        v_c += add_c
-    v_m = _outer_sum(m, 2.0 * v_a, n, v_b)
-    v_n = _outer_sum(n, 2.0 * v_c, m, v_b)
-    v_scales[i, 0] = v_m[0] * p[0] + v_n[0] * q[0]
-    v_scales[i, 1] = v_m[1] * p[1] + v_n[1] * q[1]
-    v_scales[i, 2] = v_m[2] * p[2] + v_n[2] * q[2]
-    v_p = (v_m[0] * s0, v_m[1] * s1, v_m[2] * s2)
-    v_q = (v_n[0] * s0, v_n[1] * s1, v_n[2] * s2)
-    v_quat = _turn_gradient(
-        (qw, qx, qy, qz),
-        inverse_norm,
-        _outer_sum(row_x, v_p[0], row_y, v_q[0]),
-        _outer_sum(row_x, v_p[1], row_y, v_q[1]),
-        _outer_sum(row_x, v_p[2], row_y, v_q[2]),
-    )
-    v_quats[i, 0], v_quats[i, 1], v_quats[i, 2], v_quats[i, 3] = v_quat
-
-    inverse_det = 1.0 / det
-    sum_d = np.float64(sums[SUM_D])
-    v_u = c * inverse_det * sum_d
-    v_v = np.float64(sums[SUM_Y]) / c - b * inverse_det * sum_d
-    v_centres[i, 0] = v_u
-    v_centres[i, 1] = v_v
-    if v_absolute.shape[0] > 0:
-        # The sums are in units of the records' decays, log2(e) / 2 of the inverse variances.
-        v_absolute[i, 0] = c * inverse_det * np.float64(sums[SUM_ABS_X])
-        v_absolute[i, 1] = 2.0 * math.log(2.0) * np.float64(sums[SUM_ABS_Y])
-
-    # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
-    pose = camera.pose
-    v_row_x = _weighted(columns, v_p)
-    v_row_y = _weighted(columns, v_q)
-    pose_z = (pose[2, 0], pose[2, 1], pose[2, 2])
-    v_inverse_z = z * (dot(row_x, v_row_x) + dot(row_y, v_row_y))
-    v_slope_x = -camera.fx * inverse_z * dot(pose_z, v_row_x)
-    v_slope_y = -camera.fy * inverse_z * dot(pose_z, v_row_y)
-    # u = fx x / z + cx; the Jacobian's slope is x / z only inside its bounds
-    v_ratio_x = camera.fx * v_u
-    v_ratio_y = camera.fy * v_v
-    if slope_x == ratio_x:
-        v_ratio_x += v_slope_x
-    if slope_y == ratio_y:
-        v_ratio_y += v_slope_y
-    v_x = v_ratio_x * inverse_z
-    v_y = v_ratio_y * inverse_z
-    v_inverse_z += v_ratio_x * x + v_ratio_y * y
-    v_z = v_depth - inverse_z * inverse_z * v_inverse_z
-    for k in range(3):
-        v_means[i, k] = pose[0, k] * v_x + pose[1, k] * v_y + pose[2, k] * v_z
-    v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
+    """Puts the first `used` sums and the parameters of Gaussian i into place k of a block."""
+    for number in range(SUM_DEPTH + 1):
+        block[number * BLOCK + k] = sums[number] if number < used else 0.0
+    for axis in range(3):
+        block[(_MEAN + axis) * BLOCK + k] = means[i, axis]
+        block[(_SCALE + axis) * BLOCK + k] = scales[i, axis]
+    for axis in range(4):
+        block[(_QUAT + axis) * BLOCK + k] = quats[i, axis]
 
 
 @parallel_kernel
@@ -239,8 +251,7 @@ def unproject(
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
     shelves: NDArray[np.int32],
-    entry_of_slot: NDArray[np.int32],
-    masks: NDArray[np.uint64],
+    written: NDArray[np.uint8],
     partials: NDArray[np.float32],
     v_means: NDArray[np.float32],
     v_quats: NDArray[np.float32],
@@ -257,9 +268,9 @@ def unproject(
         with_depth: Whether the partial sums hold gradients of the depth.
         means, quats, scales, opacities: As in `project`.
         drawn, owners: From `project`.
-        shelves, entry_of_slot: From binning.
-        masks: [E] from compositing.
-        partials: [(E + 1) * PARTIAL] from `differentiate`, the last row zero.
+        shelves: From binning.
+        written: [slots] from `differentiate`.
+        partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
         v_means: [N, 3] written for Gaussians with entries, zero before; and so on:
         v_quats: [N, 4].
         v_scales: [N, 3].
@@ -268,34 +279,42 @@ def unproject(
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
+    used = SUM_DEPTH + 1 if with_depth else SUM_DEPTH
     for chunk in prange(drawn.shape[0]):
         sums = np.empty(PARTIAL, np.float32)
-        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-            first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
-            if not add_up(first, count, entry_of_slot, masks, partials, sums):
-                continue
-            i = np.intp(owners[j])
-            v_colors[i, 0] = sums[SUM_RED]
-            v_colors[i, 1] = sums[SUM_GREEN]
-            v_colors[i, 2] = sums[SUM_BLUE]
-            v_depth = 0.0
-            if with_depth:
-                v_depth = np.float64(sums[SUM_DEPTH])
-            _unproject_one(
-                i,
-                camera,
-                dilation,
-                antialiased,
-                means,
-                quats,
-                scales,
-                opacities,
-                sums,
-                v_depth,
-                v_means,
-                v_quats,
-                v_scales,
-                v_opacities,
-                v_centres,
-                v_absolute,
-            )
+        block = np.empty(_ROWS * BLOCK, np.float64)
+        numbers = np.empty(BLOCK, np.int64)
+        begin = chunk * CHUNK
+        j = begin
+        while j < begin + drawn[chunk]:
+            size = 0
+            while size < BLOCK and j < begin + drawn[chunk]:
+                first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
+                i = np.intp(owners[j])
+                j += 1
+                if not add_up(first, count, written, partials, sums):
+                    continue
+                v_colors[i, 0] = sums[SUM_RED]
+                v_colors[i, 1] = sums[SUM_GREEN]
+                v_colors[i, 2] = sums[SUM_BLUE]
+                v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
+                if v_absolute.shape[0] > 0:
+                    v_absolute[i, 0] = sums[SUM_ABS_X]
+                    v_absolute[i, 1] = sums[SUM_ABS_Y]
+                _bring(i, size, used, sums, means, quats, scales, block)
+                numbers[size] = i
+                size += 1
+            _unproject_block(size, camera, dilation, antialiased, block)
+            for k in range(size):
+                i = numbers[k]
+                for axis in range(3):
+                    v_means[i, axis] = block[(_V_MEAN + axis) * BLOCK + k]
+                    v_scales[i, axis] = block[(_V_SCALE + axis) * BLOCK + k]
+                for axis in range(4):
+                    v_quats[i, axis] = block[(_V_QUAT + axis) * BLOCK + k]
+                for axis in range(2):
+                    v_centres[i, axis] = block[(_V_CENTRE + axis) * BLOCK + k]
+                if v_absolute.shape[0] > 0:
+                    # In the sums' units, the decays of the records.
+                    v_absolute[i, 0] *= block[_INVERSE_VARIANCE * BLOCK + k]
+                    v_absolute[i, 1] *= 2.0 * math.log(2.0)

@@ -7,39 +7,29 @@ from numpy.typing import NDArray
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
-from crossgrad_plugins.rasterizers.numba_kernels.simd import LANES, load, prefetch, splat, store
-
-#: Slots ahead for which memory is asked.
-_AHEAD = 24
+from crossgrad_plugins.rasterizers.numba_kernels.simd import LANES, load, splat, store
 
 
 @device
 def add_up(
     first: int,
     count: int,
-    entry_of_slot: NDArray[np.int32],
-    masks: NDArray[np.uint64],
+    written: NDArray[np.uint8],
     partials: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> bool:
-    """Adds up the sums of one record's entries; returns whether there were any.
+    """Adds up the rows of a record's slots that were written; returns whether there were any.
 
     `partials` ends with a row of zeros.
     """
-    zeros = masks.shape[0]
+    zeros = written.shape[0]
     low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
     found = False
     for slot in range(first, first + count):
-        ahead = np.intp(entry_of_slot[min(slot + _AHEAD, entry_of_slot.shape[0] - 1)])
-        prefetch(masks, ahead)
-        prefetch(partials, ahead * PARTIAL)
-        entry = np.intp(entry_of_slot[slot])
-        blended = masks[entry] != 0
-        # Rows of entries without a mask were never written.
-        row = (entry if blended else zeros) * PARTIAL
-        found |= blended
-        low = low + load(partials, row)
-        high = high + load(partials, row + LANES)
+        row = slot if written[slot] else zeros
+        found |= row == slot
+        low = low + load(partials, row * PARTIAL)
+        high = high + load(partials, row * PARTIAL + LANES)
     store(sums, 0, low)
     store(sums, LANES, high)
     return found
@@ -50,7 +40,6 @@ def count_pixels(
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
     shelves: NDArray[np.int32],
-    entry_of_slot: NDArray[np.int32],
     counts: NDArray[np.int32],
     pixels: NDArray[np.int32],
 ) -> None:
@@ -58,8 +47,8 @@ def count_pixels(
 
     Args:
         drawn, owners: From `project`.
-        shelves, entry_of_slot: From binning.
-        counts: [E] pixels per entry.
+        shelves: From binning.
+        counts: [slots] pixels per slot.
         pixels: [N] written for the Gaussians drawn; zero before.
     """
     for chunk in prange(drawn.shape[0]):
@@ -67,5 +56,5 @@ def count_pixels(
             first = np.intp(shelves[j, FIRST_SLOT])
             total = 0
             for slot in range(first, first + shelves[j, SLOTS]):
-                total += counts[entry_of_slot[slot]]
+                total += counts[slot]
             pixels[owners[j]] = total

@@ -169,17 +169,30 @@ def broadcast(typing_context: Any, array: Any, index: Any) -> Any:
     return _lanes(array, types.intp), emit
 
 
+def _prefetch(context: Any, builder: Any, signature: Any, args: Any, write: int) -> Any:
+    data = context.make_array(signature.args[0])(context, builder, args[0]).data
+    pointer = builder.bitcast(builder.gep(data, [args[1]]), _BYTE.as_pointer())
+    # Keep in all levels of the cache; data, not instructions.
+    _llvm(builder, "llvm.prefetch.p0", ir.VoidType(), (pointer, _INT(write), _INT(3), _INT(1)))
+    return context.get_dummy_value()
+
+
 @intrinsic
 def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     """Asks for the cache line of an element to be brought near."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        pointer = builder.bitcast(builder.gep(data, [args[1]]), _BYTE.as_pointer())
-        # Read, keep in all levels, data (not instructions).
-        options = (_INT(0), _INT(3), _INT(1))
-        _llvm(builder, "llvm.prefetch.p0", ir.VoidType(), (pointer, *options))
-        return context.get_dummy_value()
+        return _prefetch(context, builder, signature, args, 0)
+
+    return types.void(array, types.intp), emit
+
+
+@intrinsic
+def prefetch_write(typing_context: Any, array: Any, index: Any) -> Any:
+    """As `prefetch`, for an element that will be written."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _prefetch(context, builder, signature, args, 1)
 
     return types.void(array, types.intp), emit
 

@@ -169,6 +169,8 @@ def unshade(
         basis = np.empty(BASIS, np.float64)
         v_basis = np.empty(BASIS, np.float64)
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            if records[j * RECORD + LOG_OPACITY] == -math.inf:
+                continue
             i = np.intp(owners[j])
             x, y, z, inverse = _direction(means, i, eye)
             _basis(degree, x, y, z, basis)

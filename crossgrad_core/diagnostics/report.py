@@ -1,0 +1,150 @@
+"""The results of diagnostics: CSV files, a picture, and a few lines for the terminal."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isnan
+from pathlib import Path
+
+from crossgrad_core.diagnostics.table import ALL, Row, rows_of
+from crossgrad_core.files import write_atomically
+
+PROBES = "diagnostics.csv"
+CAMERAS = "cameras.csv"
+GROUPINGS = "groupings.csv"
+PICTURE = "diagnostics.png"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that was found out.
+
+    Attributes:
+        scene: Name of the scene.
+        title: Scene and model.
+        probes: Rows of `table`, all probes one after the other.
+        cameras: Rows of `camera_rows`.
+        groupings: Rows of `grouping_rows`, for the last probe.
+        notes: What the reader should know.
+    """
+
+    scene: str
+    title: str
+    probes: Sequence[Row]
+    cameras: Sequence[Row]
+    groupings: Sequence[Row]
+    notes: Sequence[str] = ()
+
+    def write(self, folder: Path) -> None:
+        """Writes the CSV files and the picture.
+
+        Raises:
+            UserError: The disk is full, or the folder is read-only.
+        """
+        from crossgrad_core.diagnostics.figure import draw
+
+        write_csv(folder / PROBES, self.probes)
+        write_csv(folder / CAMERAS, self.cameras)
+        write_csv(folder / GROUPINGS, self.groupings)
+        write_atomically(folder / PICTURE, draw(self.title, self.probes, self.cameras))
+
+    def lines(self) -> list[str]:
+        """The report for a terminal."""
+        return [self.title, *self.notes, "", *_camera_lines(self.cameras), "", *self._blocks()]
+
+    def _blocks(self) -> list[str]:
+        last = max(int(row["step"]) for row in self.probes)
+        now = [row for row in self.probes if row["step"] == last]
+        first = now[0]
+        lines = [
+            f"step {last}, {first['near_views']} near and {first['far_views']} far views by "
+            f"grouping {first['grouping']}; intervals 95 %"
+        ]
+        for metric in dict.fromkeys(str(row["metric"]) for row in now):
+            lines += ["", f"{metric} metric", _HEADER]
+            lines += [_block_line(row) for row in rows_of(now, metric)]
+        return lines
+
+
+_HEADER = (
+    f"{'block':<16}{'conflict':>9}{'near/far':>9}{'sigma_b2/sigma_w2':>26}"
+    f"{'noise scale':>13}{'exponent':>22}"
+)
+
+
+def _block_line(row: Row) -> str:
+    conflict = _figure(100.0 * float(row["conflict_rate"]), ".0f") + " %"
+    rho = _with_interval(row, "rho", ".2f")
+    exponent = _with_interval(row, "exponent_radial", ".1f")
+    name = str(row["block"])
+    return (
+        f"{name if name != ALL else '(all)':<16}{conflict:>9}"
+        f"{_figure(float(row['ratio_of_means']), '.2f'):>9}{rho:>26}"
+        f"{_figure(float(row['noise_scale']), '.3g'):>13}{exponent:>22}"
+    )
+
+
+def _with_interval(row: Row, name: str, form: str) -> str:
+    low, high = float(row[f"{name}_low"]), float(row[f"{name}_high"])
+    ends = "" if isnan(low) else f" [{_figure(low, form)}, {_figure(high, form)}]"
+    return _figure(float(row[name]), form) + ends
+
+
+def _camera_lines(rows: Sequence[Row]) -> list[str]:
+    lines = ["Sarle's bimodality (finite-sample, population form; uniform 0.56, normal 0.33)"]
+    for row in rows:
+        figures = (
+            f"{_figure(float(row['bimodality_sample']), '.3f')}, "
+            f"{_figure(float(row['bimodality_population']), '.3f')}, n = {row['views']}"
+        )
+        variance = float(row["relative_variance"])
+        spread = "" if isnan(variance) else f"; Var(r)/mean(r)^2 = {variance:.3g}"
+        note = f" ({row['note']})" if row["note"] else ""
+        lines.append(f"  {row['quantity']}: {figures}{spread}{note}")
+    return lines
+
+
+def _figure(value: float, form: str) -> str:
+    # Adding zero after rounding turns -0.00 into 0.00.
+    return "-" if isnan(value) else format(float(format(value, form)) + 0.0, form)
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Writes rows with the union of their columns; a figure that is NaN is left empty.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
+    """
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: _cell(value) for name, value in row.items()})
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_csv(path: Path) -> list[Row]:
+    """Rows that `write_csv` wrote, empty cells as NaN; none where there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{name: _value(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+
+
+def _cell(value: float | str) -> str:
+    if isinstance(value, float):
+        return "" if isnan(value) else f"{value:.9g}"
+    return str(value)
+
+
+def _value(cell: str) -> str | int | float:
+    if cell == "":
+        return float("nan")
+    for convert in (int, float):
+        try:
+            return convert(cell)
+        except ValueError:
+            continue
+    return cell

@@ -1,0 +1,91 @@
+"""Notes on what was done to the photos of a scene."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from crossgrad_core.scene.decode import RESIZE_FILTER
+from crossgrad_core.scene.headers import PhotoHeader
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.photos import PhotoSource
+from crossgrad_core.scene.wording import count, name_some
+
+_MIB = 2**20
+_SHOWN_SIZES = 3
+
+Sources = Mapping[str, PhotoSource]
+
+
+def note_pairing(folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str]) -> list[str]:
+    """Posed images without a photo, photos without a pose, and pairs that differ in spelling."""
+    absent = [name for name in names if name not in paths]
+    spare = folder.others(paths.values())
+    renamed = [name for name, path in paths.items() if path != folder.path / name]
+    told = (
+        (absent, "posed image", "left out, the photo is missing"),
+        (spare, "photo", "without a pose left out"),
+        (renamed, "photo", "paired by a name that differs in suffix or case"),
+    )
+    return [
+        f"photos: {count(len(which), noun)} {what}: {name_some(which)}"
+        for which, noun, what in told
+        if which
+    ]
+
+
+def note_undistortion(sources: Sources) -> list[str]:
+    """How many photos are undistorted, from which camera models."""
+    models = Counter(s.distorted.model for s in sources.values() if s.distorted is not None)
+    if not models:
+        return []
+    kinds = ", ".join(f"{number} {model}" for model, number in sorted(models.items()))
+    total = count(models.total(), "photo")
+    return [f"photos: {total} undistorted to PINHOLE with pycolmap ({kinds})"]
+
+
+def note_sizes(
+    folder: str, sources: Sources, calibrated: Mapping[str, tuple[int, int]]
+) -> list[str]:
+    """Sizes as trained, the folder that they come from, and the resize filter."""
+    sizes = Counter(source.target for source in sources.values()).most_common()
+    shown = [f"{width} x {height} px ({number})" for (width, height), number in sizes]
+    text = ", ".join(shown[:_SHOWN_SIZES])
+    if len(shown) > _SHOWN_SIZES:
+        text += f" and {len(shown) - _SHOWN_SIZES} more sizes"
+    resized = sum(source.target != source.undistorted_size for source in sources.values())
+    how = f"{resized} resized ({RESIZE_FILTER})" if resized else "not resized"
+    notes = [f"photos: {text} from {folder}/, {how}"]
+    scaled = sum(calibrated[n] != (s.width, s.height) for n, s in sources.items())
+    if scaled:
+        notes.append(f"photos: {scaled} of another size than their camera, which was scaled")
+    return notes
+
+
+def note_kinds(
+    sources: Sources,
+    headers: Mapping[str, PhotoHeader],
+    background: tuple[float, float, float] | None,
+) -> list[str]:
+    """Turned, transparent, grey and masked photos."""
+    total = len(sources)
+    over = f"blended over RGB {background}" if background else "alpha < 0.5 does not count"
+    told = (
+        (sum(s.orientation != 1 for s in sources.values()), "photos", "turned by EXIF orientation"),
+        (sum(header.alpha for header in headers.values()), "photos", f"with transparency: {over}"),
+        (sum(header.grey for header in headers.values()), "photos", "grey: three equal channels"),
+        (sum(s.mask is not None for s in sources.values()), "masks", "have one: white counts"),
+    )
+    return [f"{topic}: {number} of {total} {what}" for number, topic, what in told if number]
+
+
+def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
+    """Says so when the decoded photos do not fit into the memory set aside for them."""
+    need = sum(3 * s.target[0] * s.target[1] for s in sources.values()) / _MIB
+    if need <= options.cache_mib:
+        return []
+    return [
+        f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
+        "others are decoded again whenever they are drawn (more memory: cache_mib; smaller photos: "
+        "max_size or a folder of reduced photos)"
+    ]

@@ -1,0 +1,122 @@
+"""Reads COLMAP scenes: `images/` and `sparse/0/`, binary or text."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.reader import Reader
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.types import Scene
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import (
+    check_scene_folder,
+    choose_model,
+    find_models,
+)
+from crossgrad_plugins.readers._colmap_model import ColmapImage, ColmapModel, read_model
+
+
+class ColmapReader(Reader):
+    """COLMAP scenes (https://colmap.github.io/format.html), with any perspective camera model.
+
+    Photos are paired with poses by their path below the image folder. Where several models are
+    there, the one with most registered images is taken.
+    """
+
+    images: str = Field("images", description="folder of the photos within the scene")
+    model: str | None = Field(
+        None, description="folder of the model within the scene, such as sparse/1"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        try:
+            return bool(find_models(path))
+        except OSError:
+            return False
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        folder, notes = choose_model(path, self.model)
+        model = read_model(folder)
+        form = "binary" if (folder / "cameras.bin").is_file() else "text"
+        notes.append(
+            f"COLMAP: {count(len(model.images), 'posed image')}, "
+            f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
+            f"{folder.relative_to(path)} ({form})"
+        )
+        raw = RawScene(
+            root=path,
+            images=path / self.images,
+            views=_make_views(model, folder),
+            points=model.points,
+            point_colors=model.colors,
+            notes=tuple(notes),
+        )
+        return build_scene(raw, options)
+
+
+def _make_views(model: ColmapModel, folder: Path) -> tuple[RawView, ...]:
+    order = np.argsort(model.point_ids, kind="stable")
+    ids = model.point_ids[order]
+    return tuple(
+        RawView(
+            name=image.name.replace("\\", "/").removeprefix("./"),
+            calibration=model.cameras[_checked_camera(image, model, folder)],
+            world_to_camera=_make_pose(image, folder),
+            seen=_find_rows(image.points, ids, order),
+        )
+        for image in model.images
+    )
+
+
+def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int:
+    if image.camera in model.cameras:
+        return image.camera
+    raise UserError(
+        f"image {image.name} has no camera",
+        where=folder,
+        expected=f"one of {sorted(model.cameras)[:10]}",
+        found=f"camera id {image.camera}",
+        todo="cameras and images must be of one model: export it again",
+    )
+
+
+def _find_rows(
+    points: NDArray[np.uint64], ids: NDArray[np.uint64], order: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Rows of the points with these ids; ids that the model has no point for are left out."""
+    if not len(ids):
+        return np.zeros(0, dtype=np.int64)
+    # Sorted needles are found many times faster than scattered ones.
+    points = np.sort(points)
+    place = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
+    return np.asarray(order[place[ids[place] == points]], dtype=np.int64)
+
+
+def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
+    """[4, 4] world to camera."""
+    length = float(np.linalg.norm(image.quaternion))
+    if not np.isfinite(length) or length == 0 or not np.isfinite(image.translation).all():
+        raise UserError(
+            "a pose is not finite",
+            where=f"{folder}: image {image.name}",
+            found=f"quaternion {image.quaternion.tolist()}, shift {image.translation.tolist()}",
+            todo="remove the image from the model, or estimate the poses again",
+        )
+    w, x, y, z = image.quaternion / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = image.translation
+    return pose

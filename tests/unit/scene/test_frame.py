@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from crossgrad_core.scene.frame import camera_centers, make_frame
+
+RNG = np.random.default_rng(3)
+CENTERS = RNG.normal(size=(20, 3)) * [30, 20, 5]
+POINTS = RNG.normal(size=(2000, 3)) * [60, 60, 8]
+
+
+def test_unit_is_the_extent_of_the_training_cameras():
+    centers = np.array([[1.0, 0, 0], [3.0, 0, 0], [2.0, 2, 0], [2.0, -2, 0]])
+    frame = make_frame(centers, POINTS)
+    np.testing.assert_allclose(frame.similarity.offset, [2, 0, 0])
+    assert 1 / frame.similarity.scale == pytest.approx(1.1 * 2)
+
+
+def test_points_come_back_through_the_similarity():
+    frame = make_frame(CENTERS, POINTS)
+    back = frame.similarity.to_input(frame.points(POINTS))
+    extent = 1 / frame.similarity.scale
+    np.testing.assert_allclose(back, POINTS, rtol=0, atol=extent * 2.0**-31 * 1.01)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 0.001, 7.3e-5])
+def test_scaling_the_input_changes_nearly_no_bit(factor):
+    reference = make_frame(CENTERS, POINTS).points(POINTS)
+    scaled = make_frame(CENTERS * factor, POINTS * factor).points(POINTS * factor)
+    assert np.mean(scaled == reference) > 0.999
+    np.testing.assert_allclose(scaled, reference, rtol=0, atol=2.0**-30)
+
+
+def test_moving_the_input_by_a_million_changes_few_bits_and_no_value():
+    move = np.array([5e5, 4e6, 1e6])
+    reference = make_frame(CENTERS, POINTS).points(POINTS)
+    moved = make_frame(CENTERS + move, POINTS + move).points(POINTS + move)
+    assert np.mean(moved.astype(np.float32) == reference.astype(np.float32)) > 0.99
+    np.testing.assert_allclose(moved, reference, rtol=0, atol=3e-9)
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-9])
+def test_cameras_in_one_place_take_their_distance_to_the_points(spread):
+    centers = np.array([4e6, 5e5, 100]) + spread * CENTERS
+    points = centers[0] + 7 * POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
+    frame = make_frame(centers, points)
+    assert 1 / frame.similarity.scale == pytest.approx(7, rel=1e-6)
+    assert "median distance to the SfM points" in frame.note
+
+
+def test_one_camera_without_points_keeps_the_unit_of_the_input():
+    frame = make_frame(CENTERS[:1], np.zeros((0, 3)))
+    assert frame.similarity.scale == 1
+    np.testing.assert_array_equal(frame.similarity.offset, CENTERS[0])
+
+
+def test_pose_keeps_its_rotation_and_moves_its_centre():
+    pose = np.eye(4)
+    pose[:3, :3] = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+    pose[:3, 3] = [1, 2, 3]
+    frame = make_frame(CENTERS, POINTS)
+    local = frame.pose(pose)
+    np.testing.assert_array_equal(local[:3, :3], pose[:3, :3])
+    center = camera_centers(pose[None])
+    np.testing.assert_allclose(
+        camera_centers(local[None]), frame.similarity.to_local(center), atol=2.0**-30
+    )
