@@ -22,7 +22,7 @@ from crossgrad_core.results.summary import Status
 from crossgrad_core.results.table import final_table
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import DEFAULT_STEPS, assemble, read_scene
+from crossgrad_core.training.assemble import DEFAULT_STEPS, assemble, check_names, read_scene
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.loop import Stopper, train
@@ -114,6 +114,7 @@ def with_defaults(config: RunConfig) -> RunConfig:
 
 def _setup(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
     """The assembled run and the seconds that reading the scene took."""
+    check_names(config)
     configure_threads(config.threads)
     start = perf_counter()
     scene, reader = read_scene(config, cast("Path", config.scene))

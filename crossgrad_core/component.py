@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from pydantic import BaseModel, ConfigDict
+from typing_extensions import override
 
 if TYPE_CHECKING:
     from crossgrad_core.backbone import Backbone
@@ -47,6 +48,7 @@ class ViewCounts:
         above = self.maximum is not None and views > self.maximum
         return views >= self.minimum and not above and views % self.multiple_of == 0
 
+    @override
     def __str__(self) -> str:
         if self.maximum == self.minimum:
             return f"K = {self.minimum}"

@@ -18,7 +18,7 @@ def evaluate(
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
 ) -> None:
-    """Evaluate the held-out views of a run again and print the figures."""
+    """Evaluate the held-out views of a run again."""
     from crossgrad_core import app
 
     app.evaluate(run, device=device, threads=threads)

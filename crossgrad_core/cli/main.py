@@ -51,8 +51,16 @@ app.command("run", cls=GroupedCommand)(run.run)
 app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
 app.command("render", cls=GroupedCommand)(render.render)
 app.command("export", cls=GroupedCommand)(export.export)
-app.command("diagnose", cls=GroupedCommand)(diagnose.diagnose)
-app.command("stress", cls=GroupedCommand)(stress.stress)
+app.command(
+    "diagnose",
+    cls=GroupedCommand,
+    short_help="Measure a scene: camera regimes, gradient conflict, variance.",
+)(diagnose.diagnose)
+app.command(
+    "stress",
+    cls=GroupedCommand,
+    short_help="Hold operators against exact arithmetic on extreme gradients.",
+)(stress.stress)
 app.add_typer(plugins.app, name="plugins")
 
 

@@ -1,24 +1,19 @@
 """What `crossgrad diagnose` does: a model, its probes, the report."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contexts import Model
-from crossgrad_core.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_core.diagnostics.plan import ProbePlan, labelled, plan_probe
-from crossgrad_core.diagnostics.probe import Measurement, ModelProbe, measure
+from crossgrad_core.diagnostics.probe import ModelProbe
 from crossgrad_core.diagnostics.report import Report
-from crossgrad_core.diagnostics.table import Row, table
-from crossgrad_core.errors import UserError
+from crossgrad_core.diagnostics.watch import Watch
 from crossgrad_core.files import write_atomically
 from crossgrad_core.grouping import Grouping
-from crossgrad_core.hooks import hookimpl
 from crossgrad_core.registry import build
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
@@ -78,12 +73,12 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
     warm_up(setup)
     steps, _ = steps_for(setup, options.seconds)
     setup = replace(setup, schedule=Schedule.for_run(steps, vanilla.schedule))
-    watcher = _Watcher(plan, options, distances_of(scene), max(1, steps // options.probes), steps)
-    setup.manager.register(watcher, name="diagnostics")
+    watch = Watch(plan, max(1, steps // options.probes), steps, options.seed)
+    setup.manager.register(watch, name="diagnostics")
     state = first_state(setup)
     train(setup, state, _NoSink(), Stopper())
     model = f"a vanilla run of {steps} steps, one view each, in epoch order"
-    return _report(scene, model, plan, watcher, model_of(setup, state), options)
+    return _report(model, watch, model_of(setup, state), options)
 
 
 def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:
@@ -93,15 +88,15 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
         UserError: The grouping cannot group its scene.
     """
     plan = _plan(setup.scene, options)
-    watcher = _Watcher(plan, options, distances_of(setup.scene), 1, state.step)
+    watch = Watch(plan, 1, state.step, options.seed)
     model = model_of(setup, state)
-    watcher.crossgrad_model(model)
+    watch.crossgrad_model(model)
     names = setup.selection.names
     which = (
         f"run {folder} ({names['backbone']}, {names['sampler']}, {names['operator']}) "
         f"at step {state.step}"
     )
-    return _report(setup.scene, which, plan, watcher, model, options)
+    return _report(which, watch, model, options)
 
 
 class _NoSink:
@@ -114,78 +109,18 @@ class _NoSink:
         pass
 
 
-@dataclass
-class _Watcher:
-    """Probes the model every so many steps, and at the end.
-
-    Attributes:
-        plan: The views.
-        options: The seed.
-        distances: Of the training views.
-        every: Steps between probes.
-        total: The last step.
-        rows: What was found.
-        last: The last measurement.
-    """
-
-    plan: ProbePlan
-    options: Options
-    distances: Mapping[str, NDArray[np.float64]]
-    every: int
-    total: int
-    rows: list[Row] = field(default_factory=list)
-    last: Measurement | None = None
-
-    @hookimpl
-    def crossgrad_model(self, model: Model) -> None:
-        """Probes where it is time."""
-        step = model.phase.step
-        close_to_end = self.total - self.every < step < self.total
-        if step != self.total and (step % self.every or close_to_end):
-            return
-        rng = np.random.default_rng(self.options.seed)
-        self.last = measure(model, self.plan.views, rng)
-        self.rows += table(self.last, self.plan, self.distances, self.options.seed)
-
-
 def _plan(scene: Scene, options: Options) -> ProbePlan:
     labels, notes = labelled(scene, options.grouping, options.seed)
     plan = plan_probe(scene, options.grouping, labels, options.per_group, options.seed)
     return replace(plan, notes=notes)
 
 
-def _report(
-    scene: Scene,
-    model: str,
-    plan: ProbePlan,
-    watcher: _Watcher,
-    final: Model,
-    options: Options,
-) -> Report:
-    last = watcher.last
-    if last is None:
-        raise UserError("the model was never probed", where=scene.name, todo="train longer")
-    notes = [f"model: {model}", *plan.notes, *_dropped(last)]
-    if options.signature is not None:
-        notes.append(_write_signature(final, options.signature, options.seed))
-    return Report(
-        scene=scene.name,
-        title=f"{scene.name}: {model}",
-        probes=watcher.rows,
-        cameras=camera_rows(scene),
-        groupings=grouping_rows(scene, last, options.seed),
-        notes=notes,
-    )
-
-
-def _dropped(measurement: Measurement) -> Sequence[str]:
-    notes = []
-    if measurement.dropped:
-        listed = ", ".join(measurement.dropped)
-        notes.append(f"left out, gradient not finite: {listed}")
-    if measurement.share < 1.0:
-        notes.append(f"gradients of a random {measurement.share:.0%} of the primitives")
-    return notes
+def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
+    report = watch.report(model.scene, which)
+    if options.signature is None:
+        return report
+    note = _write_signature(model, options.signature, options.seed)
+    return replace(report, notes=(*report.notes, note))
 
 
 def _write_signature(model: Model, path: Path, seed: int) -> str:

@@ -75,7 +75,7 @@ _HEADER = (
 
 def _block_line(row: Row) -> str:
     conflict = _figure(100.0 * float(row["conflict_rate"]), ".0f") + " %"
-    rho = _with_interval(row, "rho", ".2f")
+    rho = _with_interval(row, "rho", ".2g")
     exponent = _with_interval(row, "exponent_radial", ".1f")
     name = str(row["block"])
     return (

@@ -89,8 +89,10 @@ def _windowed(fields: Tensor) -> Tensor:
     if fields.numel() == 0:
         return fields
     fields = fields.permute(0, 3, 1, 2)  # [M, C, H, W]
-    planes = fields.reshape(-1, 1, *fields.shape[2:])  # [M * C, 1, H, W]
-    weight = gaussian_window().to(fields)
-    planes = conv2d(planes, weight.view(1, 1, WINDOW, 1), padding=(RADIUS, 0))
-    planes = conv2d(planes, weight.view(1, 1, 1, WINDOW), padding=(0, RADIUS))
+    # One group per plane: torch's depthwise convolution is the fastest of its ways on the CPU.
+    planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
+    groups = planes.shape[1]
+    weight = gaussian_window().to(fields).expand(groups, 1, WINDOW)
+    planes = conv2d(planes, weight.unsqueeze(-1), padding=(RADIUS, 0), groups=groups)
+    planes = conv2d(planes, weight.unsqueeze(-2), padding=(0, RADIUS), groups=groups)
     return planes.view(fields.shape).permute(0, 2, 3, 1)

@@ -35,7 +35,7 @@ def supports(count: int) -> Iterator[tuple[int, ...]]:
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
-    """Solution x on the support with (M x)_S = right_S, zero elsewhere; None where M_SS is singular."""
+    """Solution x of (M x)_S = right_S, zero outside the support S; None where M_SS is singular."""
     mp = require_mpmath().mp
     size = len(support)
     # In units of the diagonal, so that no ratio of norms looks singular.

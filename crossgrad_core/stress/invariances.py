@@ -12,7 +12,8 @@ from crossgrad_core.operator import Operator
 from crossgrad_core.state import EMPTY_STATE
 from crossgrad_core.stress.case import Case, short
 from crossgrad_core.stress.reference import Views, usual_views
-from crossgrad_core.stress.runner import BLOCK, PROMISED, Cell, aggregate, context_of
+from crossgrad_core.stress.runner import BLOCK, Cell, context_of, timed
+from crossgrad_core.stress.verdict import PROMISED, Finding
 
 #: A law returns its error in units of u times the largest norm, or None where it does not apply.
 Law = Callable[[Operator], float | None]
@@ -26,8 +27,7 @@ def _rows(views: int) -> Case:
 
 
 def _result(operator: Operator, case: Case, views: Views | None = None) -> Tensor:
-    found, _ = aggregate(operator, case, views or usual_views(case.views), EMPTY_STATE, 0)
-    gradient = found.gradients[BLOCK.name]
+    gradient, _, _ = timed(operator, case, views or usual_views(case.views))
     if gradient is None:
         raise RuntimeError("no gradient where all views have one")
     return gradient.double()
@@ -127,19 +127,22 @@ def threads(operator: Operator) -> float | None:
 LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, company, threads)
 
 
-def judge_law(name: str, operator: Operator, law: Law) -> Cell:
+def run_law(name: str, operator: Operator, law: Law) -> Cell:
     """One law on one operator."""
-    label = law.__name__.replace("_", " ")
+    return Cell(name, law.__name__.replace("_", " "), _judged(operator, law))
+
+
+def _judged(operator: Operator, law: Law) -> Finding:
     try:
         error = law(operator)
     except Exception as problem:
         # Third-party code may raise anything.
-        return Cell(name, label, "failed", reason=f"{type(problem).__name__}: {problem}")
+        return Finding("failed", reason=f"{type(problem).__name__}: {problem}")
     if error is None:
-        return Cell(name, label, "refused")
+        return Finding("refused")
     if error <= PROMISED:
-        return Cell(name, label, "ok", error)
-    return Cell(name, label, "failed", error, reason=f"error {error:.3g} u")
+        return Finding("ok", error)
+    return Finding("failed", error, f"error {error:.3g} u")
 
 
 def _reversed(gradient: Tensor | None) -> Tensor | None:

@@ -179,30 +179,32 @@ def anchors(question: Question) -> Vector:
 
 def confgate(question: Question) -> Vector:
     """Projection where the averaged cosine says so."""
-    mp = require_mpmath().mp
-    beta: Number = number(question.options["beta"])
-    tau: float = question.options["tau"] or {"v2": 0.9, "low": 0.6}[question.options["preset"]]
     cosine = cosines(question.gramian)
-    confident = {}
-    for i in range(question.count):
-        for j in range(question.count):
-            if i == j or question.gramian[i][j] == 0:
-                confident[i, j] = False
-                continue
-            key = (question.places[i], question.places[j])
-            seen: tuple[Number, Number, int] = question.memory.get(key, (number(0), number(0), 0))
-            first, second, updates = seen
-            c = cosine[i][j]
-            first, second = beta * first + (1 - beta) * c, beta * second + (1 - beta) * c * c
-            question.memory[key] = (first, second, updates + 1)
-            missing = 1 - beta ** (updates + 1)
-            mean = first / missing
-            variance = max(second / missing - mean**2, number(0))
-            effective = (1 + beta) / (1 - beta)
-            score = -mean / mp.sqrt(variance / effective + number("1e-12"))
-            believed = mp.ncdf(score) >= tau
-            confident[i, j] = believed and updates + 1 > question.options["warmup"]
+    confident = {
+        (i, j): i != j
+        and question.gramian[i][j] != 0
+        and _believed(question, (question.places[i], question.places[j]), cosine[i][j])
+        for i in range(question.count)
+        for j in range(question.count)
+    }
     return column_sums(projected_rows(question, lambda i, j: confident[i, j]))
+
+
+def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
+    """Whether a pair has probably been conflicting, this step's cosine included."""
+    mp, options = require_mpmath().mp, question.options
+    beta = number(options["beta"])
+    tau = {"v2": 0.9, "low": 0.6}[options["preset"]] if options["tau"] is None else options["tau"]
+    seen: tuple[Number, Number, int] = question.memory.get(pair, (number(0), number(0), 0))
+    first = beta * seen[0] + (1 - beta) * cosine
+    second = beta * seen[1] + (1 - beta) * cosine**2
+    updates = seen[2] + 1
+    question.memory[pair] = (first, second, updates)
+    missing = 1 - beta**updates
+    mean = first / missing
+    variance = max(second / missing - mean**2, number(0))
+    score = -mean / mp.sqrt(variance * (1 - beta) / (1 + beta) + number("1e-12"))
+    return bool(mp.ncdf(score) >= tau) and updates > options["warmup"]
 
 
 def gradvac(question: Question) -> Vector:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 from pathlib import Path
 
-from crossgrad_core.stress.runner import PROMISED, Cell
+from crossgrad_core.stress.runner import Cell
+from crossgrad_core.stress.verdict import PROMISED
 
 #: Operators side by side in one part of the table.
 COLUMNS = 5
@@ -30,7 +31,7 @@ def as_text(cells: Sequence[Cell]) -> str:
 
 def failed(cells: Sequence[Cell]) -> list[Cell]:
     """The cells that break a promise."""
-    return [cell for cell in cells if cell.verdict == "failed"]
+    return [cell for cell in cells if cell.finding.verdict == "failed"]
 
 
 def write_csv(cells: Sequence[Cell], path: Path) -> None:
@@ -39,7 +40,9 @@ def write_csv(cells: Sequence[Cell], path: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(["operator", "case", "verdict", "error_u_kappa", "microseconds", "reason"])
         for c in cells:
-            writer.writerow([c.operator, c.case, c.verdict, c.error, c.microseconds, c.reason])
+            found = c.finding
+            row = [found.verdict, found.error, c.microseconds, found.reason]
+            writer.writerow([c.operator, c.case, *row])
 
 
 def _part(cells: Sequence[Cell], names: Sequence[str]) -> str:
@@ -53,29 +56,33 @@ def _part(cells: Sequence[Cell], names: Sequence[str]) -> str:
 
 def _shown(cell: Cell) -> str:
     time = "" if isnan(cell.microseconds) else f"{cell.microseconds:8.0f}"
-    if cell.verdict == "refused":
+    if cell.finding.verdict == "refused":
         return "-" + " " * 8
-    if cell.verdict == "failed":
+    if cell.finding.verdict == "failed":
         return "FAIL" + (time or " " * 8)
-    mark = "~" if cell.verdict == "undetermined" else ""
-    error = f"{cell.error:.2f}" if isfinite(cell.error) else ""
+    mark = "~" if cell.finding.verdict == "undetermined" else ""
+    error = f"{cell.finding.error:.2f}" if isfinite(cell.finding.error) else ""
     return f"{mark}{error}{time or ' ' * 8}"
 
 
 def _summary(cells: Sequence[Cell], names: Sequence[str]) -> str:
     lines = [f"{'operator':<{_NAME}}{'worst error':>12}  of {PROMISED:g}   in case"]
     for name in names:
-        judged = [c for c in cells if c.operator == name and c.verdict == "ok"]
-        worst = max((c for c in judged if isfinite(c.error)), key=lambda c: c.error, default=None)
+        judged = [c for c in cells if c.operator == name and c.finding.verdict == "ok"]
+        worst = max(
+            (c for c in judged if isfinite(c.finding.error)),
+            key=lambda c: c.finding.error,
+            default=None,
+        )
         if worst is not None:
-            lines.append(f"{name:<{_NAME}}{worst.error:>12.3f}         {worst.case}")
+            lines.append(f"{name:<{_NAME}}{worst.finding.error:>12.3f}         {worst.case}")
     return "\n".join(lines)
 
 
 def _failures(cells: Sequence[Cell]) -> list[str]:
     wrong = failed(cells)
-    total = sum(cell.verdict != "refused" for cell in cells)
+    total = sum(cell.finding.verdict != "refused" for cell in cells)
     if not wrong:
         return [f"all {total} checks hold"]
-    lines = [f"{cell.operator}, {cell.case}: {cell.reason}" for cell in wrong]
+    lines = [f"{cell.operator}, {cell.case}: {cell.finding.reason}" for cell in wrong]
     return ["\n".join([f"{len(wrong)} of {total} checks fail:", *lines])]

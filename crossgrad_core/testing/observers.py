@@ -163,7 +163,11 @@ def _model(step: int) -> Model:
         backbone=backbone,
         rasterizer=cast("Rasterizer", build("rasterizers", "torch", {})),
         parameters=parameters,
-        adam=AdamState.zeros(parameters),
+        adam=AdamState(
+            exp_avg={name: torch.zeros_like(tensor) for name, tensor in parameters.items()},
+            exp_avg_sq={name: torch.zeros_like(tensor) for name, tensor in parameters.items()},
+            steps=dict.fromkeys(parameters, step),
+        ),
         background=torch.zeros(3),
         ssim_weight=0.2,
         groups=None,

@@ -16,7 +16,7 @@ from crossgrad_core.manager import make_manager
 from crossgrad_core.operator import Operator
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.reader import Reader
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry import build, entries, find
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
@@ -41,6 +41,22 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     # No reader recognises it: the first one explains what it misses.
     reader = cast("Reader", build("readers", "colmap", {}))
     return reader.read(path, config.reading), "colmap"
+
+
+def check_names(config: RunConfig) -> None:
+    """Looks up every component and the device, before a large scene is read for nothing.
+
+    Raises:
+        UserError: A name does not exist, with the closest one that does.
+    """
+    choose_device(config.device)
+    named = [("operators", link) for link in config.operators]
+    named += [("observers", observer) for observer in config.observers]
+    for slot in ("backbone", "sampler", "grouping", "densifier", "rasterizer", "reader"):
+        named.append((f"{slot}s", getattr(config, slot)))
+    for slot, choice in named:
+        if choice is not None and choice.name != AUTO:
+            find(slot, choice.name)
 
 
 def choose_device(name: str) -> torch.device:

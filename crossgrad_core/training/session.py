@@ -7,7 +7,8 @@ from time import perf_counter
 
 from torch import Tensor
 
-from crossgrad_core.checkpoint import Keep, save
+from crossgrad_core.checkpoint import save
+from crossgrad_core.checkpoint_folders import Keep
 from crossgrad_core.contexts import EvaluationReport
 from crossgrad_core.evaluation import EvaluationResult, evaluate
 from crossgrad_core.ply import write_ply

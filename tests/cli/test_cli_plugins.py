@@ -80,6 +80,8 @@ def test_version(ran):
         ("eval", "--help"),
         ("render", "-h"),
         ("export", "-h"),
+        ("diagnose", "-h"),
+        ("stress", "-h"),
         ("plugins", "--help"),
         ("plugins", "list", "-h"),
         ("plugins", "show", "-h"),

@@ -14,7 +14,7 @@ from crossgrad_core.contexts import Aggregated, Densified, Regularized
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.ply import read_ply
 from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.topology import Edit, NO_EDIT, Rows
+from crossgrad_core.topology import NO_EDIT, Edit, Rows
 
 QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
 
@@ -228,7 +228,7 @@ class Louder:
     def crossgrad_aggregate_gradients(self, context):
         aggregated = yield
         self.seen.append("aggregate")
-        zeroed = {name: None for name in aggregated.gradients}
+        zeroed = dict.fromkeys(aggregated.gradients)
         return Aggregated(zeroed, aggregated.counts, states=aggregated.states)
 
     @hookimpl(wrapper=True)

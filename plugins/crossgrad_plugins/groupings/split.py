@@ -26,7 +26,7 @@ def require_training_views(scene: Scene, grouping: str) -> None:
         raise UserError(
             f"grouping {grouping} has no training views to be fitted on",
             where=scene.name,
-            todo="check the split: --set scene.split=none trains on all images",
+            todo="check the split: --split none trains on all images",
         )
 
 

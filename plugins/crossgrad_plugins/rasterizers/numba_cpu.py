@@ -85,6 +85,7 @@ def _gaussians(degree: int, tensors: tuple[Tensor | None, ...]) -> GaussianArray
 
 class _Draw(torch.autograd.Function):
     @staticmethod
+    @override
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> Any:
         camera = call.camera
         frame = forward(
@@ -107,6 +108,7 @@ class _Draw(torch.autograd.Function):
         return torch.from_numpy(frame.image), torch.from_numpy(frame.alpha), depth
 
     @staticmethod
+    @override
     def backward(ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, v_depth: Any) -> Any:
         call: _Call = ctx.call
         frame = call.frame

@@ -86,7 +86,7 @@ def require_enough(available: int, count: int) -> None:
             f"a step needs {count} different views of {available} training views",
             where="sampler",
             expected=f"at most {available} views per step from this group of training views",
-            todo="lower --views-per-step, or choose sampler random, which may repeat a view",
+            todo="lower --views, or choose sampler random, which may repeat a view",
         )
 
 
@@ -100,6 +100,6 @@ def training_views(context: SampleContext) -> range:
         raise UserError(
             "the scene has no training views",
             where=context.scene.name,
-            todo="check the split: --set scene.split=none trains on all images",
+            todo="check the split: --split none trains on all images",
         )
     return range(len(context.centers))

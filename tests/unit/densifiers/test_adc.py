@@ -10,8 +10,8 @@ import torch
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contexts import DensifyContext, ViewRecord
 from crossgrad_core.gaussians import Gaussians, Screen
-from crossgrad_core.schedule import Schedule
 from crossgrad_core.scene.types import Camera, View
+from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import NO_EDIT, apply_to_parameters
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl

@@ -42,7 +42,7 @@ def check_gradients(gaussians, names, *, every_entry=True):
 
 @pytest.mark.parametrize("response", RESPONSES)
 def test_gradcheck_of_geometry_opacity_and_rgb(response):
-    gaussians = smooth_gaussians(24, CAMERA, response=response)
+    gaussians = smooth_gaussians(20, CAMERA, response=response)
     check_gradients(gaussians, ("means", "quats", "scales", "opacities", "colors"))
 
 

@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+from skimage.transform import resize as skimage_resize
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.decode import blend, decode_mask, decode_photo, resize, turn
+
+RNG = np.random.default_rng(0)
+GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)
+RGB = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+
+
+def test_grey_photos_have_three_equal_channels(tmp_path):
+    Image.fromarray(GREY).save(tmp_path / "a.png")
+    rgb, alpha = decode_photo(tmp_path / "a.png")
+    np.testing.assert_array_equal(rgb, GREY[..., None].repeat(3, 2))
+    assert alpha is None
+
+
+def test_16_bit_photos_are_rounded_to_8_bits(tmp_path):
+    wide = RNG.integers(0, 65536, (40, 60)).astype(np.uint16)
+    Image.fromarray(wide).save(tmp_path / "a.png")
+    rgb, _ = decode_photo(tmp_path / "a.png")
+    np.testing.assert_array_equal(rgb[..., 0], np.rint(wide / 257))
+    Image.fromarray(wide).save(tmp_path / "a.tif")
+    np.testing.assert_array_equal(decode_photo(tmp_path / "a.tif")[0], rgb)
+
+
+def test_alpha_comes_apart(tmp_path):
+    Image.fromarray(np.dstack([RGB, GREY])).save(tmp_path / "a.png")
+    rgb, alpha = decode_photo(tmp_path / "a.png")
+    np.testing.assert_array_equal(rgb, RGB)
+    np.testing.assert_array_equal(alpha, GREY)
+
+
+def test_a_transparent_palette_colour_is_alpha(tmp_path):
+    image = Image.new("P", (60, 40), 0)
+    image.putpalette([10, 20, 30, 40, 50, 60])
+    image.putpixel((3, 2), 1)
+    image.save(tmp_path / "a.png", transparency=1)
+    rgb, alpha = decode_photo(tmp_path / "a.png")
+    assert tuple(rgb[0, 0]) == (10, 20, 30)
+    assert (alpha[2, 3], alpha[0, 0]) == (0, 255)
+
+
+def test_float_photos_are_refused(tmp_path):
+    Image.fromarray(GREY.astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"a\.tif(?s:.*)floating-point"):
+        decode_photo(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("decode", [decode_photo, decode_mask])
+def test_a_damaged_photo_is_named(decode, tmp_path):
+    Image.fromarray(RGB).save(tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match=r"cannot be decoded(?s:.*)a\.jpg"):
+        decode(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("mask", "mode"),
+    [
+        (np.where(GREY > 127, 255, 0).astype(np.uint8), "L"),
+        (GREY, "L"),
+        ((GREY > 127).astype(np.uint8), "L"),
+        ((GREY > 127).astype(np.uint16) * 65535, "I;16"),
+        (GREY > 127, "1"),
+    ],
+)
+def test_masks_keep_white(mask, mode, tmp_path):
+    image = Image.fromarray(mask)
+    assert image.mode == mode
+    image.save(tmp_path / "m.png")
+    np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), np.where(GREY > 127, 255, 0))
+
+
+def test_a_black_mask_keeps_nothing(tmp_path):
+    Image.new("L", (60, 40)).save(tmp_path / "m.png")
+    assert not decode_mask(tmp_path / "m.png").any()
+
+
+@pytest.mark.parametrize("orientation", [1, 5, 6, 7, 8])
+def test_quarter_turns_are_those_of_exif(orientation):
+    image = Image.fromarray(RGB)
+    image.getexif()[0x0112] = orientation
+    np.testing.assert_array_equal(turn(RGB, orientation), ImageOps.exif_transpose(image))
+
+
+def test_resize_is_the_anti_aliased_resize_of_scikit_image():
+    expected = skimage_resize(RGB, (13, 20), anti_aliasing=True) * 255
+    assert np.abs(resize(RGB, 20, 13) - expected).max() <= 0.51
+
+
+def test_resize_to_its_own_size_changes_nothing():
+    assert resize(RGB, 60, 40) is RGB
+
+
+def test_blend_puts_a_colour_behind():
+    alpha = np.zeros((40, 60), dtype=np.uint8)
+    alpha[:20] = 255
+    mixed = blend(RGB, alpha, (1.0, 0.5, 0.0))
+    np.testing.assert_array_equal(mixed[:20], RGB[:20])
+    assert tuple(mixed[30, 30]) == (255, 128, 0)

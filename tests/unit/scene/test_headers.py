@@ -1,0 +1,90 @@
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+
+
+def save(path, **options):
+    Image.fromarray(PIXELS).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "bmp"])
+def test_header_of_a_whole_photo(suffix, tmp_path):
+    assert read_header(save(tmp_path / f"a.{suffix}")) == PhotoHeader(60, 40, False, False)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("share", [0.5, 0.97])
+def test_a_photo_cut_short_is_refused(suffix, share, tmp_path):
+    path = save(tmp_path / f"a.{suffix}")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(UserError, match=rf"cut short|cannot be read(?s:.*)a\.{suffix}"):
+        read_header(path)
+
+
+def test_a_thumbnail_does_not_hide_that_the_photo_is_cut_short(tmp_path):
+    # A whole JPEG with its own end marker, as the EXIF header of a camera carries it.
+    thumbnail = io.BytesIO()
+    Image.fromarray(PIXELS[:8, :8]).save(thumbnail, "jpeg")
+    exif = b"Exif\0\0" + thumbnail.getvalue()
+    data = save(tmp_path / "a.jpg").read_bytes()
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    whole = data[:2] + segment + data[2:]
+    (tmp_path / "a.jpg").write_bytes(whole)
+    assert read_header(tmp_path / "a.jpg").width == 60
+    (tmp_path / "a.jpg").write_bytes(whole[:-200])
+    with pytest.raises(UserError, match="cut short"):
+        read_header(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("trailer", [b"\0" * 500, b"SEFH trailer of a phone" * 9])
+def test_data_behind_a_jpeg_is_allowed(trailer, tmp_path):
+    path = save(tmp_path / "a.jpg")
+    path.write_bytes(path.read_bytes() + trailer)
+    assert read_header(path).height == 40
+
+
+def test_a_jpeg_filled_up_with_zeros_is_cut_short(tmp_path):
+    path = save(tmp_path / "a.jpg")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2] + b"\0" * (len(data) // 2))
+    with pytest.raises(UserError, match="cut short"):
+        read_header(path)
+
+
+@pytest.mark.parametrize(("content", "found"), [(b"", "an empty file"), (b"hello", "no format")])
+def test_what_is_no_photo_is_refused(content, found, tmp_path):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=rf"not a photo(?s:.*)a\.jpg(?s:.*){found}"):
+        read_header(path)
+
+
+def test_a_photo_that_may_not_be_read_is_named(tmp_path):
+    (tmp_path / "a.jpg").mkdir()
+    with pytest.raises(UserError, match=r"cannot be read(?s:.*)a\.jpg"):
+        read_header(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("mode", "alpha", "grey"),
+    [("L", False, True), ("LA", True, True), ("RGBA", True, False), ("I;16", False, True)],
+)
+def test_transparency_and_grey_are_seen(mode, alpha, grey, tmp_path):
+    Image.new(mode, (60, 40)).save(tmp_path / "a.png")
+    assert read_header(tmp_path / "a.png") == PhotoHeader(60, 40, alpha, grey)
+
+
+@pytest.mark.parametrize(("orientation", "turn"), [(1, None), (3, None), (6, 6), (8, 8), (0, None)])
+def test_quarter_turns_are_found(orientation, turn, tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    assert read_quarter_turn(save(tmp_path / "a.jpg", exif=exif)) == turn
