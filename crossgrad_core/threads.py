@@ -23,8 +23,8 @@ def configure_threads(n: int | None = None) -> int:
     - torch brings its own copy of libgomp and Numba loads the system's, so there are two pools, and
       idle threads of a pool spin for a while before they sleep. Numba's and torch's parallel
       operators in turn take as long as the two apart when both are OpenMP. With workqueue, whose
-      threads have to be woken by the scheduler while torch's spin, the same loop takes up to twice
-      as long. `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per
+      threads have to be woken by the scheduler while torch's spin, the same loop takes twice as
+      long or more. `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per
       parallel call, which small operators feel more than large ones gain: the default is left
       alone.
     - workqueue ends the process when two Python threads enter parallel kernels at once; OpenMP and

@@ -15,8 +15,8 @@ class DistanceConflict:
         variance: Variance of the distances over their squared mean.
         edges: [Q + 1] edges of |log r_i - log r_j|, quantiles over pairs.
         rates: [Q] conflict rate of the pairs of each bin; NaN in an empty one.
-        correlation: Spearman's rank correlation of conflict with |log r_i - log r_j|; NaN where
-            either is constant.
+        correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j|, ranks among
+            all pairs; NaN where either is constant.
         p_value: Share of relabelled cameras (Mantel's permutations) with as large a correlation.
     """
 
@@ -52,26 +52,51 @@ def conflict_by_distance(
     logs, products = np.log(distances[positive]), gramian[np.ix_(positive, positive)]
     first, second = np.triu_indices(len(positive), 1)
     counted = products[first, second] != 0.0
-    first, second = first[counted], second[counted]
-    if len(first) == 0:
+    if not counted.any():
         nothing = np.full(bins, np.nan)
         return DistanceConflict(variance, np.full(bins + 1, np.nan), nothing, np.nan, np.nan)
+    ranks = _pair_ranks(logs)
+    first, second = first[counted], second[counted]
     apart = np.abs(logs[first] - logs[second])
-    negative = (products[first, second] < 0.0).astype(np.float64)
+    negative = products[first, second] < 0.0
     edges = np.quantile(apart, np.linspace(0.0, 1.0, bins + 1))
+    # The first order is the cameras' own.
+    orders = [
+        np.arange(len(positive)),
+        *(rng.permutation(len(positive)) for _ in range(permutations)),
+    ]
+    order = np.stack(orders)
+    correlations = _correlations(ranks[order[:, first], order[:, second]], negative)
+    above = int((correlations[1:] >= correlations[0]).sum())
+    p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
+    rates = _rates(apart, negative, edges)
+    return DistanceConflict(variance, edges, rates, float(correlations[0]), p_value)
+
+
+def _rates(
+    apart: NDArray[np.float64], negative: NDArray[np.bool_], edges: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[Q] share of negative pairs between neighbouring edges [Q + 1]; NaN in an empty bin."""
+    bins = len(edges) - 1
     places = np.clip(np.searchsorted(edges, apart, side="right") - 1, 0, bins - 1)
-    rates = [float(negative[places == b].mean()) if (places == b).any() else np.nan
-             for b in range(bins)]  # fmt: skip
-    correlation = _rank_correlation(apart, negative)
-    orders = (rng.permutation(len(positive)) for _ in range(permutations))
-    relabelled = [np.abs(logs[order[first]] - logs[order[second]]) for order in orders]
-    above = sum(_rank_correlation(other, negative) >= correlation for other in relabelled)
-    p_value = (1 + above) / (1 + permutations) if np.isfinite(correlation) else np.nan
-    return DistanceConflict(variance, edges, np.array(rates), correlation, p_value)
+    inside = [negative[places == place] for place in range(bins)]
+    return np.array([float(each.mean()) if len(each) else np.nan for each in inside])
 
 
-def _rank_correlation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    a, b = rankdata(x), rankdata(y)
-    a, b = a - a.mean(), b - b.mean()
-    length = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / length if length > 0.0 else float("nan")
+def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, V] rank of |log r_i - log r_j| among all pairs."""
+    first, second = np.triu_indices(len(logs), 1)
+    ranks = np.zeros((len(logs), len(logs)))
+    ranks[first, second] = rankdata(np.abs(logs[first] - logs[second]))
+    return ranks + ranks.T
+
+
+def _correlations(ranks: NDArray[np.float64], negative: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """[R] correlation of each row of ranks [R, pairs] with conflict; NaN where one is constant."""
+    about = ranks - ranks.mean(axis=1, keepdims=True)
+    conflict = negative - negative.mean()
+    lengths = np.sqrt((about**2).sum(axis=1) * (conflict @ conflict))
+    undefined = np.full(len(ranks), np.nan)
+    return np.asarray(
+        np.divide(about @ conflict, lengths, out=undefined, where=lengths > 0.0), dtype=np.float64
+    )

@@ -13,6 +13,8 @@ from crossgrad_core.diagnostics.variance import split_of
 
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
+#: A variance of this size, relative to the squared lengths, is rounding.
+_NEGLIGIBLE = 1e-13
 #: Share of the error of sigma_w^2's interval that falls on its upper end. A few views miss rare
 #: long gradients more often than they hold too many, so the error is not split evenly.
 _UPPER_SHARE = 0.2
@@ -47,11 +49,11 @@ def split_intervals(
     Unknown (NaN) with fewer than four views in a group, or without any variance.
 
     Source: bootstrap-t and intervals by test inversion, Efron and Tibshirani 1993; variance of the
-    statistic, Chen and Qin 2010. Coverage: `benchmarks/coverage.py`.
+    statistic, Chen and Qin 2010. Coverage: `benchmarks/interval_coverage.py`.
     """
     parts = GroupedGramian.of(gramian, groups)
     within, between = split_of(parts, groups)
-    if min(groups.sizes) < SMALLEST_FOR_INTERVALS or parts.scale <= 0.0 or within <= 0.0:
+    if min(groups.sizes) < SMALLEST_FOR_INTERVALS or parts.scale <= 0.0 or within <= _NEGLIGIBLE:
         return SplitIntervals(UNKNOWN, UNKNOWN, UNKNOWN)
     if max(groups.unseen) <= 0.0:
         return _points(parts.scale * within, parts.scale * between)

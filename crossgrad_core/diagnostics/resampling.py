@@ -78,13 +78,14 @@ class GroupResamples:
 class Resamples:
     """Everything that the intervals need; row 0 is the sample itself, in units of the scale.
 
-    With gap = ||near mean - far mean||^2 written as theta, a resample's estimate of it is
-    theta + 2 sqrt(theta) `shift` + `noise`.
+    If theta is the true ||near mean - far mean||^2, a resample's estimate of it is theta +
+    2 sqrt(theta) `shift` + `noise`, less the mean of the noise.
 
     Attributes:
         within: [R + 1] sigma_w^2.
         within_variance: [R + 1] its variance.
-        shift: [R + 1] mean deviation along the unit vector of the gap.
+        shift: [R + 1] mean deviation along the unit vector of the gap, each view's own part in the
+            gap left out.
         noise: [R + 1] squared mean deviation, less what single cameras' deviations make of it.
         shift_variance: [R + 1] variance of `shift`.
         covariance: [R + 1] covariance of `within` with `shift`.
@@ -109,13 +110,15 @@ class Resamples:
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # Probing part of a finite population leaves only the unseen share of each mean's noise.
+        # Probing part of a finite population leaves only the unseen share of the noise's variance.
         root_f, root_g = f**0.5, g**0.5
+        near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
+        far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])
         meeting = (near.counts @ parts.cross * far.counts).sum(axis=1) / (n * m)
         unit = parts.gap**0.5 if parts.gap > 0.0 else 1.0
         own_noise = f * near.spread * near.self_share + g * far.spread * far.self_share
         return cls(
-            within=p * near.spread + q * far.spread,
+            within=p * near_spread + q * far_spread,
             within_variance=p**2 * f * near.quadratic + q**2 * g * far.quadratic,
             shift=(root_f * near.along - root_g * far.along) / unit,
             noise=f * near.own + g * far.own - 2.0 * root_f * root_g * meeting - own_noise,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap
@@ -126,6 +127,7 @@ class Calibration:
         """
         if self.is_pinhole:
             return self._read_pinhole(self._camera)
+        guard_pycolmap()
         import pycolmap
 
         try:
@@ -160,6 +162,7 @@ class Calibration:
         Args:
             image: [H, W, 3] or [H, W], in the size of the calibration.
         """
+        guard_pycolmap()
         import pycolmap
 
         bitmap, _ = pycolmap.undistort_image(
@@ -172,6 +175,7 @@ class Calibration:
         return self._make_camera()
 
     def _make_camera(self) -> "pycolmap.Camera":
+        guard_pycolmap()
         import pycolmap
 
         return pycolmap.Camera(

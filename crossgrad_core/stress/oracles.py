@@ -225,12 +225,12 @@ def _vaccinated(question: Question, i: int, partners: Sequence[int]) -> Vector:
         if not length:
             break
         key = (question.places[i], question.places[j])
-        t = question.memory.get(key, number(0))
+        t: Number = question.memory.get(key, number(0))
         phi = apply(gramian, v)[j] / length / other
         if phi < t and 1 + phi <= number(OPPOSITE):
             v = zeros(question.count)
         elif phi < t:
-            root = mp.sqrt(1 - t**2)
+            root = mp.sqrt(1 - t * t)
             v[j] += length * (t * mp.sqrt(1 - phi**2) - phi * root) / (other * root)
         limit = number("0.999")
         question.memory[key] = min(max((1 - beta) * t + beta * phi, -limit), limit)

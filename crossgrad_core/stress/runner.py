@@ -64,7 +64,8 @@ def run_case(name: str, operator: Operator, exact: ExactCase, reference: Referen
     case = exact.case
     if not operator.views.admits(case.views):
         return Cell(name, case.name, Finding("refused"))
-    state, memory = EMPTY_STATE, cast("dict[Any, Any]", {})
+    state = EMPTY_STATE
+    memory: dict[Any, Any] = {}
     findings, times = [], []
     for step in range(STEPS):
         views = usual_views(case.views, seed=step)

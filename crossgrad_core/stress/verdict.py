@@ -62,11 +62,8 @@ class ExactCase:
 
 def judge(exact: ExactCase, found: Tensor | None, expected: Answer | ElementRule | None) -> Finding:
     """Compares a result with exact weights, with a rule for elements, or with nothing."""
-    if found is None:
-        right = not exact.touched
-        return Finding("ok", 0.0) if right else Finding("failed", inf, "no gradient")
-    if not exact.touched:
-        return Finding("failed", inf, "must be None where no view counts")
+    if found is None or not exact.touched:
+        return _either(found is None and not exact.touched, "None is for blocks without any view")
     if not bool(torch.isfinite(found).all()):
         return Finding("failed", inf, "not finite")
     if expected is None:
@@ -75,10 +72,13 @@ def judge(exact: ExactCase, found: Tensor | None, expected: Answer | ElementRule
         scale = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
         return _measured(exact.case, expected(exact.case, found), scale, scale)
     if all(w == 0 for w in expected.weights):
-        right = not bool(found.any())
-        return Finding("ok", 0.0) if right else Finding("failed", inf, "must be exactly zero")
+        return _either(not bool(found.any()), "must be exactly zero")
     scale, length = float(max(expected.largest, expected.length)), float(expected.length)
     return _measured(exact.case, distance(exact.case, found, expected), scale, length)
+
+
+def _either(right: bool, otherwise: str) -> Finding:
+    return Finding("ok", 0.0) if right else Finding("failed", inf, otherwise)
 
 
 def _measured(case: Case, error: float, scale: float, length: float) -> Finding:

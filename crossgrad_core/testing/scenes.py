@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -120,6 +122,7 @@ def _make_camera(
     camera_id: int, model: str, size: tuple[int, int], focal: float
 ) -> "pycolmap.Camera":
     """A pycolmap camera with an off-centre principal point and, where it has any, distortion."""
+    guard_pycolmap()
     import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, *size)
@@ -202,6 +205,7 @@ def _reconstruct(
     suffix: str,
 ) -> "pycolmap.Reconstruction":
     """The pycolmap reconstruction: poses, points, and the tracks that `seen` describes."""
+    guard_pycolmap()
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -265,6 +269,7 @@ def write_tiny_scene(  # noqa: PLR0913 - a table of independent switches, all ke
     Returns:
         `folder`.
     """
+    guard_pycolmap()
     import pycolmap
     from PIL import Image
 

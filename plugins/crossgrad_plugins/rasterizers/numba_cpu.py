@@ -40,7 +40,7 @@ class NumbaRasterizer(Rasterizer):
             max_alpha=self.max_alpha,
             near=self.near,
             dilation=self.dilation if gaussians.dilation is None else gaussians.dilation,
-            antialiased=gaussians.response == "antialiased",
+            response=gaussians.response,
             depth="depth" in outputs,
             pixels="pixels" in outputs,
         )

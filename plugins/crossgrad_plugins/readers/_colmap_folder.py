@@ -57,14 +57,15 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
 
 def check_scene_folder(scene: Path) -> None:
-    """Refuses what is not a readable folder.
+    """Refuses what is not a readable folder, and the model's folder in place of the scene's.
 
     Raises:
-        UserError: The path is not there, is a file or may not be listed.
+        UserError: The path is not there, is a file, may not be listed or lies within `sparse`.
     """
     try:
         if scene.is_dir():
             next(scene.iterdir(), None)
+            _check_not_within_sparse(scene)
             return
         if scene.exists():
             raise UserError(
@@ -77,6 +78,18 @@ def check_scene_folder(scene: Path) -> None:
     raise UserError("the scene folder is not there", where=scene, todo=hint)
 
 
+def _check_not_within_sparse(scene: Path) -> None:
+    place = scene.absolute()
+    within = [parent for parent in (place, place.parent) if parent.name == "sparse"]
+    if within and not (scene / "images").is_dir():
+        raise UserError(
+            "the path leads into a scene",
+            where=scene,
+            expected="the folder that holds images/ and sparse/",
+            todo=f"try {within[0].parent}",
+        )
+
+
 def _similar_folder(scene: Path) -> Path | None:
     parent = scene.absolute().parent
     if not parent.is_dir():
@@ -87,17 +100,13 @@ def _similar_folder(scene: Path) -> Path | None:
 
 
 def _no_model(scene: Path) -> UserError:
-    if not has_model(scene) and (scene.parent.name == "sparse" or scene.name == "sparse"):
-        todo = "pass the folder that holds images/ and sparse/"
-    else:
-        todo = "run COLMAP first (crossgrad prepare PHOTOS SCENE), or name the model's folder"
     below = sorted(path.name for path in scene.iterdir())
     return UserError(
         "the scene has no COLMAP model",
         where=scene,
         expected="sparse/0/ with cameras, images and points3D, as .bin or .txt",
         found=", ".join(below[:8]) or "an empty folder",
-        todo=todo,
+        todo="run COLMAP first (crossgrad prepare PHOTOS SCENE), or name the model's folder",
     )
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
@@ -107,6 +108,7 @@ def _has(folder: Path, suffix: str) -> bool:
 
 def _convert_text(folder: Path, converted: Path) -> None:
     """Writes the binary form of a text model into another folder."""
+    guard_pycolmap()
     import pycolmap
 
     try:
@@ -198,6 +200,7 @@ def _open(path: Path) -> Iterator[_Walk]:
 
 
 def _read_cameras(file: _Walk) -> Iterator[tuple[int, Calibration]]:
+    guard_pycolmap()
     import pycolmap
 
     models = {int(model.value): name for name, model in pycolmap.CameraModelId.__members__.items()}

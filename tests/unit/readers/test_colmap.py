@@ -261,7 +261,7 @@ class TestPhotos:
                 image.resize((image.width // 4, image.height // 4)).save(small)
         # One stray file must not shift any pair.
         shutil.copy(small, path / "images_4" / "aerial" / "0000b.jpg")
-        scene = read(path, max_size=12)
+        scene = read(path, max_size=17)
         assert "12 x 8 px (8), 9 x 10 px (8) from images_4/, not resized" in notes(scene)
         view = scene.views[0]
         assert (view.camera.fx, view.camera.cx) == pytest.approx((57.6 / 4, 25.5 / 4))
@@ -396,9 +396,10 @@ class TestModels:
         assert not ColmapReader().accepts(path)
         refuses(path, "no COLMAP model", "images, sparse")
 
-    def test_a_model_folder_is_not_a_scene(self, make):
+    def test_a_path_into_a_scene_is_refused(self, make):
         path = make()
-        refuses(model(path), "no folder of photos")
+        refuses(model(path), "leads into a scene", f"try {path}")
+        refuses(path / "sparse", "leads into a scene", f"try {path}")
 
     def test_paths_that_are_no_scene(self, make):
         path = make()

@@ -14,10 +14,17 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    axis_offsets,
+    coverages,
+    fill_axis_rows,
+    log_window_gradients,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
     FINISHED,
     LARGEST_ALPHA,
+    LEAST,
     OFFSETS,
     ONE,
     STOPPED,
@@ -34,6 +41,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
+    COSINE,
     DECAY,
     DEPTH,
     GREEN,
@@ -43,6 +51,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     ROW_DECAY,
     SEGMENT,
     SEGMENTS,
+    SIGMA_1,
+    SIGMA_2,
+    SINE,
     SLOPE,
     SUM_ABS_X,
     SUM_ABS_Y,
@@ -126,6 +137,7 @@ def _gather(
     constants: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
@@ -138,8 +150,11 @@ def _gather(
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
     pull = broadcast(records, record + ROW_DECAY)
     lean = decay * broadcast(records, record + SLOPE)
+    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
+    inverse_1 = splat(np.float32(1.0)) / broadcast(records, record + SIGMA_1)
+    inverse_2 = splat(np.float32(1.0)) / broadcast(records, record + SIGMA_2)
     zero = splat(np.float32(0.0))
-    sum_1 = sum_d = sum_dd = sum_y = sum_yy = sum_dy = zero
+    sum_1 = sum_a = sum_b = sum_c = sum_d = sum_e = zero
     sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
     while reached != np.uint64(0):
         segment = lowest_bit(reached)
@@ -147,11 +162,18 @@ def _gather(
         row = base + (segment & (TILE_HEIGHT - 1))
         at = segment * _STATE
         offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
-        dx = offsets - broadcast(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-        touched = power >= load(constants, TOUCHED)
-        alpha = smaller(exp2(power, constants), load(constants, LARGEST_ALPHA))
-        alpha = where(touched, alpha, zero)
+        if analytic is None:
+            dx = offsets - broadcast(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+            touched = power >= load(constants, TOUCHED)
+            free = power <= load(constants, CAPPED)
+            alpha = exp2(power, constants)
+        else:
+            u, v = axis_offsets(records, record, offsets, rows, row)
+            alpha = coverages(records, record, u, v, constants)
+            touched = alpha >= load(constants, LEAST)
+            free = touched & (alpha <= load(constants, LARGEST_ALPHA))
+        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
         before = load(state, at + _T)
         weight = alpha * before
         after = before - weight
@@ -174,24 +196,35 @@ def _gather(
         store(state, at + _REST, rest)
         # alpha * dL/d(alpha), the gradient of the exponent and of the log of the opacity
         s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
-        s = where(blended & (power <= load(constants, CAPPED)), s, zero)
-        dy = broadcast(rows, row + ROW_DY)
-        sd = s * dx
-        sy = s * dy
+        s = where(blended & free, s, zero)
         sum_1 = sum_1 + s
-        sum_d = sum_d + sd
-        sum_y = sum_y + sy
-        sum_dd = fma(sd, dx, sum_dd)
-        sum_dy = fma(sd, dy, sum_dy)
-        sum_yy = fma(sy, dy, sum_yy)
-        if absolute is not None:
-            sum_abs_x = sum_abs_x + magnitude(sd)
-            sum_abs_y = sum_abs_y + magnitude(fnma(lean, sd, pull * sy))
-    store(
-        partials,
-        partial,
-        sums(sum_1, sum_d, sum_dd, sum_y, sum_yy, sum_dy, sum_red, sum_green),
-    )
+        if analytic is None:
+            dy = broadcast(rows, row + ROW_DY)
+            sd = s * dx
+            sy = s * dy
+            sum_a = sum_a + sd
+            sum_b = sum_b + sy
+            sum_c = fma(sd, dx, sum_c)
+            sum_d = fma(sy, dy, sum_d)
+            sum_e = fma(sd, dy, sum_e)
+            if absolute is not None:
+                sum_abs_x = sum_abs_x + magnitude(sd)
+                sum_abs_y = sum_abs_y + magnitude(fnma(lean, sd, pull * sy))
+        else:
+            by_u, by_sigma_1 = log_window_gradients(u, inverse_1, constants)
+            by_v, by_sigma_2 = log_window_gradients(v, inverse_2, constants)
+            su = where(free, s * by_u * inverse_1, zero)
+            sv = where(free, s * by_v * inverse_2, zero)
+            sum_a = sum_a + su
+            sum_b = sum_b + sv
+            sum_c = fma(s, where(free, by_sigma_1, zero), sum_c)
+            sum_d = fma(s, where(free, by_sigma_2, zero), sum_d)
+            sum_e = sum_e + fnma(sv, u, su * v)
+            if absolute is not None:
+                sum_abs_x = sum_abs_x + magnitude(fnma(sine, sv, cosine * su))
+                sum_abs_y = sum_abs_y + magnitude(fma(cosine, sv, sine * su))
+    # In the order of SUM_1, SUM_D, SUM_Y, ... or SUM_1, SUM_U, SUM_V, ... of the layout.
+    store(partials, partial, sums(sum_1, sum_a, sum_b, sum_c, sum_d, sum_e, sum_red, sum_green))
     partials[partial + SUM_BLUE] = total(sum_blue)
     if v_depth is not None:
         partials[partial + SUM_DEPTH] = total(sum_depth)
@@ -215,6 +248,7 @@ def _backward(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
@@ -232,7 +266,12 @@ def _backward(
         while filled < BATCH and entry < stop:
             prefetch(records, np.intp(entries[min(entry + BATCH, stop - 1), 0]) * RECORD)
             record = np.intp(entries[entry, 0]) * RECORD
-            fill_rows(records, record, np.float32(left), np.float32(top), rows, filled * ROWS)
+            if analytic is None:
+                fill_rows(records, record, np.float32(left), np.float32(top), rows, filled * ROWS)
+            else:
+                fill_axis_rows(
+                    records, record, np.float32(left), np.float32(top), rows, filled * ROWS
+                )
             batch[filled] = entry
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             filled += np.intp(masks[entry] != 0)
@@ -251,6 +290,7 @@ def _backward(
                 constants,
                 v_depth,
                 absolute,
+                analytic,
                 partials,
                 slot * PARTIAL,
             )
@@ -271,6 +311,7 @@ def differentiate(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
@@ -290,6 +331,7 @@ def differentiate(
         v_alpha: [H, W] gradient by alpha, or None.
         v_depth: [H, W] gradient by the depth, or None.
         absolute: Any vector asks for the sums of absolute gradients; None leaves them out.
+        analytic: As in `composite`.
         partials: [slots * PARTIAL] written for slots of entries with a mask.
         written: [slots] 1 written for these; zero before.
     """
@@ -308,6 +350,7 @@ def differentiate(
             v_alpha,
             v_depth,
             absolute,
+            analytic,
             partials,
             written,
         )

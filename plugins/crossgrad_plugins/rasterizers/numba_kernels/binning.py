@@ -144,12 +144,16 @@ def _find(
     counts: NDArray[np.int32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
+    boxed: bool,
 ) -> int:
     """Writes the tiles that record j reaches to its slots and counts them; returns their number."""
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
     slot = first_slot
     for block in range(boxes[j, 2], boxes[j, 3], LANES):
-        _spans(j * RECORD, block, records, begins, ends)
+        if boxed:
+            begins[:], ends[:] = left, right
+        else:
+            _spans(j * RECORD, block, records, begins, ends)
         for row in range(min(LANES, boxes[j, 3] - block)):
             begin = np.intp(max(left, begins[row]))
             end = np.intp(min(right, ends[row]))
@@ -166,6 +170,7 @@ def find_tiles(
     tile_columns: int,
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
+    boxed: bool,
     drawn: NDArray[np.int64],
     shelves: NDArray[np.int32],
     tile_of_slot: NDArray[np.int32],
@@ -177,6 +182,7 @@ def find_tiles(
         tile_columns: Tiles in a row of tiles.
         records: Flat records.
         boxes: [N, 4] tile boxes per record.
+        boxed: Whether to take all tiles of the boxes (records of the analytic response).
         drawn: [chunks] records per chunk.
         shelves: [N, SHELF] per record, completed.
         tile_of_slot: [slots] written.
@@ -198,6 +204,7 @@ def find_tiles(
                     counts[part],
                     begins,
                     ends,
+                    boxed,
                 )
                 shelves[j, FIRST_ROW] = boxes[j, 2]
                 shelves[j, LAST_ROW] = boxes[j, 3] - 1

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
-from crossgrad_plugins.rasterizers.numba_kernels.layout import COLUMNS, SEGMENT, STOP, TOUCH
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    COLUMNS,
+    LEAST_ALPHA,
+    SEGMENT,
+    STOP,
+    TOUCH,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.simd import (
     LANES,
     Lanes,
@@ -33,12 +39,14 @@ STOPPED = 9 * LANES
 ONE = 10 * LANES
 FINISHED = 11 * LANES
 CAPPED = 12 * LANES
-OFFSETS = 13 * LANES  # pixel offsets of each column of segments
+LEAST = 13 * LANES
+OFFSETS = 14 * LANES  # pixel offsets of each column of segments
 
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     """Returns the constants for one cap of alpha, eight equal numbers each (offsets: 0, 1, ...)."""
-    values = (_ROUND, *_EXP2, *_EXP2_HIGH, max_alpha, TOUCH, STOP, 1.0, -1.0, math.log2(max_alpha))
+    shared = (max_alpha, TOUCH, STOP, 1.0, -1.0, math.log2(max_alpha), LEAST_ALPHA)
+    values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
     offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32)
     return np.concatenate([np.repeat(np.array(values, dtype=np.float32), LANES), offsets])
 

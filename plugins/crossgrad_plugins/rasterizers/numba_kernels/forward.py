@@ -4,8 +4,14 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    axis_offsets,
+    coverages,
+    fill_axis_rows,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     LARGEST_ALPHA,
+    LEAST,
     OFFSETS,
     STOPPED,
     TOUCHED,
@@ -97,6 +103,7 @@ def _blend(
     constants: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
+    analytic: NDArray[np.float32] | None,
 ) -> int:
     """Blends one Gaussian into the reached segments; returns the number of pixels blended."""
     decay = broadcast(records, record + DECAY)
@@ -112,12 +119,17 @@ def _blend(
         row = base + (segment & (TILE_HEIGHT - 1))
         at = segment * _STATE
         offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
-        dx = offsets - broadcast(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-        touched = power >= load(constants, TOUCHED)
-        # Where nothing is touched exp2 may give anything, NaN included: select, never multiply.
-        alpha = smaller(exp2(power, constants), load(constants, LARGEST_ALPHA))
-        alpha = where(touched, alpha, zero)
+        if analytic is None:
+            dx = offsets - broadcast(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+            touched = power >= load(constants, TOUCHED)
+            alpha = exp2(power, constants)
+        else:
+            u, v = axis_offsets(records, record, offsets, rows, row)
+            alpha = coverages(records, record, u, v, constants)
+            touched = alpha >= load(constants, LEAST)
+        # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
+        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
         before = load(state, at + _T)
         weight = alpha * before
         after = before - weight
@@ -171,6 +183,7 @@ def _composite(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
+    analytic: NDArray[np.float32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
     """Composites one tile and leaves in `masks` the segments that each entry was blended into."""
@@ -188,9 +201,15 @@ def _composite(
         for k in range(entry, end):
             prefetch(records, np.intp(entries[min(k + BATCH, stop - 1), 0]) * RECORD)
             record = np.intp(entries[k, 0]) * RECORD
-            reached = live & fill_rows(
-                records, record, np.float32(left), np.float32(top), rows, filled * ROWS
-            )
+            if analytic is None:
+                reached = fill_rows(
+                    records, record, np.float32(left), np.float32(top), rows, filled * ROWS
+                )
+            else:
+                reached = fill_axis_rows(
+                    records, record, np.float32(left), np.float32(top), rows, filled * ROWS
+                )
+            reached &= live
             masks[k] = np.uint64(reached)
             batch[filled] = k
             # No branch: an entry that reaches nothing is overwritten by the next one.
@@ -199,7 +218,7 @@ def _composite(
             record = np.intp(entries[batch[k], 0]) * RECORD
             reached = np.uint64(masks[batch[k]])
             pixels = _blend(
-                reached, records, record, rows, k * ROWS, state, constants, depth, counts
+                reached, records, record, rows, k * ROWS, state, constants, depth, counts, analytic
             )
             if counts is not None:
                 counts[entries[batch[k], 1]] = pixels
@@ -220,6 +239,7 @@ def composite(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
+    analytic: NDArray[np.float32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
     """Composites the tiles in the given order.
@@ -235,6 +255,7 @@ def composite(
         alpha: [H, W] written.
         depth: [H, W] written, or None.
         counts: [slots] pixels blended per slot, written; zero before. None: not counted.
+        analytic: Any vector says that the records are of the analytic response; None: plain.
         masks: [E] segments per entry, written; zero before.
     """
     for job in prange(tiles.shape[0]):
@@ -249,5 +270,6 @@ def composite(
             alpha,
             depth,
             counts,
+            analytic,
             masks,
         )

@@ -7,6 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.gaussians import Response
 from crossgrad_plugins.rasterizers.numba_kernels.backward import differentiate
 from crossgrad_plugins.rasterizers.numba_kernels.binning import (
     PARTS,
@@ -87,7 +88,8 @@ class DrawOptions:
         max_alpha: Cap of a Gaussian's alpha, below 1.
         near: Gaussians are drawn if their centre's depth is larger.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        antialiased: Lowers opacities by what the dilation adds in area (Mip-Splatting's 2-D filter).
+        response: How a Gaussian fills a pixel; `antialiased` lowers opacities by what the dilation
+            adds in area (Mip-Splatting's 2-D filter), `analytic` is not dilated.
         depth: Whether to composite the depth.
         pixels: Whether to count the pixels of each Gaussian.
     """
@@ -95,7 +97,7 @@ class DrawOptions:
     max_alpha: float = 0.99
     near: float = 1e-3
     dilation: float = 0.3
-    antialiased: bool = False
+    response: Response = "plain"
     depth: bool = False
     pixels: bool = False
 
@@ -197,7 +199,7 @@ def forward(
 ) -> Frame:
     """Draws the Gaussians over a background [3]."""
     projected, boxes, shelves, depths, room = _project(gaussians, camera, options)
-    lists = _bin(projected, boxes, shelves, depths, room)
+    lists = _bin(projected, boxes, shelves, depths, room, boxed=options.response == "analytic")
     shape = (camera.height, camera.width)
     image = np.empty((*shape, 3), np.float32)
     alpha = np.empty(shape, np.float32)
@@ -215,6 +217,7 @@ def forward(
         alpha,
         depth,
         counts,
+        _analytic(options),
         masks,
     )
     pixels = None
@@ -270,6 +273,7 @@ def backward(
         None if v_alpha is None else np.ascontiguousarray(v_alpha, np.float32),
         None if v_depth is None else np.ascontiguousarray(v_depth, np.float32),
         np.empty(0, np.float32) if absolute else None,
+        _analytic(options),
         partials,
         written,
     )
@@ -287,8 +291,9 @@ def backward(
     )
     unproject(
         projected.camera,
-        options.dilation,
-        options.antialiased,
+        _dilation(options),
+        options.response == "antialiased",
+        _analytic(options),
         v_depth is not None,
         gaussians.means,
         gaussians.quats,
@@ -324,6 +329,15 @@ def backward(
     return gradients
 
 
+def _analytic(options: DrawOptions) -> Float32 | None:
+    """A vector asks for the kernels of the analytic response, which are compiled when first used."""
+    return np.empty(0, np.float32) if options.response == "analytic" else None
+
+
+def _dilation(options: DrawOptions) -> float:
+    return 0.0 if options.response == "analytic" else options.dilation
+
+
 def _project(
     gaussians: GaussianArrays, camera: CameraArrays, options: DrawOptions
 ) -> tuple[Projected, Int32, Int32, NDArray[np.float64], Int64]:
@@ -343,8 +357,9 @@ def _project(
     project(
         projected.camera,
         options.near,
-        options.dilation,
-        options.antialiased,
+        _dilation(options),
+        options.response == "antialiased",
+        _analytic(options),
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -375,7 +390,13 @@ def _project(
 
 
 def _bin(
-    projected: Projected, boxes: Int32, shelves: Int32, depths: NDArray[np.float64], room: Int64
+    projected: Projected,
+    boxes: Int32,
+    shelves: Int32,
+    depths: NDArray[np.float64],
+    room: Int64,
+    *,
+    boxed: bool,
 ) -> TileLists:
     camera = projected.camera
     columns = (camera.width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -384,7 +405,7 @@ def _bin(
     order = order_by_depth(keys, items)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
-    find_tiles(columns, projected.records, boxes, projected.drawn, shelves, tile_of_slot, counts)
+    find_tiles(columns, projected.records, boxes, boxed, projected.drawn, shelves, tile_of_slot, counts)
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
     entries = np.empty((int(starts[-1]), 2), np.int32)

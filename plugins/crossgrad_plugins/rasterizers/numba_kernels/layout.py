@@ -35,16 +35,26 @@ LOG_OPACITY = 8  # log2 of the opacity (with the antialiasing factor)
 RED, GREEN, BLUE = 9, 10, 11
 DEPTH = 12
 
+#: A record of the analytic response has these instead of SLOPE to LOG_OPACITY.
+COSINE, SINE = 4, 5  # of the longer main axis
+SIGMA_1, SIGMA_2 = 6, 7  # standard deviations along the main axes, pixels
+OPACITY = 8
+REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which nothing is touched, pixels
+
 #: Sums over pixels that the backward pass leaves per drawn Gaussian and tile.
 PARTIAL = 16
-SUM_1, SUM_D, SUM_DD, SUM_Y, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
+SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
 SUM_RED, SUM_GREEN, SUM_BLUE = 6, 7, 8
 SUM_DEPTH = 9
 SUM_ABS_X, SUM_ABS_Y = 10, 11
+#: Of the analytic response instead of SUM_D to SUM_DY.
+SUM_U, SUM_V, SUM_SIGMA_1, SUM_SIGMA_2, SUM_TURN = 1, 2, 3, 4, 5
 
 LOG2_E = 1.0 / math.log(2.0)
 #: A pixel is touched where the exponent plus log2 of the opacity reaches this.
 TOUCH = -math.log2(255.0)
+#: The same as an alpha.
+LEAST_ALPHA = 1.0 / 255.0
 #: Row extents are computed with this much to spare, so that rounding loses no touched pixel.
 SPARE = 1e-4
 #: Compositing stops before a blend that would bring the transmittance below this.

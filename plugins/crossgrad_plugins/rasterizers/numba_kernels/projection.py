@@ -6,6 +6,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    SIGMA_FLOOR,
+    main_axes,
+    window,
+    window_reach,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     Pinhole,
@@ -24,14 +30,22 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLOCK,
     BLUE,
     CHUNK,
+    COSINE,
     DECAY,
     DEPTH,
     GREEN,
+    LEAST_ALPHA,
     LOG2_E,
     LOG_OPACITY,
+    OPACITY,
+    REACH_1,
+    REACH_2,
     RECORD,
     RED,
     ROW_DECAY,
+    SIGMA_1,
+    SIGMA_2,
+    SINE,
     SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -47,7 +61,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 _Z, _U, _V, _A, _B, _C, _DET, _FACTOR = range(8)
 _FOUND = 8
 
-_LEAST_OPACITY = 1.0 / 255.0
 _LARGEST_RADIUS = 2.0**30
 # Projected values beyond this are dropped; well inside float32.
 _LARGEST = 1e30
@@ -158,9 +171,44 @@ def _project_block(
         found[_A * BLOCK + k] = a
         found[_B * BLOCK + k] = b
         found[_C * BLOCK + k] = c
-        # Not positive for what cannot be drawn.
-        found[_DET * BLOCK + k] = det if inverse_norm > 0.0 else 0.0
+        # Negative for what cannot be drawn.
+        found[_DET * BLOCK + k] = det if inverse_norm > 0.0 else -1.0
         found[_FACTOR * BLOCK + k] = factor
+
+
+@device
+def _place(
+    j: int,
+    u: float,
+    v: float,
+    extent_x: float,
+    extent_y: float,
+    width: int,
+    height: int,
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+) -> tuple[float, float, float, float]:
+    """Writes mean and tile box of record j; returns its pixels x0, x1, y0, y1 (x0 > x1: none)."""
+    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, width)
+    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, height)
+    if x0 > x1 or y0 > y1:
+        return 1.0, 0.0, 1.0, 0.0
+    at = j * RECORD
+    records[at + U_WHOLE] = np.floor(u)
+    records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
+    records[at + V_WHOLE] = np.floor(v)
+    records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
+    boxes[j, 0] = np.int32(x0) // TILE_WIDTH
+    boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
+    boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
+    boxes[j, 3] = np.int32(y1) // TILE_HEIGHT + 1
+    return x0, x1, y0, y1
+
+
+@device
+def _radius(extent: float) -> int:
+    """Returns the radius that is reported for a footprint of half-extent `extent`."""
+    return np.int32(max(1.0, np.ceil(min(extent, _LARGEST_RADIUS))))
 
 
 @device
@@ -172,7 +220,6 @@ def _record(
     height: int,
     found: NDArray[np.float64],
     records: NDArray[np.float32],
-    depths: NDArray[np.float64],
     boxes: NDArray[np.int32],
 ) -> int:
     """Makes record j of projected Gaussian k; returns its radius, 0 where it touches no pixel."""
@@ -193,29 +240,87 @@ def _record(
     ):
         return 0
     extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
-    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, width)
-    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, height)
-    if x0 > x1 or y0 > y1:
-        return 0
-    if not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    if x0 > x1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
         return 0
     at = j * RECORD
-    records[at + U_WHOLE] = np.floor(u)
-    records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
-    records[at + V_WHOLE] = np.floor(v)
-    records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
     records[at + SLOPE] = slope
     records[at + ROW_DECAY] = max(0.5 * LOG2_E * inverse_c, _FLAT)
     records[at + DECAY] = max(decay, _FLAT)
     records[at + WIDTH] = min(2.0 / LOG2_E * variance, 1.0 / _FLAT)
     records[at + LOG_OPACITY] = log_opacity
-    records[at + DEPTH] = found[_Z * BLOCK + k]
-    depths[j] = found[_Z * BLOCK + k]
-    boxes[j, 0] = np.int32(x0) // TILE_WIDTH
-    boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
-    boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
-    boxes[j, 3] = np.int32(y1) // TILE_HEIGHT + 1
-    return np.int32(max(1.0, np.ceil(min(max(extent_x, extent_y), _LARGEST_RADIUS))))
+    return _radius(max(extent_x, extent_y))
+
+
+@device
+def _covers(
+    x: float,
+    y: float,
+    u: float,
+    v: float,
+    axis: tuple[float, float],
+    sigma: tuple[float, float],
+    reach: tuple[float, float],
+    opacity: float,
+) -> bool:
+    """Whether the analytic response touches pixel (x, y)."""
+    dx, dy = x + 0.5 - u, y + 0.5 - v
+    along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
+    if abs(along) > reach[0] or abs(across) > reach[1]:
+        return False
+    return opacity * window(along, sigma[0]) * window(across, sigma[1]) >= LEAST_ALPHA
+
+
+@device
+def _record_analytic(
+    k: int,
+    j: int,
+    opacity: float,
+    width: int,
+    height: int,
+    found: NDArray[np.float64],
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+) -> int:
+    """As `_record` for the analytic response."""
+    u, v = found[_U * BLOCK + k], found[_V * BLOCK + k]
+    a, c, det = found[_A * BLOCK + k], found[_C * BLOCK + k], found[_DET * BLOCK + k]
+    if not (det >= 0.0 and a + c + det < math.inf and abs(u) + abs(v) < _LARGEST):
+        return 0
+    cosine, sine, variance_1, variance_2 = main_axes(a, found[_B * BLOCK + k], c, det)
+    sigma_1 = math.sqrt(max(variance_1, SIGMA_FLOOR * SIGMA_FLOOR))
+    sigma_2 = math.sqrt(max(variance_2, SIGMA_FLOOR * SIGMA_FLOOR))
+    peak_1, peak_2 = window(0.0, sigma_1), window(0.0, sigma_2)
+    if not opacity * peak_1 * peak_2 >= LEAST_ALPHA:
+        return 0
+    contrast = opacity * math.sqrt(2.0 * math.pi) / LEAST_ALPHA
+    reach_1 = window_reach(sigma_1, math.log(contrast * sigma_1 * peak_2))
+    reach_2 = window_reach(sigma_2, math.log(contrast * sigma_2 * peak_1))
+    if not reach_1 + reach_2 < _LARGEST:
+        return 0
+    extent_x = abs(cosine) * reach_1 + abs(sine) * reach_2
+    extent_y = abs(sine) * reach_1 + abs(cosine) * reach_2
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    if x0 > x1:
+        return 0
+    axis, sigma, reach = (cosine, sine), (sigma_1, sigma_2), (reach_1, reach_2)
+    x, y = clamped(np.floor(u), x0, x1), clamped(np.floor(v), y0, y1)
+    touched = _covers(x, y, u, v, axis, sigma, reach, opacity)
+    y = y0
+    while not touched and y <= y1:
+        x = x0
+        while not touched and x <= x1:
+            touched = _covers(x, y, u, v, axis, sigma, reach, opacity)
+            x += 1.0
+        y += 1.0
+    if not touched:
+        return 0
+    at = j * RECORD
+    records[at + COSINE], records[at + SINE] = cosine, sine
+    records[at + SIGMA_1], records[at + SIGMA_2] = sigma_1, sigma_2
+    records[at + REACH_1], records[at + REACH_2] = reach_1, reach_2
+    records[at + OPACITY] = opacity
+    return _radius(math.sqrt(2.0 * math.log(opacity / LEAST_ALPHA) * max(a, c)))
 
 
 @device
@@ -236,6 +341,7 @@ def project(
     near: float,
     dilation: float,
     antialiased: bool,
+    analytic: NDArray[np.float32] | None,
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
@@ -257,6 +363,7 @@ def project(
         near: Least depth.
         dilation: Added to both variances, px^2.
         antialiased: Whether opacities are lowered by what the dilation adds in area.
+        analytic: Any vector asks for records of the analytic response (with no dilation).
         means: [N, 3].
         quats: [N, 4] wxyz, any norm.
         scales: [N, 3] linear.
@@ -296,16 +403,23 @@ def project(
                 opacity = np.float64(opacities[i])
                 if not (found[_Z * BLOCK + k] > near and found[_Z * BLOCK + k] < math.inf):
                     continue
-                if not (opacity >= _LEAST_OPACITY and opacity < math.inf):
+                if not (opacity >= LEAST_ALPHA and opacity < math.inf):
                     continue
-                radius = _record(
-                    k, j, opacity, camera.width, camera.height, found, records, depths, boxes
-                )
+                if analytic is None:
+                    radius = _record(
+                        k, j, opacity, camera.width, camera.height, found, records, boxes
+                    )
+                else:
+                    radius = _record_analytic(
+                        k, j, opacity, camera.width, camera.height, found, records, boxes
+                    )
                 if radius == 0:
                     continue
                 if colors is not None and not _tint(i, j, colors, records):
                     continue
                 radii[i] = radius
+                records[j * RECORD + DEPTH] = found[_Z * BLOCK + k]
+                depths[j] = found[_Z * BLOCK + k]
                 owners[j] = i
                 shelves[j, FIRST_SLOT] = tiles
                 tiles += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])

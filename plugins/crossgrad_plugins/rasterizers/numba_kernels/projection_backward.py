@@ -6,6 +6,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import SIGMA_FLOOR, main_axes
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     LEAST_DET,
@@ -38,6 +39,11 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SUM_DY,
     SUM_GREEN,
     SUM_RED,
+    SUM_SIGMA_1,
+    SUM_SIGMA_2,
+    SUM_TURN,
+    SUM_U,
+    SUM_V,
     SUM_Y,
     SUM_YY,
 )
@@ -99,6 +105,34 @@ def _factor_gradient(
 
 
 @device
+def _axes_gradient(
+    cosine: float,
+    sine: float,
+    variance_1: float,
+    variance_2: float,
+    sum_sigma_1: float,
+    sum_sigma_2: float,
+    v_angle: float,
+) -> Triple:
+    """Returns the gradients of A, B (as one number) and C of the analytic response.
+
+    The sums are those of gradients by the logarithms of the standard deviations. A floored one has
+    no gradient, and the axes of a round Gaussian do not turn.
+    """
+    floor = SIGMA_FLOOR * SIGMA_FLOOR
+    v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0
+    v_2 = 0.5 * sum_sigma_2 / variance_2 if variance_2 > floor else 0.0
+    gap = variance_1 - variance_2
+    v_turn = v_angle / gap if gap > 0.0 else 0.0
+    mixed = cosine * sine
+    return (
+        cosine * cosine * v_1 + sine * sine * v_2 - mixed * v_turn,
+        2.0 * mixed * (v_1 - v_2) + (cosine * cosine - sine * sine) * v_turn,
+        sine * sine * v_1 + cosine * cosine * v_2 + mixed * v_turn,
+    )
+
+
+@device
 def _turn_gradient(
     q: Row,
     inverse_norm: float,
@@ -147,6 +181,7 @@ def _unproject_block(
     camera: Pinhole,
     dilation: float,
     antialiased: bool,
+    analytic: NDArray[np.float32] | None,
     block: NDArray[np.float64],
 ) -> None:
     """Finds the gradients of `count` Gaussians; no branches on them, so it is vectorised."""
@@ -166,16 +201,41 @@ def _unproject_block(
         columns = rotation(qw, qx, qy, qz)
         p, q = in_axes(row_x, columns), in_axes(row_y, columns)
         m, n = times(p, scale), times(q, scale)
-        _, b, c, det, factor = covariance(m, n, dilation, antialiased)
+        a, b, c, det, factor = covariance(m, n, dilation, antialiased)
 
-        v_a, v_b, v_c = _covariance_gradient(
-            b, c, det, block[SUM_DD * BLOCK + k], block[SUM_DY * BLOCK + k], block[SUM_YY * BLOCK + k]
-        )
-        if antialiased:
-            add_a, add_b, add_c = _factor_gradient(m, n, dilation, det, factor, block[SUM_1 * BLOCK + k])
-            v_a += add_a
-            v_b += add_b
-            v_c += add_c
+        if analytic is None:
+            v_a, v_b, v_c = _covariance_gradient(
+                b,
+                c,
+                det,
+                block[SUM_DD * BLOCK + k],
+                block[SUM_DY * BLOCK + k],
+                block[SUM_YY * BLOCK + k],
+            )
+            if antialiased:
+                add_a, add_b, add_c = _factor_gradient(
+                    m, n, dilation, det, factor, block[SUM_1 * BLOCK + k]
+                )
+                v_a += add_a
+                v_b += add_b
+                v_c += add_c
+            inverse_det = 1.0 / det
+            v_u = c * inverse_det * block[SUM_D * BLOCK + k]
+            v_v = block[SUM_Y * BLOCK + k] / c - b * inverse_det * block[SUM_D * BLOCK + k]
+            block[_INVERSE_VARIANCE * BLOCK + k] = c * inverse_det
+        else:
+            cosine, sine, variance_1, variance_2 = main_axes(a, b, c, det)
+            v_a, v_b, v_c = _axes_gradient(
+                cosine,
+                sine,
+                variance_1,
+                variance_2,
+                block[SUM_SIGMA_1 * BLOCK + k],
+                block[SUM_SIGMA_2 * BLOCK + k],
+                block[SUM_TURN * BLOCK + k],
+            )
+            v_u = sine * block[SUM_V * BLOCK + k] - cosine * block[SUM_U * BLOCK + k]
+            v_v = -sine * block[SUM_U * BLOCK + k] - cosine * block[SUM_V * BLOCK + k]
         v_m = _outer_sum(m, 2.0 * v_a, n, v_b)
         v_n = _outer_sum(n, 2.0 * v_c, m, v_b)
         v_p, v_q = times(v_m, scale), times(v_n, scale)
@@ -194,12 +254,8 @@ def _unproject_block(
         block[(_V_QUAT + 2) * BLOCK + k] = v_quat[2]
         block[(_V_QUAT + 3) * BLOCK + k] = v_quat[3]
 
-        inverse_det = 1.0 / det
-        v_u = c * inverse_det * block[SUM_D * BLOCK + k]
-        v_v = block[SUM_Y * BLOCK + k] / c - b * inverse_det * block[SUM_D * BLOCK + k]
         block[_V_CENTRE * BLOCK + k] = v_u
         block[(_V_CENTRE + 1) * BLOCK + k] = v_v
-        block[_INVERSE_VARIANCE * BLOCK + k] = c * inverse_det
 
         # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
         v_row_x, v_row_y = _weighted(columns, v_p), _weighted(columns, v_q)
@@ -243,6 +299,7 @@ def unproject(
     camera: Pinhole,
     dilation: float,
     antialiased: bool,
+    analytic: NDArray[np.float32] | None,
     with_depth: bool,
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
@@ -264,7 +321,7 @@ def unproject(
     """Adds up each Gaussian's entries and carries the sums on to its parameters.
 
     Args:
-        camera, dilation, antialiased: As in `project`.
+        camera, dilation, antialiased, analytic: As in `project`.
         with_depth: Whether the partial sums hold gradients of the depth.
         means, quats, scales, opacities: As in `project`.
         drawn, owners: From `project`.
@@ -304,7 +361,7 @@ def unproject(
                 _bring(i, size, used, sums, means, quats, scales, block)
                 numbers[size] = i
                 size += 1
-            _unproject_block(size, camera, dilation, antialiased, block)
+            _unproject_block(size, camera, dilation, antialiased, analytic, block)
             for k in range(size):
                 i = numbers[k]
                 for axis in range(3):
@@ -314,7 +371,7 @@ def unproject(
                     v_quats[i, axis] = block[(_V_QUAT + axis) * BLOCK + k]
                 for axis in range(2):
                     v_centres[i, axis] = block[(_V_CENTRE + axis) * BLOCK + k]
-                if v_absolute.shape[0] > 0:
-                    # In the sums' units, the decays of the records.
+                if analytic is None and v_absolute.shape[0] > 0:
+                    # These sums are in units of the decays of the records.
                     v_absolute[i, 0] *= block[_INVERSE_VARIANCE * BLOCK + k]
                     v_absolute[i, 1] *= 2.0 * math.log(2.0)

@@ -1,6 +1,6 @@
 """How often the intervals of sigma_w^2, sigma_b^2 and their ratio hold the truth.
 
-    python benchmarks/coverage.py [repetitions]
+    python benchmarks/interval_coverage.py [repetitions]
 
 Prints the share of repetitions (nominally 95 %) per kind of noise, dimension of the gradients,
 number of near and far views, and true ratio sigma_b^2 / sigma_w^2.

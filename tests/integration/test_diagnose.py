@@ -1,0 +1,135 @@
+"""Diagnostics of whole runs: the command, and the observer that changes no bit."""
+
+import csv
+
+import pytest
+import torch
+
+from crossgrad_core import app
+from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.cli.main import main
+from crossgrad_core.diagnostics.app import diagnose
+from crossgrad_core.diagnostics.command import Options
+from crossgrad_core.errors import UserError
+from crossgrad_core.testing.scenes import write_tiny_scene
+
+FILES = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
+QUICK = Options(per_group=4, probes=2, seconds=1.0)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    write_tiny_scene(folder, views=9, folders=("street", "aerial"))
+    return folder
+
+
+def run(scene, out, **settings):
+    given = {"scene": str(scene), "out": str(out), "steps": 24, "eval_every": 12, "threads": 1}
+    assert app.run({**given, **settings}, verbosity=-1) == 0
+    return load(latest(out))
+
+
+def table(folder):
+    with (folder / "diagnostics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+OBSERVER = {"name": "diagnostics", "every": 8, "views": 4}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"sampler": {"name": "epoch"}, "operator": {"name": "sum"}},
+        {"sampler": {"name": "near-far"}, "operator": {"name": "symmetric"}},
+        {"sampler": {"name": "random"}, "background": "random"},
+    ],
+    ids=["one view", "pair", "random background"],
+)
+def test_watching_changes_no_bit_of_the_training(scene, tmp_path, settings):
+    plain = run(scene, tmp_path / "plain", **settings)
+    watched = run(scene, tmp_path / "watched", observers=[OBSERVER], **settings)
+    assert same(plain.parameters, watched.parameters)
+    assert same(plain.exp_avg, watched.exp_avg)
+    assert same(plain.exp_avg_sq, watched.exp_avg_sq)
+    assert plain.generators == watched.generators
+    assert {path.name for path in (tmp_path / "watched").iterdir()} >= FILES
+    assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [8, 16, 24]
+
+
+def test_a_probe_uses_the_run_s_own_groups(scene, tmp_path):
+    settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
+    run(scene, tmp_path / "run", observers=[OBSERVER], **settings)
+    assert {row["grouping"] for row in table(tmp_path / "run")} == {"of the run"}
+
+
+def test_the_time_of_a_probe_is_told_and_is_not_training_time(scene, tmp_path):
+    run(scene, tmp_path / "run", observers=[{**OBSERVER, "every": 1}])
+    probing = {row["step"]: float(row["probe_seconds"]) for row in table(tmp_path / "run")}
+    assert len(probing) == 24
+    assert all(seconds > 0 for seconds in probing.values())
+
+
+def test_a_resumed_run_continues_its_table(scene, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    run(scene, whole, observers=[OBSERVER])
+    run(scene, parts, observers=[OBSERVER], stop_after=12)
+    assert app.run({}, resume=parts, verbosity=-1) == 0
+
+    def figures(folder):
+        return [{k: v for k, v in row.items() if k != "probe_seconds"} for row in table(folder)]
+
+    assert figures(parts) == figures(whole)
+
+
+def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
+    diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
+    printed = capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+    assert "model: a vanilla run of" in printed
+    assert "Sarle's bimodality" in printed
+    rows = table(tmp_path / "out")
+    assert len({row["step"] for row in rows}) == 2
+    assert {row["metric"] for row in rows} == {"plain", "adam"}
+    assert {"means", "opacities", "all"} <= {row["block"] for row in rows}
+    assert (tmp_path / "out" / "diagnostics.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_run_is_diagnosed_where_it_is(scene, tmp_path, capsys):
+    settings = {"sampler": {"name": "near-far"}, "operator": {"name": "symmetric"}}
+    run(scene, tmp_path / "run", **settings)
+    arguments = ["diagnose", "--run", str(tmp_path / "run"), "--views", "3", "--threads", "1"]
+    main([*arguments, "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert f"run {tmp_path / 'run'} (vanilla, near-far, symmetric) at step 24" in printed
+    assert {row["step"] for row in table(tmp_path / "out")} == {"24"}
+    assert {row["near_views"] for row in table(tmp_path / "out")} == {"3"}
+
+
+def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):
+    run(scene, tmp_path / "run")
+    labels = tmp_path / "labels.csv"
+    options = Options(per_group=4, signature=labels)
+    diagnose(None, tmp_path / "run", {"threads": 1}, options, tmp_path / "out")
+    names = {line.split(",")[1] for line in labels.read_text().splitlines()}
+    assert names == {"near", "far"}
+    grouping = {"name": "lists", "file": str(labels)}
+    run(scene, tmp_path / "second", sampler={"name": "near-far"}, grouping=grouping)
+
+
+def test_bad_requests_are_refused(scene, tmp_path):
+    with pytest.raises(UserError, match="either a scene"):
+        diagnose(scene, tmp_path, {}, QUICK, None)
+    with pytest.raises(UserError, match="nosuch"):
+        diagnose(scene, None, {}, Options(grouping="nosuch"), tmp_path / "a")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "diagnostics.csv").touch()
+    with pytest.raises(UserError, match="holds a report"):
+        diagnose(scene, None, {}, QUICK, tmp_path / "b")
+    with pytest.raises(UserError, match="not the folder of a run"):
+        diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")

@@ -1,0 +1,185 @@
+"""Intervals of the variance split: coverage, invariances, edges."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crossgrad_core.diagnostics.grouped import GroupedGramian, Groups
+from crossgrad_core.diagnostics.interval import Interval
+from crossgrad_core.diagnostics.intervals import split_intervals
+from crossgrad_core.diagnostics.resampling import Resamples, multiplicities
+from crossgrad_core.diagnostics.variance import split_of, variance_split
+
+
+def benchmark():
+    path = Path(__file__).parents[3] / "benchmarks" / "coverage.py"
+    spec = importlib.util.spec_from_file_location("coverage_benchmark", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+COVERAGE = benchmark().coverage
+REPETITIONS = 120
+#: Three standard errors of a share of 0.95 in so many repetitions.
+SLACK = 3 * (0.95 * 0.05 / REPETITIONS) ** 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "dimension", "sizes", "ratio"),
+    [
+        ("normal", 30, (12, 12), 0.1),
+        ("normal", 300, (8, 8), 1.0),
+        ("decaying", 30, (8, 24), 1.0),
+        ("finite", 30, (12, 12), 0.1),
+    ],
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(kind, dimension, sizes, ratio):
+    held = COVERAGE(kind, dimension, sizes, ratio, REPETITIONS)
+    assert (held > 0.95 - SLACK).all()
+
+
+def test_intervals_are_not_idle():
+    # An interval that held everything would pass the test above.
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(24, 300))
+    rows[12:] += 0.5
+    groups = Groups(np.arange(24) < 12)
+    found = split_intervals(rows @ rows.T, groups, rng)
+    assert found.within.high / found.within.low < 1.3
+    assert 0.5 * 18.75 < found.between.low < 18.75 < found.between.high < 1.5 * 18.75
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sizes", [(8, 8), (12, 12)])
+@pytest.mark.parametrize(
+    ("kind", "dimension", "lowest"), [("normal", 30, 0.92), ("radial5", 30, 0.88)]
+)
+def test_acceptance_in_a_thousand_repetitions(kind, dimension, lowest, sizes):
+    within, between, _ = COVERAGE(kind, dimension, sizes, 1.0, 1000)
+    assert lowest <= within <= 0.98
+    assert lowest <= between <= 0.98
+
+
+def sample(seed=0, near=9, far=7, dimension=20, shift=0.3):
+    rows = np.random.default_rng(seed).normal(size=(near + far, dimension))
+    rows[:near] += shift
+    return rows, np.arange(near + far) < near
+
+
+def ends(rows, near, **options):
+    found = split_intervals(rows @ rows.T, Groups(near, **options), np.random.default_rng(3))
+    return np.array([(i.low, i.high) for i in (found.within, found.between, found.ratio)])
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e25])
+def test_intervals_scale_with_the_squared_gradients(scale):
+    rows, near = sample()
+    expected = ends(rows, near) * np.array([[scale**2], [scale**2], [1.0]])
+    np.testing.assert_allclose(ends(scale * rows, near), expected, rtol=1e-5)
+
+
+def test_a_common_part_of_all_gradients_does_not_matter():
+    rows, near = sample()
+    np.testing.assert_allclose(ends(rows + 100.0, near), ends(rows, near), rtol=1e-5)
+
+
+def test_a_rotation_of_the_gradients_does_not_matter():
+    rows, near = sample()
+    rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(20, 20)))[0]
+    np.testing.assert_allclose(ends(rows @ rotation, near), ends(rows, near), rtol=1e-5)
+
+
+def test_the_same_generator_gives_the_same_ends():
+    rows, near = sample()
+    assert (ends(rows, near) == ends(rows, near)).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_estimates_lie_inside_where_they_can(seed):
+    rows, near = sample(seed)
+    gramian, groups = rows @ rows.T, Groups(near)
+    figures = variance_split(gramian, groups)
+    found = split_intervals(gramian, groups, np.random.default_rng(0))
+    assert found.within.holds(figures.within)
+    assert found.between.holds(max(figures.between, 0.0))
+    assert found.between.low >= 0.0
+
+
+def test_a_wide_gap_is_told_from_none():
+    rows, near = sample(shift=3.0)
+    assert ends(rows, near)[1, 0] > 0.0
+    rows, near = sample(shift=0.0)
+    assert ends(rows, near)[1, 0] == 0.0
+
+
+def test_probing_every_camera_leaves_no_doubt():
+    rows, near = sample()
+    groups = Groups(near, cameras=(9, 7))
+    figures = variance_split(rows @ rows.T, groups)
+    found = split_intervals(rows @ rows.T, groups, np.random.default_rng(0))
+    assert found.within == Interval(figures.within, figures.within)
+    assert found.between == Interval(figures.between, figures.between)
+    assert found.ratio.low == pytest.approx(figures.ratio)
+
+
+def test_probing_most_cameras_leaves_little_doubt():
+    rows, near = sample()
+    width = np.ptp(ends(rows, near), axis=1)
+    assert (np.ptp(ends(rows, near, cameras=(10, 8)), axis=1) < 0.6 * width).all()
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        pytest.param(np.zeros((10, 3)), id="zero"),
+        pytest.param(np.ones((10, 3)), id="equal"),
+        pytest.param(np.random.default_rng(0).normal(size=(6, 3)), id="three views per group"),
+    ],
+)
+def test_without_variance_or_views_the_ends_are_unknown(rows):
+    near = np.arange(len(rows)) < len(rows) // 2
+    assert np.isnan(ends(rows, near)).all()
+
+
+def test_every_resample_has_three_cameras_and_the_right_size():
+    counts = multiplicities(4, 500, np.random.default_rng(0))
+    assert (counts[0] == 1.0).all()
+    assert (counts.sum(axis=1) == 4.0).all()
+    assert (np.count_nonzero(counts, axis=1) >= 3).all()
+
+
+def test_resampled_figures_are_those_of_the_resampled_gradients():
+    rows, near = sample()
+    groups = Groups(near)
+    parts = GroupedGramian.of(rows @ rows.T, groups)
+    draws = Resamples.of(parts, groups, 5, np.random.default_rng(2))
+    # The same generator draws the same cameras: near group first, then far.
+    rng = np.random.default_rng(2)
+    counts = multiplicities(9, 5, rng), multiplicities(7, 5, rng)
+    unit = np.trace(rows @ rows.T) / len(rows)
+    gap = rows[near].mean(axis=0) - rows[~near].mean(axis=0)
+    for r in range(6):
+        spreads, means, shares, shifts = [], [], [], []
+        for members, weights, sign in zip((rows[near], rows[~near]), counts, (1, -1), strict=True):
+            w, n = weights[r], len(members)
+            deviations = members - members.mean(axis=0)
+            own = deviations / (n - 1)
+            along = ((gap - sign * own) * deviations).sum(axis=1)
+            shifts.append(sign * w @ (along - along.mean()) / n)
+            pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
+            mass = sum(w[i] * w[j] for i, j in pairs)
+            spreads.append(
+                sum(w[i] * w[j] * ((members[i] - members[j]) ** 2).sum() / 2 for i, j in pairs)
+                / mass
+            )
+            means.append(w @ deviations / n)
+            shares.append((w**2).sum() / n**2)
+        noise = ((means[0] - means[1]) ** 2).sum()
+        noise -= sum(s * share for s, share in zip(spreads, shares, strict=True))
+        assert draws.within[r] * unit == pytest.approx(sum(spreads) / 2)
+        assert draws.noise[r] * unit == pytest.approx(noise)
+        assert draws.shift[r] * np.sqrt(unit) == pytest.approx(sum(shifts) / np.linalg.norm(gap))
+    assert split_of(parts, groups)[0] == pytest.approx(draws.within[0])

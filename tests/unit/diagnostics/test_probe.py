@@ -1,0 +1,232 @@
+"""Probes: right dot products in both metrics, nothing changed, views and rows chosen well."""
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.contexts import Model
+from crossgrad_core.diagnostics import probe
+from crossgrad_core.diagnostics.cameras import camera_rows, distances_of, grouping_rows
+from crossgrad_core.diagnostics.plan import labelled, plan_probe
+from crossgrad_core.diagnostics.probe import ModelProbe, measure
+from crossgrad_core.diagnostics.report import read_csv, write_csv
+from crossgrad_core.diagnostics.table import ALL, table
+from crossgrad_core.diagnostics.watch import Watch
+from crossgrad_core.errors import UserError
+from crossgrad_core.optimizer import AdamState, adam_step
+from crossgrad_core.photometric import photometric_loss
+from crossgrad_core.registry import build
+from crossgrad_core.testing.fixtures import sample_phase, sample_scene
+
+VIEWS = (0, 2, 5, 8)
+
+
+@pytest.fixture
+def model():
+    scene, backbone = sample_scene(), build("backbones", "vanilla", {})
+    parameters = backbone.create(scene, np.random.default_rng(0))
+    parameters = {name: tensor.requires_grad_() for name, tensor in parameters.items()}
+    adam = AdamState()
+    rng = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        grads = {n: torch.randn(t.shape, generator=rng) * 1e-3 for n, t in parameters.items()}
+        adam_step(parameters, grads, adam, dict.fromkeys(parameters, 1e-3))
+    return Model(
+        phase=sample_phase(),
+        scene=scene,
+        backbone=backbone,
+        rasterizer=build("rasterizers", "torch", {}),
+        parameters=parameters,
+        adam=adam,
+        background=torch.zeros(3),
+        ssim_weight=0.2,
+        groups=None,
+    )
+
+
+def gradients(model, view):
+    """By way of backward passes and `.grad`, unlike the probe."""
+    one = model.scene.train_views[view]
+    leaves = {n: t.detach().clone().requires_grad_() for n, t in model.parameters.items()}
+    gaussians = model.backbone.decode(leaves, one.camera, model.phase)
+    image = model.rasterizer.render(gaussians, one.camera, model.background).image
+    photometric_loss(image, one.photo.image(), None, model.ssim_weight).backward()
+    return {name: tensor.grad for name, tensor in leaves.items()}
+
+
+def test_gramians_hold_the_dot_products_of_each_view_s_own_gradient(model):
+    found = measure(model, VIEWS, np.random.default_rng(0))
+    each = [gradients(model, view) for view in VIEWS]
+    assert found.views == VIEWS
+    assert found.share == 1.0
+    for place, name in enumerate(found.blocks):
+        rows = np.stack([g[name].double().numpy().ravel() for g in each])
+        expected = rows @ rows.T
+        np.testing.assert_allclose(found.plain[place], expected, rtol=1e-5, atol=1e-12)
+
+
+def test_adam_s_metric_divides_by_the_root_that_the_next_step_would_have(model):
+    found = measure(model, VIEWS, np.random.default_rng(0))
+    each = [gradients(model, view) for view in VIEWS]
+    for place, name in enumerate(found.blocks):
+        rows = np.stack([g[name].double().numpy().ravel() for g in each])
+        before = model.adam.exp_avg_sq[name].double().numpy().ravel()
+        second = 0.999 * before + 0.001 * (rows**2).mean(axis=0)
+        rows = rows / (np.sqrt(second / (1 - 0.999**4)) + 1e-15)
+        np.testing.assert_allclose(found.adam[place], rows @ rows.T, rtol=1e-3, atol=1e-8)
+
+
+def test_before_the_first_step_there_is_no_adam_metric(model):
+    model.adam.exp_avg_sq.clear()
+    assert measure(model, VIEWS, np.random.default_rng(0)).adam is None
+
+
+def test_the_model_is_left_as_it_is(model):
+    before = {name: tensor.detach().clone() for name, tensor in model.parameters.items()}
+    moments = {name: tensor.clone() for name, tensor in model.adam.exp_avg_sq.items()}
+    measure(model, VIEWS, np.random.default_rng(0))
+    assert all(torch.equal(model.parameters[name], before[name]) for name in before)
+    assert all(torch.equal(model.adam.exp_avg_sq[name], moments[name]) for name in moments)
+    assert all(tensor.grad is None for tensor in model.parameters.values())
+
+
+def made_up(monkeypatch, model, change=lambda view, gradients: gradients):
+    """Replaces the gradients by random ones that are the same each time."""
+
+    def gradient(_, index, names):
+        rng = torch.Generator().manual_seed(index)
+        made = {n: torch.randn(model.parameters[n].shape, generator=rng) + 0.5 for n in names}
+        return change(index, made)
+
+    monkeypatch.setattr(probe, "_gradients", gradient)
+
+
+def test_a_random_subset_of_primitives_is_right_on_average(model, monkeypatch):
+    made_up(monkeypatch, model)
+    whole = measure(model, VIEWS, np.random.default_rng(0))
+    row = sum(model.parameters[n][:1].nbytes for n in model.parameters)
+    monkeypatch.setattr(probe, "MEMORY", 10 * row * len(VIEWS))
+    rng = np.random.default_rng(1)
+    parts = [measure(model, VIEWS, rng) for _ in range(60)]
+    assert {part.share for part in parts} == {10 / 40}
+    for metric in ("plain", "adam"):
+        mean = np.mean([getattr(part, metric) for part in parts], axis=0)
+        full = getattr(whole, metric)
+        scale = np.sqrt(np.einsum("bi,bj->bij", *[np.einsum("bii->bi", full)] * 2))
+        assert np.abs(mean - full).max() < 0.15 * scale.max()
+        np.testing.assert_allclose(mean / scale, full / scale, atol=0.15)
+
+
+def test_a_view_whose_gradient_is_not_finite_is_left_out(model, monkeypatch):
+    def spoil(view, made):
+        if view == 2:
+            made["scales"][0, 0] = float("nan")
+        return made
+
+    made_up(monkeypatch, model, spoil)
+    found = measure(model, VIEWS, np.random.default_rng(0))
+    assert found.views == (0, 5, 8)
+    assert found.dropped == (sample_scene().train_views[2].name,)
+    assert found.plain.shape[1:] == (3, 3)
+    full = ModelProbe(model, np.random.default_rng(0)).gramians(VIEWS)
+    assert (full[:, 1] == 0.0).all()
+    assert (full[:, 0, 0] > 0.0).all()
+
+
+def test_a_view_that_touches_nothing_has_zero_dot_products(model, monkeypatch):
+    made_up(monkeypatch, model, lambda view, made: {} if view == 5 else made)
+    found = measure(model, VIEWS, np.random.default_rng(0))
+    assert (found.plain[:, 2] == 0.0).all()
+    assert not found.overlap[:, 2].any()
+
+
+def plan(per_group=12, seed=0, grouping="radial"):
+    labels, _ = labelled(sample_scene(), grouping, seed)
+    return plan_probe(sample_scene(), grouping, labels, per_group, seed)
+
+
+def test_a_plan_draws_as_many_near_as_far_views():
+    found = plan(3)
+    assert len(found.views) == 6
+    assert found.near(found.views).sum() == 3
+    assert found.views == plan(3).views
+    assert len({plan(3, seed).views for seed in range(8)}) > 1
+
+
+def test_a_plan_tells_near_from_far_whatever_the_labels_are_called():
+    scene = sample_scene()
+    labels = tuple("b" if view.regime == "near" else "a" for view in scene.train_views)
+    found = plan_probe(scene, "lists", labels, 12, 0)
+    assert (found.near_label, found.far_label) == ("b", "a")
+
+
+@pytest.mark.parametrize(
+    "labels", [("all",) * 9, ("near",) * 8 + ("far",)], ids=["one group", "one view"]
+)
+def test_a_plan_needs_two_groups_of_two(labels):
+    with pytest.raises(UserError, match="two"):
+        plan_probe(sample_scene(), "lists", labels, 12, 0)
+
+
+def test_the_table_has_a_row_per_metric_and_block(model):
+    measurement = measure(model, plan().views, np.random.default_rng(0))
+    rows = table(measurement, plan(), distances_of(model.scene), 0)
+    blocks = [*measurement.blocks, "opacities+f_dc", ALL]
+    assert [row["block"] for row in rows] == 2 * blocks
+    assert [row["metric"] for row in rows] == ["plain"] * len(blocks) + ["adam"] * len(blocks)
+    whole = rows[len(blocks) - 1]
+    assert whole["sigma_w2_low"] <= whole["sigma_w2"] <= whole["sigma_w2_high"]
+    parts = sum(float(row["sigma_w2"]) for row in rows[: len(measurement.blocks)])
+    assert whole["sigma_w2"] == pytest.approx(parts)
+
+
+def test_the_table_is_the_same_each_time(model):
+    def rows():
+        measurement = measure(model, plan().views, np.random.default_rng(0))
+        return table(measurement, plan(), distances_of(model.scene), 0)
+
+    assert str(rows()) == str(rows())
+
+
+def test_one_probe_is_read_by_every_grouping(model):
+    measurement = measure(model, plan().views, np.random.default_rng(0))
+    rows = grouping_rows(model.scene, measurement, 0)
+    read = {row["grouping"] for row in rows if not row["note"]}
+    assert {"regime", "radial", "altitude", "footprint"} <= read
+    first = next(row for row in rows if row["grouping"] == "radial")
+    own = table(measurement, plan(), distances_of(model.scene), 0)[0]
+    assert first["block"] == own["block"]
+    assert first["ratio_of_means"] == own["ratio_of_means"]
+    assert first["rho"] == own["rho"]
+
+
+def test_cameras_are_described_with_their_number():
+    rows = camera_rows(sample_scene())
+    assert [str(row["quantity"]).split(" ")[0] for row in rows] == ["height", "log", "log"]
+    assert {row["views"] for row in rows} == {len(sample_scene().train)}
+    distances = distances_of(sample_scene())["radial"]
+    expected = distances.var() / distances.mean() ** 2
+    assert rows[1]["relative_variance"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("every", "total", "expected"),
+    [(5, 20, [5, 10, 15, 20]), (5, 22, [5, 10, 15, 22]), (7, 20, [7, 20]), (30, 20, [20])],
+)
+def test_probes_are_evenly_spaced_and_the_last_is_at_the_end(every, total, expected):
+    watch = Watch(plan(), every, total, 0)
+    assert [step for step in range(1, total + 1) if watch.due(step)] == expected
+
+
+def test_a_watch_that_saw_nothing_has_no_report():
+    with pytest.raises(UserError, match="never probed"):
+        Watch(plan(), 5, 20, 0).report(sample_scene(), "nothing")
+
+
+def test_tables_survive_the_file(tmp_path):
+    rows = [{"a": 1, "b": 0.25, "c": "x"}, {"a": 2, "b": float("inf"), "d": "y"}]
+    write_csv(tmp_path / "t.csv", rows)
+    found = read_csv(tmp_path / "t.csv")
+    assert found[0] == {**rows[0], "d": pytest.approx(float("nan"), nan_ok=True)}
+    assert found[1]["b"] == float("inf")
+    assert read_csv(tmp_path / "none.csv") == []

@@ -1,0 +1,77 @@
+"""Named operators that coincide."""
+
+import numpy as np
+import pytest
+
+from crossgrad_core.registry import build
+
+
+def pairs():
+    rng = np.random.default_rng(0)
+    yield from (rng.standard_normal((2, 3)) * 10.0 ** rng.uniform(-8, 8, (2, 1)) for _ in range(300))
+    yield np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    yield np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
+    yield np.array([[1.0, 2.0, 0.0], [-1.0, -2.0, 0.0]])
+
+
+def same(one, other, rows):
+    """Weights agree where they count: relative to the largest summand."""
+    norms = np.linalg.norm(rows, axis=1)
+    size = np.abs(one.weights * norms).max()
+    np.testing.assert_allclose(one.weights * norms, other * norms, rtol=1e-12, atol=1e-12 * size)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [("pcgrad", 1), ("upgrad", 2), ("gradvac", 1), ("anchors", 1), ("soft", 1)],
+)
+def test_two_views_make_symmetric_of_it(name, factor, ask):
+    for rows in pairs():
+        same(ask("symmetric", rows), factor * ask(name, rows).weights, rows)
+
+
+def test_a_gate_without_memory_is_symmetric(ask):
+    open_gate = build("operators", "confgate", {"warmup": 0})
+    for rows in pairs():
+        same(ask("symmetric", rows), ask(open_gate, rows).weights, rows)
+
+
+def test_nash_is_parallel_to_imtl_g(ask):
+    for rows in pairs():
+        one, other = ask("nash", rows).result, ask("imtl-g", rows).result
+        lengths = np.linalg.norm(one), np.linalg.norm(other)
+        if not lengths[0]:
+            assert not lengths[1]
+            continue
+        assert one @ other / lengths[0] / lengths[1] == pytest.approx(1, abs=1e-12)
+
+
+def test_soft_at_strength_zero_is_sum(ask):
+    weak = build("operators", "soft", {"strength": 0.0})
+    for rows in pairs():
+        present = rows.any(axis=1)
+        np.testing.assert_array_equal(ask(weak, rows).weights, present.astype(float))
+
+
+@pytest.mark.parametrize("views", [3, 4, 6])
+def test_enumeration_and_active_sets_find_the_same_minimum(views):
+    from crossgrad_operators.numba_kernels import cone, simplex
+
+    rng = np.random.default_rng(views)
+    norms, cosines = np.empty(views), np.empty((views, views))
+    for _ in range(50):
+        rows = rng.standard_normal((views, 7)) * 10.0 ** rng.uniform(-3, 3, (views, 1))
+        present = np.ones(views, bool)
+        simplex.normalised(rows @ rows.T, present, norms, cosines)
+        members = np.arange(views)
+        r = norms.min() / norms
+        q = cosines @ (norms / norms.max() / views)
+        for rho in (-1.0, 0.3):
+            one = simplex._by_enumeration(cosines, r, q, rho, members, views)
+            other = simplex._by_active_set(cosines, r, q, rho, present)
+            np.testing.assert_allclose(one, other, atol=1e-9 * abs(one).max())
+        one, other = np.empty(views), np.empty(views)
+        b = np.eye(views)[0]
+        cone._by_enumeration(cosines, members, views, b, one)
+        cone._by_active_set(cosines, members, views, b, other)
+        np.testing.assert_allclose(one, other, atol=1e-9 * abs(one).max())

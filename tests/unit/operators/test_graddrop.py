@@ -1,0 +1,54 @@
+"""GradDrop: one sign per element, the sum on average."""
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.stress.reference import Views
+from crossgrad_core.stress.runner import BLOCK, context_of
+from crossgrad_operators.graddrop import GradDrop
+
+
+def drop(*gradients, seed=0):
+    views = Views(("near",) * len(gradients), (1.0,) * len(gradients), seed)
+    context = context_of([{"means": g} for g in gradients], (BLOCK,), views)
+    return GradDrop().aggregate(context, EMPTY_STATE)[0].gradients["means"]
+
+
+def test_two_to_one_keeps_the_positive_in_two_of_three_places():
+    count = 90_000
+    found = drop(torch.full((count,), 2.0), torch.full((count,), -1.0))
+    assert set(found.unique().tolist()) == {-1.0, 2.0}
+    share = float((found > 0).float().mean())
+    assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / count)
+
+
+def test_elements_of_one_sign_are_added_and_zeros_stay():
+    found = drop(torch.tensor([1.0, -2.0, 0.0, 0.0]), torch.tensor([3.0, -1.0, 5.0, 0.0]))
+    assert found.tolist() == [4.0, -3.0, 5.0, 0.0]
+
+
+@pytest.mark.parametrize("size", [3e38, 1e-45])
+def test_extreme_elements_neither_overflow_nor_vanish(size):
+    found = drop(torch.full((1000,), size), torch.full((1000,), -size))
+    assert set(found.abs().unique().tolist()) == {float(np.float32(size))}
+    assert 400 < int((found > 0).sum()) < 600
+
+
+def test_the_same_generator_gives_the_same_draws():
+    g = torch.randn((2, 500), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(drop(*g), drop(*g))
+    assert not torch.equal(drop(*g), drop(*g, seed=1))
+
+
+def test_views_that_are_not_finite_are_left_out():
+    bad = torch.tensor([1.0, float("nan")])
+    assert drop(bad, torch.tensor([2.0, -3.0])).tolist() == [2.0, -3.0]
+    assert drop(bad, bad) is None
+
+
+def test_it_is_no_gramian_operator():
+    with pytest.raises(UserError, match="elements"):
+        GradDrop().transform(np.eye(2)[None], None, EMPTY_STATE, np.random.default_rng(0))

@@ -1,0 +1,133 @@
+"""Operators made of operators: chain and dispatch."""
+
+import json
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from crossgrad_core.component import Selection, ViewCounts
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import build
+from crossgrad_core.state import EMPTY_STATE
+from crossgrad_operators.chain import Chain
+from crossgrad_operators.dispatch import Dispatch
+from crossgrad_operators.pcgrad import PCGrad
+
+ROWS = np.array([[1.0, 0.0, 2.0], [-1.0, 1.0, -1.0], [0.5, -2.0, 0.0]])
+
+
+def chain(*links):
+    return build("operators", "chain", {"links": links})
+
+
+def test_the_empty_chain_is_sum(ask):
+    np.testing.assert_array_equal(ask(chain(), ROWS).weights, [1, 1, 1])
+
+
+@pytest.mark.parametrize("name", ["symmetric", "cagrad", "upgrad", "mgda", "preconditioner"])
+def test_one_link_and_the_identity_change_nothing(name, ask):
+    alone = ask(name, ROWS).weights
+    for links in ((name,), ("sum", name), (name, "sum")):
+        np.testing.assert_allclose(ask(chain(*links), ROWS).weights, alone, rtol=1e-13)
+
+
+def test_chains_are_associative(ask):
+    flat = ask(chain("preconditioner", "symmetric", "mean"), ROWS, distances=[0.5, 1, 2])
+    left = chain(chain("preconditioner", "symmetric"), "mean")
+    right = chain("preconditioner", chain("symmetric", "mean"))
+    for nested in (left, right):
+        found = ask(nested, ROWS, distances=[0.5, 1, 2])
+        np.testing.assert_allclose(found.weights, flat.weights, rtol=1e-13)
+
+
+def test_a_link_sees_what_the_one_before_made_of_the_gradients(ask):
+    scaled = ROWS * np.array([[0.25], [1.0], [4.0]])
+    expected = ask("symmetric", scaled).result / 3
+    found = ask(chain("preconditioner", "symmetric", "mean"), ROWS, distances=[0.5, 1, 2])
+    np.testing.assert_allclose(found.result, expected, rtol=1e-13)
+
+
+def test_rows_that_cancel_are_gone_for_the_next_link(ask):
+    rows = np.array([[2.0, 0.0], [-1.0, 0.0], [0.0, 3.0]])
+    np.testing.assert_allclose(ask(chain("symmetric", "imtl-g"), rows).result, [0.0, 3.0])
+
+
+def test_the_state_of_every_link_is_kept_apart(ask):
+    operator = chain("gradvac", "confgate", "gradvac")
+    state = ask(operator, ROWS).state
+    assert set(state.tensors) == {"0/target", "1/moments", "2/target"}
+    assert set(ask(operator, ROWS, state=state).state.tensors) == set(state.tensors)
+
+
+def test_dispatch_serves_each_kind_by_its_own_operator(context_of):
+    gramians = np.stack([ROWS[:2] @ ROWS[:2].T] * 3)
+    blocks = ("means", "opacities", "f_dc")
+    context = context_of(gramians, blocks=blocks)
+    kinds = ("geometry", "appearance", "appearance")
+    context = type(context)(**{**vars(context), "kinds": kinds})
+    rng = np.random.default_rng(0)
+
+    def weights(**options):
+        operator = build("operators", "dispatch", options)
+        return operator.transform(gramians, context, EMPTY_STATE, rng)[0].sum(axis=1)
+
+    plain, projected = np.ones(2), build("operators", "symmetric", {}).transform(
+        gramians[:1], context, EMPTY_STATE, rng
+    )[0].sum(axis=1)[0]
+    np.testing.assert_allclose(weights(), [plain, plain, plain])
+    found = weights(preset="geometry-projection")
+    np.testing.assert_allclose(found, [projected, plain, plain])
+    found = weights(preset="geometry-projection", opacity="geometry")
+    np.testing.assert_allclose(found, [projected, projected, plain])
+    found = weights(rules={"f_dc": "mean", "appearance": {"name": "cagrad", "c": 0.0}})
+    np.testing.assert_allclose(found, [plain, plain / 2, plain / 2])
+
+
+@pytest.mark.parametrize(
+    "operator",
+    [
+        chain("preconditioner", {"name": "cagrad", "c": 0.4}, PCGrad()),
+        build("operators", "dispatch", {"rules": {"means": {"name": "soft", "strength": 0.5}}}),
+    ],
+    ids=["chain", "dispatch"],
+)
+def test_configurations_are_read_back(operator):
+    written = json.loads(json.dumps(operator.model_dump(mode="json")))
+    assert type(operator).model_validate(written) == operator
+    assert hash(type(operator).model_validate(written)) == hash(operator)
+
+
+@pytest.mark.parametrize("links", [["graddrop"], [{"name": "pcgrad", "granularity": "group"}], [3]])
+def test_links_that_cannot_work_are_refused(links):
+    with pytest.raises(ValidationError):
+        Chain(links=links)
+
+
+def test_an_unknown_link_is_refused_with_a_suggestion():
+    with pytest.raises(UserError, match="pcgrad"):
+        chain("pcgrd")
+
+
+def selection(operator, views, blocks=()):
+    class Backbone:
+        @staticmethod
+        def blocks():
+            return blocks
+
+    components = {"operator": operator, "backbone": Backbone()}
+    names = {"operator": "it", "sampler": "random"}
+    return Selection(components, names, views, "cpu")
+
+
+def test_objections_of_links_are_passed_on():
+    assert PCGrad().views == ViewCounts()
+    found = chain("pcgrad", "anchors").crossgrad_objections(selection(PCGrad(), 3))
+    assert any("anchors needs K = 2" in reason for reason in found)
+    assert any("labels" in reason for reason in found)
+
+
+def test_rules_for_blocks_that_do_not_exist_are_refused():
+    operator = Dispatch(rules={"f_dcc": "sum", "geometry": "mean"})
+    (found,) = operator.crossgrad_objections(selection(operator, 2))
+    assert "'f_dcc'" in found

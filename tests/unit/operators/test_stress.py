@@ -1,0 +1,125 @@
+"""The stability suite holds, and notices what does not."""
+
+from math import isnan
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from crossgrad_core.registry import entries
+from crossgrad_core.stress.case import short
+from crossgrad_core.stress.cases import cases
+from crossgrad_core.stress.runner import Reference, run_case
+from crossgrad_core.stress.suite import made, reference_of, run_suite
+from crossgrad_core.stress.table import as_text, failed, write_csv
+from crossgrad_core.stress.verdict import ExactCase
+from crossgrad_operators.symmetric import Symmetric
+
+mpmath = pytest.importorskip("mpmath")
+
+OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
+#: The same cases with shorter gradients.
+SHORT = cases(large=20_000, exact=300)
+
+
+@pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
+def test_case(case):
+    with mpmath.mp.workdps(50):
+        exact = ExactCase(case)
+        for name in OURS:
+            operator = made(name)
+            cell = run_case(name, operator, exact, reference_of(name, operator))
+            assert cell.finding.verdict != "failed", (name, cell.finding)
+
+
+def test_every_built_in_but_the_adapter_has_a_reference():
+    for name in OURS:
+        reference = reference_of(name, made(name))
+        assert (reference.oracle or reference.rule) or name == "torchjd"
+
+
+class Careless(Symmetric):
+    """Off by one part in a million."""
+
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        return matrices * (1 + 2e-6), state
+
+
+class Broken(Symmetric):
+    """Divides by the smallest norm."""
+
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        with np.errstate(all="ignore"):
+            return matrices / np.einsum("bkk->bk", gramians).min(), state
+
+
+@pytest.mark.parametrize(
+    ("operator", "case", "reason"),
+    [
+        (Careless(), "conflict", "u kappa"),
+        (Careless(), "ratio 1e12", "u kappa"),
+        (Broken(), "zero row", "not finite"),
+    ],
+)
+def test_flaws_are_found(operator, case, reason):
+    (chosen,) = (c for c in SHORT if c.name == case)
+    reference = Reference(reference_of("symmetric", Symmetric()).oracle, {})
+    with mpmath.mp.workdps(50):
+        finding = run_case("flawed", operator, ExactCase(chosen), reference).finding
+    assert finding.verdict == "failed"
+    assert reason in finding.reason
+
+
+def test_an_operator_without_a_reference_must_be_finite():
+    case = short("plain", [[1.0, 2.0], [2.0, 1.0]])
+    with mpmath.mp.workdps(50):
+        cell = run_case("theirs", Symmetric(), ExactCase(case), Reference(None, {}))
+    assert cell.finding.verdict == "ok"
+    assert isnan(cell.finding.error)
+
+
+def test_exact_gramians_have_fifty_digits():
+    """1e8 + 1 - 1e8 in float32 products, and 2^-149 squared."""
+    tiny = 2.0**-149
+    case = short("tiny", [[1e8, 1.0, tiny], [1e8, -1.0, tiny]])
+    with mpmath.mp.workdps(50):
+        gramian = ExactCase(case).gramian
+        assert gramian[0][1] == mpmath.mpf(10) ** 16 - 1 + mpmath.mpf(2) ** -298
+
+
+def test_a_repeated_pattern_counts_as_often_as_it_is_there():
+    from dataclasses import replace
+
+    case = replace(short("x", np.zeros((2, 0))), pattern=np.array([[1.0, 2.0], [3.0, -1.0]]), copies=7)
+    assert case.size == 14
+    assert torch.cat([g[:2] for g in case.gradients()]).tolist() == [1, 2, 3, -1]
+    with mpmath.mp.workdps(50):
+        assert ExactCase(case).gramian == [[35, 7], [7, 70]]
+
+
+def test_the_table_shows_errors_times_and_failures(tmp_path):
+    chosen = [c for c in SHORT if c.name in {"plain", "K = 3"}]
+    cells = list(run_suite(["symmetric", "anchors"], chosen))
+    text = as_text(cells)
+    assert "all " in text and "checks hold" in text
+    assert not failed(cells)
+    write_csv(cells, tmp_path / "table.csv")
+    rows = (tmp_path / "table.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(cells)
+    assert any(row.startswith("anchors,K = 3,refused") for row in rows)
+
+
+def test_the_command_tells_by_its_exit_status(monkeypatch):
+    from crossgrad_core.cli.main import app
+    from crossgrad_core.stress import suite
+
+    arguments = ["stress", "symmetric", "--case", "conflict", "--elements", "1000"]
+    good = CliRunner().invoke(app, arguments)
+    assert good.exit_code == 0, good.output
+    monkeypatch.setattr(suite, "made", lambda name: Careless())
+    bad = CliRunner().invoke(app, arguments)
+    assert bad.exit_code == 1
+    assert "checks fail" in bad.output

@@ -1,0 +1,133 @@
+"""Agreement with TorchJD 0.18 on well-scaled Gramians, and the adapter to it."""
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import build
+
+aggregation = pytest.importorskip("torchjd.aggregation")
+
+TOLERANCE = 1e-6
+VIEWS = (2, 3, 4, 6)
+
+
+def gradients(views, count=20):
+    rng = np.random.default_rng(views)
+    for _ in range(count):
+        yield rng.standard_normal((views, 24)) * rng.uniform(0.5, 2, (views, 1)) - 0.1
+
+
+def agree(name, weighting, views, ask):
+    for rows in gradients(views):
+        gramian = rows @ rows.T
+        expected = weighting(torch.from_numpy(gramian / np.trace(gramian))).numpy()
+        found = ask(name, rows).weights
+        np.testing.assert_allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+@pytest.mark.parametrize(
+    ("name", "weighting"),
+    [("sum", "Sum"), ("mean", "Mean"), ("imtl-g", "IMTLG"), ("aligned", "AlignedMTL")],
+)
+def test_direct_methods(name, weighting, views, ask):
+    agree(name, getattr(aggregation, f"{weighting}Weighting")(), views, ask)
+
+
+@pytest.mark.parametrize(("name", "weighting"), [("pcgrad", "PCGrad"), ("gradvac", "GradVac")])
+def test_pairwise_methods_at_two_views(name, weighting, ask):
+    for rows in gradients(2):
+        gramian = rows @ rows.T
+        fresh = getattr(aggregation, f"{weighting}Weighting")()
+        expected = fresh(torch.from_numpy(gramian / np.trace(gramian))).numpy()
+        np.testing.assert_allclose(ask(name, rows).weights, expected, rtol=TOLERANCE)
+
+
+@pytest.mark.parametrize("beta", [0.3, 0.5])
+def test_gradvac_follows_the_same_targets(beta, ask):
+    operator = build("operators", "gradvac", {"beta": beta})
+    theirs = aggregation.GradVacWeighting(beta=beta)
+    state = None
+    for rows in gradients(2, 40):
+        gramian = rows @ rows.T
+        expected = theirs(torch.from_numpy(gramian / np.trace(gramian))).numpy()
+        found = ask(operator, rows, **({} if state is None else {"state": state}))
+        state = found.state
+        np.testing.assert_allclose(found.weights, expected, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_mgda(views, ask):
+    """Frank and Wolfe's steps shrink slowly: theirs is as far off as it is longer, no further.
+
+    For u the shortest point of a convex set and v any other, |v - u|^2 <= |v|^2 - |u|^2.
+    """
+    theirs = aggregation.MGDAWeighting(epsilon=1e-14, max_iters=1000)
+    for rows in gradients(views, 5):
+        gramian = rows @ rows.T
+        expected = theirs(torch.from_numpy(gramian / np.trace(gramian))).numpy() @ rows
+        found = ask("mgda", rows).result
+        excess = expected @ expected - found @ found
+        assert excess <= (1e-13 if views == 2 else 0.02) * (expected @ expected)
+        assert ((found - expected) ** 2).sum() <= excess + 1e-12 * (expected @ expected)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+@pytest.mark.parametrize(("name", "weighting"), [("upgrad", "UPGrad"), ("dualproj", "DualProj")])
+def test_cone_projections(name, weighting, views, ask):
+    pytest.importorskip("quadprog")
+    pytest.importorskip("qpsolvers")
+    projector = aggregation.QuadprogProjector(norm_eps=1e-12, reg_eps=1e-12)
+    agree(name, getattr(aggregation, f"{weighting}Weighting")(projector=projector), views, ask)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_cagrad(views, ask):
+    pytest.importorskip("cvxpy")
+    pytest.importorskip("clarabel")
+    agree("cagrad", aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12), views, ask)
+
+
+def test_adapter_is_scale_free_and_leaves_zero_views_out(ask):
+    rows = np.random.default_rng(0).standard_normal((3, 8))
+    rows[1] = 0
+    plain = ask("torchjd", rows).weights
+    np.testing.assert_allclose(ask("torchjd", 1e-12 * rows).weights, plain, rtol=1e-12)
+    np.testing.assert_allclose(plain[[0, 2]], ask("torchjd", rows[[0, 2]]).weights)
+    assert plain[1] == 0
+
+
+def test_adapter_passes_options_and_leaves_the_global_generator_alone(ask):
+    operator = build(
+        "operators", "torchjd", {"weighting": "Krum", "options": {"n_byzantine": 0}}
+    )
+    assert hash(operator) == hash(type(operator).model_validate(operator.model_dump(mode="json")))
+    rows = np.random.default_rng(0).standard_normal((4, 8))
+    before = torch.get_rng_state()
+    ask(operator, rows)
+    one = ask(build("operators", "torchjd", {"weighting": "PCGrad"}), rows, seed=5).weights
+    two = ask(build("operators", "torchjd", {"weighting": "PCGradWeighting"}), rows, seed=5).weights
+    np.testing.assert_array_equal(one, two)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"weighting": "PCGard"}, "no weighting named"),
+        ({"weighting": "GradVac"}, "could not be resumed"),
+        ({"weighting": "MGDA", "options": {"speed": 3}}, "cannot be made"),
+        ({"weighting": "ConstantWeighting"}, "cannot be made"),
+    ],
+)
+def test_adapter_refuses(options, reason, ask):
+    with pytest.raises(UserError, match=reason):
+        ask(build("operators", "torchjd", options), np.eye(2))
+
+
+def test_adapter_says_what_to_install(monkeypatch, ask):
+    monkeypatch.setitem(__import__("sys").modules, "torchjd", None)
+    with pytest.raises(UserError, match=r"crossgrad\[torchjd\]"):
+        ask("torchjd", np.eye(2))
