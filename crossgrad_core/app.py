@@ -20,9 +20,15 @@ from crossgrad_core.results.folder import RunName, check_out, create_run_folder,
 from crossgrad_core.results.log import RunLog
 from crossgrad_core.results.summary import Status
 from crossgrad_core.results.table import final_table
-from crossgrad_core.schedule import Schedule
 from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import DEFAULT_STEPS, assemble, check_names, read_scene
+from crossgrad_core.training.assemble import (
+    DEFAULT_STEPS,
+    assemble,
+    check_names,
+    growth_note,
+    read_scene,
+    schedule_of,
+)
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.loop import Stopper, train
@@ -72,6 +78,7 @@ def run(
     compile_seconds = warm_up(setup)
     if config.seconds is not None:
         setup = _within(setup, config.seconds)
+    setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds, compile_seconds
     folder = _new_folder(setup, state)
@@ -130,7 +137,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note = steps_for(setup, seconds)
     config = setup.config.model_copy(update={"steps": steps, "seconds": None})
-    schedule = Schedule.for_run(steps, config.schedule)
+    schedule = schedule_of(config, steps)
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
 
 

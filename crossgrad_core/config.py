@@ -54,6 +54,10 @@ class RunConfig(BaseModel):
     )
     seed: int = Field(0, ge=0, description="seed of every random number of the run")
     schedule: ScheduleMode = "scaled"
+    densify_from: int | None = Field(None, ge=0, description="density control after this step ...")
+    densify_until: int | None = Field(None, ge=0, description="... and before this one")
+    densify_every: int | None = Field(None, ge=1, description="steps between its edits")
+    reset_every: int | None = Field(None, ge=1, description="steps between opacity resets")
     preset: Literal["default", "inria"] = "default"
     backward: Literal["separate", "joint"] = "separate"
     device: str = "cpu"

@@ -7,11 +7,12 @@ ScheduleMode = Literal["scaled", "absolute"]
 
 #: The length that every published figure is written for (3DGS).
 REFERENCE_STEPS = 30_000
-#: Learning rates of colour, scale and opacity are not stretched with the run, so that the first
+#: Learning rates of colour, scale and opacity are not stretched with the run, so the first
 #: transient always takes some hundred steps. Gradients are large everywhere during it, and growing
-#: then copies Gaussians that only had to settle.
-WARM_UP = 500
-#: The statistics of so many steps decide about growth (published figure, a floor here).
+#: then copies Gaussians that only had to settle: 300 steps on the bundled scene (two views per
+#: step, seed 0) end at 15.7 dB with growth from step 75 on, and at 17.2 dB without any.
+SHORTEST_WARM_UP = 500
+#: The statistics of so many steps decide about growth, at least (the published interval).
 SHORTEST_INTERVAL = 100
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
@@ -56,13 +57,18 @@ class Schedule:
             total=total,
             lr_steps=total,
             sh_interval=max(100, total // 30),
-            densify_from=max(total // 60, min(WARM_UP, total // 4)),
+            densify_from=max(total // 60, SHORTEST_WARM_UP),
             densify_until=total // 2,
-            densify_every=max(min(SHORTEST_INTERVAL, max(1, total // 20)), total // 300),
+            densify_every=max(SHORTEST_INTERVAL, total // 300),
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
             prune_large_from=total // 10,
             anchors_from=total // 20,
         )
+
+    @property
+    def grows(self) -> bool:
+        """Whether there is any step after which density control edits."""
+        return any(self.densifies(step) for step in range(self.densify_from, self.densify_until))
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
         """Active spherical-harmonics degree at a step."""

@@ -34,7 +34,7 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
             help="Training seconds of the vanilla run.",
             rich_help_panel=_MODEL,
         ),
-    ] = 30.0,
+    ] = 60.0,
     max_size: Annotated[
         int | None,
         typer.Option(

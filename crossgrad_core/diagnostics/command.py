@@ -42,7 +42,7 @@ class Options:
     grouping: str = "radial"
     per_group: int = 12
     probes: int = 4
-    seconds: float = 30.0
+    seconds: float = 60.0
     seed: int = 0
     signature: Path | None = None
 

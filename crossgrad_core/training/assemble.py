@@ -1,6 +1,7 @@
 """From a configuration to a Setup: load, fit to the scene, object, or say what was left out."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -157,9 +158,28 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         manager=manager,
         plugins=plugins,
         groups=groups,
-        schedule=Schedule.for_run(config.steps or DEFAULT_STEPS, config.schedule),
+        schedule=schedule_of(config, config.steps or DEFAULT_STEPS),
         device=device,
         notes=tuple(notes),
+    )
+
+
+def schedule_of(config: RunConfig, steps: int) -> Schedule:
+    """The schedule of a run of `steps` steps with what the user set by hand."""
+    names = ("densify_from", "densify_until", "densify_every", "reset_every")
+    given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
+    return replace(Schedule.for_run(steps, config.schedule), **given)
+
+
+def growth_note(setup: Setup) -> tuple[str, ...]:
+    """Says that density control is left out, where the run is too short for it."""
+    name = setup.selection.names["densifier"]
+    if name == "none" or setup.schedule.grows:
+        return ()
+    start, end = setup.schedule.densify_from, setup.schedule.densify_until
+    return (
+        f"no density control: in {setup.schedule.total} steps it would end (step {end}) before the "
+        f"first transient is over (step {start}); --set densify_from=N forces it",
     )
 
 

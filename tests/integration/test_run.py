@@ -16,6 +16,8 @@ from crossgrad_core.ply import read_ply
 from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_core.topology import NO_EDIT, Edit, Rows
 
+#: Density control within a few dozen steps; by default it waits for step 500.
+GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}
 QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
 
 
@@ -90,8 +92,8 @@ def test_the_written_config_repeats_the_run(scene, tmp_path):
 
 @pytest.mark.parametrize("sampler", ["epoch", "random", "near-far"])
 def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
-    # 400 steps densify from step 6 on, every 50: the edit at 50 falls behind the stop.
-    settings = {"steps": 60, "sampler": {"name": sampler}, "schedule": "scaled", "eval_every": 20}
+    # Edits fall before and behind the stop.
+    settings = {"steps": 60, "sampler": {"name": sampler}, "eval_every": 20, **GROWTH}
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=23, **settings) == 0
     assert json.loads((tmp_path / "parts/summary.json").read_text())["status"] == "stopped"
@@ -107,9 +109,9 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
 def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):
     from crossgrad_core.training.setup import Setup
 
-    run(scene, tmp_path / "accumulated", steps=60)
+    run(scene, tmp_path / "accumulated", steps=45, **GROWTH)
     monkeypatch.setattr(Setup, "separate", True)
-    run(scene, tmp_path / "apart", steps=60)
+    run(scene, tmp_path / "apart", steps=45, **GROWTH)
     first, second = (load(latest(tmp_path / name)) for name in ("accumulated", "apart"))
     assert same(first.parameters, second.parameters)
     assert same(first.plugins["densifier"].per_primitive, second.plugins["densifier"].per_primitive)
@@ -156,14 +158,20 @@ def test_any_number_of_views_on_photos_of_different_sizes(tmp_path, views):
 
 
 def test_published_order_differs_and_runs(scene, tmp_path):
-    assert run(scene, tmp_path / "a", preset="inria", steps=60) == 0
-    run(scene, tmp_path / "b", steps=60)
+    assert run(scene, tmp_path / "a", preset="inria", steps=60, **GROWTH) == 0
+    run(scene, tmp_path / "b", steps=60, **GROWTH)
     assert not same(parameters(tmp_path / "a"), parameters(tmp_path / "b"))
 
 
+def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
+    run(scene, tmp_path / "run")
+    assert quality(tmp_path / "run")[-1]["primitives"] == "200"
+    assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
+
+
 def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
-    # Every Gaussian is above a threshold of 1e-12, so the first edit at step 50 wants to double.
-    settings = {"steps": 120, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
+    # Every Gaussian is above a threshold of 1e-12, so the first edit wants to double them all.
+    settings = {"steps": 60, **GROWTH, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
     assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()

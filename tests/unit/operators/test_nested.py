@@ -124,7 +124,7 @@ def test_objections_of_links_are_passed_on():
     assert PCGrad().views == ViewCounts()
     found = chain("pcgrad", "anchors").crossgrad_objections(selection(PCGrad(), 3))
     assert any("anchors needs K = 2" in reason for reason in found)
-    assert any("labels" in reason for reason in found)
+    assert any("labelled views" in reason for reason in found)
 
 
 def test_rules_for_blocks_that_do_not_exist_are_refused():

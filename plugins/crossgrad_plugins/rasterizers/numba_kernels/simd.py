@@ -6,13 +6,15 @@ eight truth values, so a kernel written with them is SIMD code by construction (
 each; LLVM splits them where a machine has narrower ones). Operations are never reordered, and
 `fma` fuses on every machine that can, so the same expression in two kernels gives the same bits.
 
-The functions below exist only inside compiled kernels; `Lanes` and `Mask` are their annotations.
+Everything below exists only inside compiled kernels; `Lanes` and `Mask` are annotations.
 """
+# ruff: noqa: ANN401 - Numba's and llvmlite's objects have no types.
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic, models, overload, register_model
@@ -20,13 +22,12 @@ from numpy.typing import NDArray
 
 LANES = 8
 
-_FLOAT = ir.FloatType()
-_BYTE = ir.IntType(8)
-_INT = ir.IntType(32)
-_LONG = ir.IntType(64)
-_LANES = ir.VectorType(_FLOAT, LANES)
-_INT_LANES = ir.VectorType(_INT, LANES)
-_MASK = ir.VectorType(ir.IntType(1), LANES)
+_FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
+_FLOATS, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
+_FLAGS = ir.VectorType(ir.IntType(1), LANES)
+_ALIGNMENT = 4  # bytes; arrays of float32 promise no more
+_SIGN_BIT = ir.Constant(_INTS, [-(2**31)] * LANES)
+_MANTISSA_BITS = ir.Constant(_INTS, [23] * LANES)
 
 
 class Mask(Protocol):
@@ -45,7 +46,6 @@ class Lanes(Protocol):
     def __ge__(self, other: "Lanes") -> Mask: ...
     def __le__(self, other: "Lanes") -> Mask: ...
     def __lt__(self, other: "Lanes") -> Mask: ...
-    def __gt__(self, other: "Lanes") -> Mask: ...
 
 
 class _LanesType(types.Type):
@@ -58,334 +58,238 @@ class _MaskType(types.Type):
         super().__init__(name="Mask")
 
 
-_lanes = _LanesType()
-_mask = _MaskType()
+_lanes, _mask = _LanesType(), _MaskType()
 
 
 @register_model(_LanesType)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _LANES)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        super().__init__(manager, numba_type, _FLOATS)
 
 
 @register_model(_MaskType)
-class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _MASK)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        super().__init__(manager, numba_type, _FLAGS)
 
 
-def _llvm(builder: Any, name: str, result: ir.Type, args: Sequence[Any]) -> Any:
-    """Calls an LLVM intrinsic."""
-    function = builder.module.globals.get(name)
-    if function is None:
-        signature = ir.FunctionType(result, [arg.type for arg in args])
-        function = ir.Function(builder.module, signature, name)
-    return builder.call(function, args)
+class _Site(NamedTuple):
+    """Where a function is called: Numba's context, LLVM's builder, the operands' Numba types."""
+
+    context: Any
+    builder: Any
+    operands: tuple[Any, ...]
 
 
-def _repeat(constant: float, kind: ir.Type = _FLOAT) -> ir.Constant:
-    return ir.Constant(ir.VectorType(kind, LANES), [constant] * LANES)
+def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
+    """Makes a function for kernels.
+
+    Args:
+        emit: Emits its instructions, given the site and the operands' LLVM values.
+        result: Numba type of the result.
+        operands: Numba types of the operands; None stands for any array.
+    """
+
+    def define(*given: Any) -> Any:
+        kinds = [other if kind is None else kind for kind, other in zip(operands, given)]
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return emit(_Site(context, builder, signature.args), *args)
+
+        return result(*kinds), generate
+
+    # Numba reads the number of operands off the function.
+    by_count: dict[int, Callable[..., Any]] = {
+        0: lambda typing: define(),
+        1: lambda typing, a: define(a),
+        2: lambda typing, a, b: define(a, b),
+        3: lambda typing, a, b, c: define(a, b, c),
+        8: lambda typing, a, b, c, d, e, f, g, h: define(a, b, c, d, e, f, g, h),
+    }
+    return intrinsic(by_count[len(operands)])
 
 
-def _shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
-    """Picks lanes of `a` (0 to 7) and `b` (8 to 15)."""
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(order)), list(order)))
+def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any, to: Any) -> None:
+    """Gives a Python operator its meaning between two values of one kind."""
+    implementation = _function(emit, to, kind, kind)
 
-
-def _splat(builder: Any, scalar: Any) -> Any:
-    single = builder.insert_element(ir.Constant(_LANES, ir.Undefined), scalar, _INT(0))
-    return _shuffle(builder, single, single, [0] * LANES)
-
-
-def _define(sign: Any, operand: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
-    """Gives a Python operator its meaning between two vectors."""
-
-    @intrinsic
-    def implementation(typing_context: Any, a: Any, b: Any) -> Any:
-        return result(a, b), lambda context, builder, signature, args: emit(builder, *args)
-
-    @overload(sign, strict=False)
+    @overload(sign, strict=False)  # the annotations are no part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
-        if a == operand and b == operand:
-            return lambda a, b: implementation(a, b)
+        if a == kind and b == kind:
+            return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
         return None
 
 
-_define(operator.add, _lanes, _lanes, lambda builder, a, b: builder.fadd(a, b))
-_define(operator.sub, _lanes, _lanes, lambda builder, a, b: builder.fsub(a, b))
-_define(operator.mul, _lanes, _lanes, lambda builder, a, b: builder.fmul(a, b))
-_define(operator.truediv, _lanes, _lanes, lambda builder, a, b: builder.fdiv(a, b))
-_define(operator.ge, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
-_define(operator.le, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-_define(operator.lt, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
-_define(operator.gt, _lanes, _mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-_define(operator.and_, _mask, _mask, lambda builder, a, b: builder.and_(a, b))
+_define(operator.add, lambda at, a, b: at.builder.fadd(a, b), _lanes, _lanes)
+_define(operator.sub, lambda at, a, b: at.builder.fsub(a, b), _lanes, _lanes)
+_define(operator.mul, lambda at, a, b: at.builder.fmul(a, b), _lanes, _lanes)
+_define(operator.truediv, lambda at, a, b: at.builder.fdiv(a, b), _lanes, _lanes)
+_define(operator.ge, lambda at, a, b: at.builder.fcmp_ordered(">=", a, b), _lanes, _mask)
+_define(operator.le, lambda at, a, b: at.builder.fcmp_ordered("<=", a, b), _lanes, _mask)
+_define(operator.lt, lambda at, a, b: at.builder.fcmp_ordered("<", a, b), _lanes, _mask)
+_define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 
 
-@intrinsic
-def splat(typing_context: Any, value: Any) -> Any:
-    """Returns a float32 number in all eight lanes."""
+def _llvm(name: str, result: ir.Type) -> Callable[..., Any]:
+    """Emits a call of an LLVM intrinsic."""
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _splat(builder, args[0])
+    def emit(at: _Site, *args: Any) -> Any:
+        function = at.builder.module.globals.get(name)
+        if function is None:
+            signature = ir.FunctionType(result, [arg.type for arg in args])
+            function = ir.Function(at.builder.module, signature, name)
+        return at.builder.call(function, args)
 
-    return _lanes(types.float32), emit
+    return emit
 
 
-@intrinsic
-def ramp(typing_context: Any) -> Any:
-    """Returns (0, 1, ..., 7)."""
+def _element(at: _Site, array: Any, index: Any, kind: ir.Type) -> Any:
+    """Returns the address of an array's element; no check, no counting from the end."""
+    data = at.context.make_array(at.operands[0])(at.context, at.builder, array).data
+    return at.builder.bitcast(at.builder.gep(data, [index]), kind.as_pointer())
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return ir.Constant(_LANES, [float(lane) for lane in range(LANES)])
 
-    return _lanes(), emit
-
-
-def _lanes_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _LANES.as_pointer())
-
-
-@intrinsic
-def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """Returns the eight numbers of a contiguous float32 vector from `index` on."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = _lanes_pointer(context, builder, signature.args[0], *args)
-        return builder.load(pointer, align=4)
-
-    return _lanes(array, types.intp), emit
-
-
-@intrinsic
-def broadcast(typing_context: Any, array: Any, index: Any) -> Any:
-    """Returns one number of a contiguous float32 vector in all eight lanes."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return _splat(builder, builder.load(builder.gep(data, [args[1]])))
-
-    return _lanes(array, types.intp), emit
-
-
-def _prefetch(context: Any, builder: Any, signature: Any, args: Any, write: int) -> Any:
-    data = context.make_array(signature.args[0])(context, builder, args[0]).data
-    pointer = builder.bitcast(builder.gep(data, [args[1]]), _BYTE.as_pointer())
-    # Keep in all levels of the cache; data, not instructions.
-    _llvm(builder, "llvm.prefetch.p0", ir.VoidType(), (pointer, _INT(write), _INT(3), _INT(1)))
-    return context.get_dummy_value()
-
-
-@intrinsic
-def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
-    """Asks for the cache line of an element to be brought near."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _prefetch(context, builder, signature, args, 0)
-
-    return types.void(array, types.intp), emit
-
-
-@intrinsic
-def prefetch_write(typing_context: Any, array: Any, index: Any) -> Any:
-    """As `prefetch`, for an element that will be written."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _prefetch(context, builder, signature, args, 1)
-
-    return types.void(array, types.intp), emit
-
-
-@intrinsic
-def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Writes eight numbers to a contiguous float32 vector from `index` on."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = _lanes_pointer(context, builder, signature.args[0], args[0], args[1])
-        builder.store(args[2], pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, _lanes), emit
-
-
-@intrinsic
-def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
-    """Returns a * b + c, rounded once where the machine can."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.fmuladd.v8f32", _LANES, args)
-
-    return _lanes(_lanes, _lanes, _lanes), emit
-
-
-@intrinsic
-def fnma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
-    """Returns c - a * b, rounded once where the machine can."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        a, b, c = args
-        return _llvm(builder, "llvm.fmuladd.v8f32", _LANES, (builder.fneg(a), b, c))
-
-    return _lanes(_lanes, _lanes, _lanes), emit
-
-
-@intrinsic
-def square_root(typing_context: Any, a: Any) -> Any:
-    """Returns the square roots."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.sqrt.v8f32", _LANES, args)
-
-    return _lanes(_lanes), emit
-
-
-@intrinsic
-def round_up(typing_context: Any, a: Any) -> Any:
-    """Returns the smallest whole numbers that are not smaller."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.ceil.v8f32", _LANES, args)
-
-    return _lanes(_lanes), emit
-
-
-@intrinsic
-def round_down(typing_context: Any, a: Any) -> Any:
-    """Returns the largest whole numbers that are not larger."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.floor.v8f32", _LANES, args)
-
-    return _lanes(_lanes), emit
-
-
-@intrinsic
-def magnitude(typing_context: Any, a: Any) -> Any:
-    """Returns the absolute values."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.fabs.v8f32", _LANES, args)
-
-    return _lanes(_lanes), emit
-
-
-@intrinsic
-def as_negative(typing_context: Any, a: Any) -> Any:
-    """Returns minus the absolute values (sets the sign bits)."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], _INT_LANES)
-        return builder.bitcast(builder.or_(bits, _repeat(-(2**31), _INT)), _LANES)
-
-    return _lanes(_lanes), emit
-
-
-@intrinsic
-def smaller(typing_context: Any, a: Any, b: Any) -> Any:
-    """Returns the smaller of each two numbers; `b` where they do not compare."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return _lanes(_lanes, _lanes), emit
-
-
-@intrinsic
-def larger(typing_context: Any, a: Any, b: Any) -> Any:
-    """Returns the larger of each two numbers; `b` where they do not compare."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return _lanes(_lanes, _lanes), emit
-
-
-@intrinsic
-def where(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
-    """Returns `a` where the mask is true and `b` elsewhere."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(*args)
-
-    return _lanes(_mask, _lanes, _lanes), emit
-
-
-@intrinsic
-def bits(typing_context: Any, mask: Any) -> Any:
-    """Returns the mask as a number from 0 to 255, lane 0 in the lowest bit (uint64)."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), _LONG)
-
-    return types.uint64(_mask), emit
-
-
-@intrinsic
-def lowest_bit(typing_context: Any, number: Any) -> Any:
-    """Returns the position of the lowest set bit of a uint64 (64 for zero)."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.cttz.i64", _LONG, (args[0], ir.IntType(1)(0)))
-
-    return types.int64(types.uint64), emit
-
-
-@intrinsic
-def count_bits(typing_context: Any, number: Any) -> Any:
-    """Returns the number of set bits of a uint64."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _llvm(builder, "llvm.ctpop.i64", _LONG, args)
-
-    return types.int64(types.uint64), emit
-
-
-@intrinsic
-def scale_by_power(typing_context: Any, value: Any, shifted: Any) -> Any:
-    """Returns value * 2**n where `shifted` is n + 1.5 * 2**23, so that its lowest bits hold n."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value, shifted = (builder.bitcast(arg, _INT_LANES) for arg in args)
-        exponent = builder.shl(shifted, _repeat(23, _INT))
-        return builder.bitcast(builder.add(value, exponent), _LANES)
-
-    return _lanes(_lanes, _lanes), emit
-
-
-@intrinsic
-def sums(
-    typing_context: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any
-) -> Any:
-    """Returns the eight vectors' sums over their lanes, in the order of the arguments."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def add_pairs(x: Any, y: Any, width: int) -> Any:
-            """Folds lane groups of `width` onto each other: x's into low, y's into high groups."""
-            blocks = range(0, LANES, 2 * width)
-            low = [s + i for start in blocks for s in (start, start + LANES) for i in range(width)]
-            return builder.fadd(
-                _shuffle(builder, x, y, low),
-                _shuffle(builder, x, y, [lane + width for lane in low]),
-            )
-
-        rows = list(args)
-        for width in (1, 2, 4):
-            rows = [add_pairs(rows[i], rows[i + 1], width) for i in range(0, len(rows), 2)]
-        return rows[0]
-
-    return _lanes(*([_lanes] * LANES)), emit
-
-
-@intrinsic
-def total(typing_context: Any, a: Any) -> Any:
-    """Returns the sum of the lanes (float32), added in pairs."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (row,) = args
-        for width in (1, 2, 4):
-            order = [lane ^ width for lane in range(LANES)]
-            row = builder.fadd(row, _shuffle(builder, row, row, order))
-        return builder.extract_element(row, _INT(0))
-
-    return types.float32(_lanes), emit
+def _shuffle(at: _Site, a: Any, b: Any, order: Sequence[int]) -> Any:
+    """Picks lanes of `a` (0 to 7) and `b` (8 to 15)."""
+    return at.builder.shuffle_vector(a, b, ir.Constant(_INTS, list(order)))
+
+
+def _splat(at: _Site, value: Any) -> Any:
+    single = at.builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), value, _INT(0))
+    return _shuffle(at, single, single, [0] * LANES)
+
+
+def _store(at: _Site, array: Any, index: Any, value: Any) -> Any:
+    at.builder.store(value, _element(at, array, index, _FLOATS), align=_ALIGNMENT)
+    return at.context.get_dummy_value()
+
+
+def _prefetch(at: _Site, array: Any, index: Any, *, write: int) -> Any:
+    address = _element(at, array, index, _BYTE)
+    # Keep in all levels of the cache (3); data, not instructions (1).
+    _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
+    return at.context.get_dummy_value()
+
+
+def _negated_fma(at: _Site, a: Any, b: Any, c: Any) -> Any:
+    return _llvm("llvm.fmuladd.v8f32", _FLOATS)(at, at.builder.fneg(a), b, c)
+
+
+def _as_negative(at: _Site, a: Any) -> Any:
+    with_sign = at.builder.or_(at.builder.bitcast(a, _INTS), _SIGN_BIT)
+    return at.builder.bitcast(with_sign, _FLOATS)
+
+
+def _pick(sign: str) -> Callable[..., Any]:
+    def emit(at: _Site, a: Any, b: Any) -> Any:
+        return at.builder.select(at.builder.fcmp_ordered(sign, a, b), a, b)
+
+    return emit
+
+
+def _bits(at: _Site, mask: Any) -> Any:
+    return at.builder.zext(at.builder.bitcast(mask, ir.IntType(LANES)), _LONG)
+
+
+def _scale_by_power(at: _Site, value: Any, shifted: Any) -> Any:
+    exponent = at.builder.shl(at.builder.bitcast(shifted, _INTS), _MANTISSA_BITS)
+    scaled = at.builder.add(at.builder.bitcast(value, _INTS), exponent)
+    return at.builder.bitcast(scaled, _FLOATS)
+
+
+def _sums(at: _Site, *args: Any) -> Any:
+    rows = list(args)
+    for width in (1, 2, 4):
+        # Folds groups of `width` lanes onto their neighbours, two vectors into one.
+        starts = [s + o for s in range(0, LANES, 2 * width) for o in (0, LANES)]
+        low = [start + lane for start in starts for lane in range(width)]
+        high = [lane + width for lane in low]
+        pairs = zip(rows[::2], rows[1::2], strict=True)
+        rows = [
+            at.builder.fadd(_shuffle(at, a, b, low), _shuffle(at, a, b, high)) for a, b in pairs
+        ]
+    return rows[0]
+
+
+def _total(at: _Site, a: Any) -> Any:
+    for width in (1, 2, 4):
+        a = at.builder.fadd(a, _shuffle(at, a, a, [lane ^ width for lane in range(LANES)]))
+    return at.builder.extract_element(a, _INT(0))
+
+
+_RAMP = ir.Constant(_FLOATS, [float(lane) for lane in range(LANES)])
+_Array = NDArray[Any]
+
+#: Returns a float32 number in all lanes.
+splat: Callable[[np.float32], Lanes] = _function(_splat, _lanes, types.float32)
+#: Returns (0, 1, ..., 7).
+ramp: Callable[[], Lanes] = _function(lambda at: _RAMP, _lanes)
+#: Returns eight consecutive numbers of a flat float32 array, from an index on.
+load: Callable[[_Array, int], Lanes] = _function(
+    lambda at, array, index: at.builder.load(
+        _element(at, array, index, _FLOATS), align=_ALIGNMENT
+    ),
+    *(_lanes, None, types.intp),
+)
+#: Returns one number of a flat float32 array in all lanes.
+broadcast: Callable[[_Array, int], Lanes] = _function(
+    lambda at, array, index: _splat(at, at.builder.load(_element(at, array, index, _FLOAT))),
+    *(_lanes, None, types.intp),
+)
+#: Writes eight consecutive numbers to a flat float32 array, from an index on.
+store: Callable[[_Array, int, Lanes], None] = _function(
+    _store, types.void, None, types.intp, _lanes
+)
+#: Asks for the cache line of an element of a contiguous array (a flat index) to be brought near.
+prefetch: Callable[[_Array, int], None] = _function(
+    lambda at, array, index: _prefetch(at, array, index, write=0), types.void, None, types.intp
+)
+#: As `prefetch`, for an element that will be written.
+prefetch_write: Callable[[_Array, int], None] = _function(
+    lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
+)
+#: Returns a b + c, rounded once where the machine can.
+fma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
+    _llvm("llvm.fmuladd.v8f32", _FLOATS), _lanes, _lanes, _lanes, _lanes
+)
+#: Returns c - a b, rounded once where the machine can.
+fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
+    _negated_fma, _lanes, _lanes, _lanes, _lanes
+)
+#: Returns the square roots.
+square_root: Callable[[Lanes], Lanes] = _function(_llvm("llvm.sqrt.v8f32", _FLOATS), _lanes, _lanes)
+#: Returns the smallest whole numbers that are not smaller.
+round_up: Callable[[Lanes], Lanes] = _function(_llvm("llvm.ceil.v8f32", _FLOATS), _lanes, _lanes)
+#: Returns the largest whole numbers that are not larger.
+round_down: Callable[[Lanes], Lanes] = _function(_llvm("llvm.floor.v8f32", _FLOATS), _lanes, _lanes)
+#: Returns the absolute values.
+magnitude: Callable[[Lanes], Lanes] = _function(_llvm("llvm.fabs.v8f32", _FLOATS), _lanes, _lanes)
+#: Returns minus the absolute values.
+as_negative: Callable[[Lanes], Lanes] = _function(_as_negative, _lanes, _lanes)
+#: Returns the smaller of each two numbers, the second where they do not compare.
+smaller: Callable[[Lanes, Lanes], Lanes] = _function(_pick("<"), _lanes, _lanes, _lanes)
+#: Returns the larger of each two numbers, the second where they do not compare.
+larger: Callable[[Lanes, Lanes], Lanes] = _function(_pick(">"), _lanes, _lanes, _lanes)
+#: Returns the first number where the mask is true and the second elsewhere.
+where: Callable[[Mask, Lanes, Lanes], Lanes] = _function(
+    lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
+)
+#: Returns the mask as a number from 0 to 255, lane 0 in the lowest bit.
+bits: Callable[[Mask], np.uint64] = _function(_bits, types.uint64, _mask)
+#: Returns the position of the lowest set bit, 64 for zero.
+lowest_bit: Callable[[np.uint64], int] = _function(
+    lambda at, number: _llvm("llvm.cttz.i64", _LONG)(at, number, ir.IntType(1)(0)),
+    *(types.int64, types.uint64),
+)
+#: Returns the number of set bits.
+count_bits: Callable[[np.uint64], int] = _function(
+    _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
+)
+#: Returns value * 2**n where the second vector is n + 1.5 * 2**23: its lowest bits then hold n.
+scale_by_power: Callable[[Lanes, Lanes], Lanes] = _function(_scale_by_power, _lanes, _lanes, _lanes)
+#: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
+sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = _function(
+    _sums, _lanes, *([_lanes] * LANES)
+)
+#: Returns the sum over the lanes, added in pairs.
+total: Callable[[Lanes], np.float32] = _function(_total, types.float32, _lanes)

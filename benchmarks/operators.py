@@ -1,0 +1,158 @@
+"""Cost of the operators beside plain additions of the same gradients.
+
+One JSON line per operator:
+
+    python benchmarks/operators.py [OPERATOR ...] [--parameters N] [--repeats N]
+
+For K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of a vanilla backbone,
+`ratio` is (time of the aggregation - time of the additions) / time of the additions, where the
+additions are `torch.add(g1, g2, out=)` and its like for the other views, measured in turn with the
+aggregation. `arithmetic_us` is the operator's own arithmetic for six blocks. Times are the least of
+the repeats; a machine that does other work shows in `load`.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+import torch
+from _machine import facts, peak_mib
+from torch import Tensor
+
+from crossgrad_core.aggregation import operator_context
+from crossgrad_core.blocks import Block, BlockKind, LearningRate
+from crossgrad_core.contexts import AggregateContext
+from crossgrad_core.dense_gradients import DenseViewGradients
+from crossgrad_core.operator import Operator
+from crossgrad_core.registry import build, entries
+from crossgrad_core.state import EMPTY_STATE
+
+#: Block -> elements per Gaussian and kind, as in the vanilla backbone with SH degree 3.
+WIDTHS: dict[str, tuple[int, BlockKind]] = {
+    "means": (3, "geometry"),
+    "scales": (3, "geometry"),
+    "quats": (4, "geometry"),
+    "opacities": (1, "appearance"),
+    "f_dc": (3, "appearance"),
+    "f_rest": (45, "appearance"),
+}
+BLOCKS = tuple(
+    Block(name, (name,), True, kind, LearningRate(1.0)) for name, (_, kind) in WIDTHS.items()
+)
+ADDITIONS = "torch.add"
+
+
+def main() -> None:
+    """Prints one line per operator, and one for the additions themselves."""
+    arguments = _arguments()
+    names = arguments.operators or list(entries("operators"))
+    operators = {name: cast("Operator", build("operators", name, {})) for name in names}
+    lines: dict[str, dict[str, Any]] = {name: {"operator": name} for name in operators}
+    for views in (2, 4):
+        for name, result in _measured(operators, views, arguments).items():
+            lines[name] |= result
+    for line in lines.values():
+        print(json.dumps(line | {"peak_mib": peak_mib()} | facts()))
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("operators", nargs="*", help="names; default: all installed")
+    parser.add_argument("--parameters", type=int, default=7_000_000)
+    parser.add_argument("--repeats", type=int, default=20)
+    return parser.parse_args()
+
+
+def _measured(
+    operators: dict[str, Operator], views: int, arguments: argparse.Namespace
+) -> dict[str, dict[str, float]]:
+    gradients = _gradients(views, arguments.parameters)
+    out = {name: torch.empty_like(gradient) for name, gradient in gradients[0].items()}
+    results = {}
+    for name, operator in operators.items():
+        if not operator.views.admits(views):
+            continue
+        work = {
+            "aggregation": lambda chosen=operator: chosen.aggregate(
+                _context(gradients), EMPTY_STATE
+            ),
+            ADDITIONS: lambda: _add(gradients, out),
+        }
+        times = _least(work, arguments.repeats)
+        added = times["aggregation"] - times[ADDITIONS]
+        results[name] = {
+            f"ratio_k{views}": round(added / times[ADDITIONS], 3),
+            f"aggregation_ms_k{views}": round(1e3 * times["aggregation"], 3),
+            f"additions_ms_k{views}": round(1e3 * times[ADDITIONS], 3),
+            f"arithmetic_us_k{views}": _arithmetic(operator, views),
+        }
+    return results
+
+
+def _gradients(views: int, parameters: int) -> list[dict[str, Tensor]]:
+    count = parameters // sum(width for width, _ in WIDTHS.values())
+    generator = torch.Generator().manual_seed(0)
+    return [
+        {name: torch.randn(count, width, generator=generator) for name, (width, _) in WIDTHS.items()}
+        for _ in range(views)
+    ]
+
+
+def _add(gradients: list[dict[str, Tensor]], out: dict[str, Tensor]) -> None:
+    for name, total in out.items():
+        torch.add(gradients[0][name], gradients[1][name], out=total)
+        for view in gradients[2:]:
+            torch.add(total, view[name], out=total)
+
+
+def _least(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Least seconds of each piece of work, in turn, after one call to warm up."""
+    least = dict.fromkeys(work, float("inf"))
+    for repeat in range(repeats + 1):
+        for name, run in work.items():
+            start = perf_counter()
+            run()
+            if repeat:
+                least[name] = min(least[name], perf_counter() - start)
+    return least
+
+
+def _context(gradients: list[dict[str, Tensor]]) -> AggregateContext:
+    views = len(gradients)
+    return AggregateContext(
+        step=1,
+        schedule=cast("Any", None),
+        scene=cast("Any", None),
+        states={},
+        rng=np.random.default_rng(0),
+        gradients=DenseViewGradients(gradients, BLOCKS),
+        losses=np.ones(views),
+        labels=tuple(("near", "far")[k % 2] for k in range(views)),
+        distances=np.linspace(0.5, 2.0, views),
+        reference_distance=1.0,
+        blocks=BLOCKS,
+    )
+
+
+def _arithmetic(operator: Operator, views: int) -> float | None:
+    """Microseconds of `transform` for six blocks; None for operators that work on elements."""
+    if operator.elementwise:
+        return None
+    context = _context(_gradients(views, 6_000))
+    gramians = context.gradients.gramians("tensor")
+    given = operator_context(context, "tensor", context.gradients.present("tensor"))
+    rng = np.random.default_rng(0)
+    state = EMPTY_STATE
+
+    def step() -> None:
+        nonlocal state
+        _, state = operator.transform(gramians, given, state, rng)
+
+    return round(1e6 * _least({"transform": step}, 200)["transform"], 1)
+
+
+if __name__ == "__main__":
+    main()

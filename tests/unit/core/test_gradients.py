@@ -1,0 +1,370 @@
+"""Gradients of K views: Gramians, weighted sums, overlaps, and accumulation."""
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.aggregation import aggregate_by_gramians
+from crossgrad_core.blocks import Block, LearningRate
+from crossgrad_core.contexts import AggregateContext
+from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import build
+from crossgrad_core.state import EMPTY_STATE
+from crossgrad_operators.sum import Sum
+from crossgrad_operators.symmetric import Symmetric
+
+RATE = LearningRate(1.0)
+BLOCKS = (
+    Block("means", ("means",), True, "geometry", RATE),
+    Block("scales", ("scales",), True, "geometry", RATE),
+    Block("opacities", ("opacities",), True, "appearance", RATE),
+    Block("mlp", ("mlp.0", "mlp.1"), False, "neutral", RATE),
+)
+SHAPES = {"means": (50, 3), "scales": (50, 3), "opacities": (50, 1), "mlp.0": (7, 5), "mlp.1": (5,)}
+GRANULARITIES = ("tensor", "group", "global", "gaussian")
+TENSORS = {
+    "tensor": [["means"], ["scales"], ["opacities"], ["mlp.0", "mlp.1"]],
+    "group": [["means", "scales"], ["opacities"], ["mlp.0", "mlp.1"]],
+    "global": [list(SHAPES)],
+}
+
+
+def make_views(count, dtype=torch.float32, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [
+        {name: torch.randn(shape, generator=generator).to(dtype) for name, shape in SHAPES.items()}
+        for _ in range(count)
+    ]
+
+
+def aggregate(operator, gradients, seed=0):
+    views = gradients.views
+    context = AggregateContext(
+        step=1,
+        schedule=None,
+        scene=None,
+        states={},
+        rng=np.random.default_rng(seed),
+        gradients=gradients,
+        losses=np.ones(views),
+        labels=None,
+        distances=np.ones(views),
+        reference_distance=1.0,
+        blocks=BLOCKS,
+    )
+    return operator.aggregate(context, EMPTY_STATE)[0]
+
+
+def naive_gramian(views, names):
+    rows = [torch.cat([v[n].double().flatten() for n in names]) for v in views]
+    return (torch.stack(rows) @ torch.stack(rows).T).numpy()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 16])
+@pytest.mark.parametrize("granularity", ["tensor", "group", "global"])
+def test_gramians_and_sums_against_the_obvious_way(granularity, count, dtype):
+    views = make_views(count, dtype)
+    gradients = DenseViewGradients(views, BLOCKS)
+    expected = np.stack([naive_gramian(views, names) for names in TENSORS[granularity]])
+    np.testing.assert_allclose(gradients.gramians(granularity), expected, rtol=1e-12, atol=1e-11)
+    weights = np.random.default_rng(1).standard_normal((len(expected), count))
+    found = gradients.combine(weights, granularity)
+    unit = torch.finfo(dtype).eps
+    for row, names in zip(weights, TENSORS[granularity], strict=True):
+        for name in names:
+            exact = sum(w * v[name].double() for w, v in zip(row, views, strict=True))
+            assert found[name].dtype == dtype
+            assert float((found[name].double() - exact).abs().max()) <= 2 * unit * count
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_rows_of_primitives(count, dtype):
+    views = make_views(count, dtype)
+    gradients = DenseViewGradients(views, BLOCKS)
+    names, found = gradients.names("gaussian"), gradients.gramians("gaussian")
+    assert names == ("means",) * 50 + ("scales",) * 50 + ("opacities",) * 50 + ("mlp",)
+    rows = torch.stack([v["scales"].double() for v in views], dim=1)
+    np.testing.assert_allclose(found[50:100], (rows @ rows.transpose(1, 2)).numpy(), atol=1e-13)
+    np.testing.assert_allclose(found[-1], naive_gramian(views, ["mlp.0", "mlp.1"]), rtol=1e-13)
+    weights = np.random.default_rng(1).standard_normal((151, count))
+    combined = gradients.combine(weights, "gaussian")
+    exact = (torch.from_numpy(weights[50:100, :, None]) * rows).sum(dim=1)
+    assert float((combined["scales"].double() - exact).abs().max()) < 1e-5
+    exact = sum(w * v["mlp.0"].double() for w, v in zip(weights[-1], views, strict=True))
+    assert float((combined["mlp.0"].double() - exact).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_accumulation_and_separate_gradients_give_the_same_bits(count, dtype):
+    views = make_views(count, dtype)
+    views[-1]["scales"] = None
+    accumulated = AccumulatedGradients.empty(BLOCKS)
+    grown = {name: None for name in SHAPES}
+    for view in views:
+        accumulated.add({n: None if g is None else g.clone() for n, g in view.items()})
+        for name, g in view.items():
+            if g is not None:
+                grown[name] = g.clone() if grown[name] is None else grown[name].add_(g)
+    separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
+    together = aggregate(Sum(), accumulated)
+    assert separate.counts == together.counts
+    weights = np.ones((len(BLOCKS), count))
+    weighted = DenseViewGradients(views, BLOCKS).combine(weights, "tensor")
+    for name, expected in grown.items():
+        for found in (separate.gradients, together.gradients, weighted):
+            if expected is None:
+                assert found[name] is None
+            else:
+                assert torch.equal(found[name], expected)
+
+
+def test_a_non_finite_view_is_dropped_alike_by_both_ways():
+    views = make_views(3)
+    views[1]["means"][4, 1] = float("nan")
+    views[0]["mlp.1"][2] = float("inf")
+    expected = {
+        "means": views[0]["means"] + views[2]["means"],
+        "mlp.0": views[1]["mlp.0"] + views[2]["mlp.0"],
+        "mlp.1": views[1]["mlp.1"] + views[2]["mlp.1"],
+    }
+    separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
+    accumulated = AccumulatedGradients.empty(BLOCKS)
+    for view in views:
+        accumulated.add({n: g.clone() for n, g in view.items()})
+    together = aggregate(Sum(), accumulated)
+    for found in (separate, together):
+        assert found.counts == {"zero": 0, "dropped": 2}
+        for name, gradient in expected.items():
+            assert torch.equal(found.gradients[name], gradient)
+
+
+def test_blocks_without_a_finite_view_are_left_out():
+    views = make_views(2)
+    for view in views:
+        view["means"][0, 0] = float("inf")
+    joint = AccumulatedGradients({n: views[0][n] + views[1][n] for n in SHAPES}, BLOCKS, 2)
+    for gradients in (DenseViewGradients(views, BLOCKS), joint):
+        found = aggregate(Sum(), gradients)
+        assert found.gradients["means"] is None
+        assert found.gradients["scales"] is not None
+        assert found.counts["dropped"] == 1
+    projected = aggregate(Symmetric(), DenseViewGradients(views, BLOCKS))
+    assert projected.gradients["means"] is None
+    assert projected.counts["dropped"] == 1
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+def test_what_a_view_does_not_touch_counts_as_zero(granularity):
+    views = make_views(2)
+    zero = [views[0], {**views[1], "opacities": torch.zeros(50, 1)}]
+    absent = [views[0], {n: g for n, g in views[1].items() if n != "opacities"}]
+    operator = Symmetric(granularity=granularity)
+    one = aggregate(operator, DenseViewGradients(zero, BLOCKS))
+    other = aggregate(operator, DenseViewGradients(absent, BLOCKS))
+    assert one.counts == other.counts
+    for name in SHAPES:
+        assert torch.equal(one.gradients[name], other.gradients[name])
+    nowhere = [{**v, "opacities": None} for v in views]
+    assert aggregate(operator, DenseViewGradients(nowhere, BLOCKS)).gradients["opacities"] is None
+
+
+def test_events_are_counted():
+    """One block of each sort: conflicting, agreeing but disjoint, zero, not finite."""
+    one = {"means": torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": torch.ones(50, 1)}
+    two = {"means": -torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": None}
+    one["scales"][:25], two["scales"][25:] = 1.0, 1.0
+    one |= {"mlp.0": torch.ones(7, 5), "mlp.1": torch.ones(5)}
+    two |= {"mlp.0": torch.full((7, 5), float("nan")), "mlp.1": torch.ones(5)}
+    found = aggregate(Symmetric(), DenseViewGradients([one, two], BLOCKS))
+    assert found.counts == {"zero": 1, "disjoint": 1, "dropped": 1, "conflict": 1}
+    assert torch.equal(found.gradients["scales"], one["scales"] + two["scales"])
+
+
+def test_a_product_of_zero_is_no_proof_of_disjoint_support():
+    one = {"means": torch.ones(50, 3)}
+    two = {"means": torch.ones(50, 3)}
+    two["means"][:, 0], two["means"][:, 1] = -1.0, 0.0
+    gradients = DenseViewGradients([one, two], BLOCKS)
+    assert gradients.gramians("tensor")[0, 0, 1] == 0
+    assert gradients.overlap("tensor")[0, 0, 1]
+    assert not DenseViewGradients([one, {}], BLOCKS).overlap("tensor")[0, 0, 1]
+    rows = gradients.overlap("gaussian")
+    assert rows[:50, 0, 1].all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_overlap_of_rows(dtype):
+    one, two = torch.zeros(50, 3, dtype=dtype), torch.zeros(50, 3, dtype=dtype)
+    one[:, 0] = 1
+    two[::2, 0], two[::2, 1], one[::2, 1] = 1, -1, 1
+    two[1::2, 2] = 1
+    gradients = DenseViewGradients([{"means": one}, {"means": two}], BLOCKS)
+    assert not gradients.gramians("gaussian")[:50, 0, 1].any()
+    assert gradients.overlap("gaussian")[:50, 0, 1].tolist() == [True, False] * 25
+
+
+@pytest.mark.parametrize("views", [2, 5])
+def test_threads_and_chunks_change_no_bit(views):
+    generator = torch.Generator().manual_seed(0)
+    big = [{"means": torch.randn(100_003, 3, generator=generator)} for _ in range(views)]
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in (1, before):
+            numba.set_num_threads(threads)
+            gradients = DenseViewGradients(big, BLOCKS[:1])
+            weights = np.linspace(-1, 2, views)[None]
+            rows = gradients.gramians("gaussian")
+            combined = gradients.combine(weights, "tensor")["means"]
+            results.append((gradients.gramians("tensor"), rows, combined))
+    finally:
+        numba.set_num_threads(before)
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(np.asarray(one), np.asarray(other))
+
+
+def test_one_core_and_all_cores_give_the_same_bits():
+    from crossgrad_core.numba_kernels import dense
+
+    rows = torch.randn(3, 50_001, generator=torch.Generator().manual_seed(0))
+    addresses = np.array([[row.data_ptr() for row in rows]])
+    sizes = np.array([50_001])
+    table = dense.chunk_table(sizes)
+    one, other = (f(addresses, sizes, table) for f in (dense.gramians, dense.gramians_serial))
+    assert np.array_equal(one, other)
+    results = [torch.empty(50_001), torch.empty(50_001)]
+    for kernel, out in zip((dense.combine, dense.combine_serial), results, strict=True):
+        places = np.array([out.data_ptr()])
+        kernel(addresses, np.array([[1.5, -2.0, 0.25]]), np.array([False]), places, sizes, table)
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("views", [1, 2, 3, 5])
+def test_overwriting_gives_the_same_bits_and_can_be_done_once(granularity, views):
+    operator = Symmetric(granularity=granularity)
+    kept = make_views(views)
+    expected = aggregate(operator, DenseViewGradients(kept, BLOCKS))
+    gradients = DenseViewGradients(make_views(views), BLOCKS, overwrite=True)
+    found = aggregate(operator, gradients)
+    for name in SHAPES:
+        assert torch.equal(found.gradients[name], expected.gradients[name])
+    with pytest.raises(RuntimeError, match="overwritten"):
+        gradients.total()
+    for view, fresh in zip(kept, make_views(views), strict=True):
+        assert all(torch.equal(view[name], fresh[name]) for name in SHAPES)
+
+
+def test_gradients_of_any_layout():
+    views = make_views(2)
+    turned = [{**v, "mlp.0": v["mlp.0"].T.contiguous().T, "means": v["means"]} for v in views]
+    assert not turned[0]["mlp.0"].is_contiguous()
+    one, other = (DenseViewGradients(v, BLOCKS).gramians("tensor") for v in (views, turned))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_float64_far_outside_the_range_of_products():
+    views = [{"means": torch.full((50, 3), 1e200, dtype=torch.float64)} for _ in range(2)]
+    views[1]["means"][:, 0] *= -4
+    gradients = DenseViewGradients(views, BLOCKS[:1])
+    gramian = gradients.gramians("tensor")[0]
+    assert np.isfinite(gramian).all()
+    cosine = gramian[0, 1] / np.sqrt(gramian[0, 0] * gramian[1, 1])
+    assert cosine == pytest.approx(-2 / np.sqrt(3 * 18))
+    found = aggregate(Symmetric(), gradients).gradients["means"]
+    assert bool(torch.isfinite(found).all())
+    assert gradients.present("tensor").all()
+
+
+def test_no_gaussians_at_all():
+    views = [{"means": torch.zeros(0, 3)} for _ in range(2)]
+    for granularity in GRANULARITIES:
+        operator = Symmetric(granularity=granularity)
+        found = aggregate(operator, DenseViewGradients(views, BLOCKS[:1]))
+        assert found.gradients["means"].shape == (0, 3)
+
+
+def test_elementwise_sees_the_views_that_count():
+    views = make_views(2)
+    views[0]["means"][0, 0] = float("nan")
+    seen = {}
+
+    def first(name, gradients):
+        seen[name] = [g is not None for g in gradients]
+        return next(g for g in gradients if g is not None)
+
+    found = DenseViewGradients(views, BLOCKS).elementwise(first)
+    assert seen["means"] == [False, True]
+    assert seen["scales"] == [True, True]
+    assert torch.equal(found["means"], views[1]["means"])
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda g: g.gramians("tensor"),
+        lambda g: g.overlap("tensor"),
+        lambda g: g.combine(np.ones((4, 2)), "tensor"),
+        lambda g: g.elementwise(lambda _, views: views[0]),
+        lambda g: g.present("group"),
+    ],
+)
+def test_accumulated_gradients_do_not_pretend_to_know_single_views(look):
+    gradients = AccumulatedGradients.empty(BLOCKS)
+    for view in make_views(2):
+        gradients.add(view)
+    assert gradients.views == 2
+    assert gradients.names("tensor") == ("means", "scales", "opacities", "mlp")
+    with pytest.raises(RuntimeError, match="separate = True"):
+        look(gradients)
+
+
+def test_weights_that_are_not_finite_are_refused_with_the_operator_and_the_block():
+    class Divides(Symmetric):
+        def transform(self, gramians, context, state, rng):
+            return np.full(gramians.shape, np.nan), state
+
+    with pytest.raises(UserError, match="Divides"):
+        aggregate(Divides(), DenseViewGradients(make_views(2), BLOCKS))
+
+
+@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize("name", ["symmetric", "cagrad", "gradvac", "confgate", "nash", "dispatch"])
+def test_operators_take_every_granularity(name, granularity):
+    operator = build("operators", name, {"granularity": granularity})
+    found = aggregate(operator, DenseViewGradients(make_views(2), BLOCKS))
+    for gradient in found.gradients.values():
+        assert bool(torch.isfinite(gradient).all())
+
+
+def test_the_mean_divides_by_all_views():
+    views = make_views(3)
+    views[2]["means"] = None
+    found = aggregate(build("operators", "mean", {}), DenseViewGradients(views, BLOCKS))
+    expected = (views[0]["means"] + views[1]["means"]) / 3
+    assert torch.equal(found.gradients["means"], expected)
+
+
+def test_aggregation_is_what_operators_do_by_default():
+    gradients = DenseViewGradients(make_views(2), BLOCKS)
+    found = aggregate(Symmetric(), gradients)
+    context = AggregateContext(
+        step=1,
+        schedule=None,
+        scene=None,
+        states={},
+        rng=np.random.default_rng(0),
+        gradients=gradients,
+        losses=np.ones(2),
+        labels=None,
+        distances=np.ones(2),
+        reference_distance=1.0,
+        blocks=BLOCKS,
+    )
+    direct, _ = aggregate_by_gramians(Symmetric(), context, EMPTY_STATE)
+    assert all(torch.equal(found.gradients[n], direct.gradients[n]) for n in SHAPES)
