@@ -96,7 +96,10 @@ def _gradients(views: int, parameters: int) -> list[dict[str, Tensor]]:
     count = parameters // sum(width for width, _ in WIDTHS.values())
     generator = torch.Generator().manual_seed(0)
     return [
-        {name: torch.randn(count, width, generator=generator) for name, (width, _) in WIDTHS.items()}
+        {
+            name: torch.randn(count, width, generator=generator)
+            for name, (width, _) in WIDTHS.items()
+        }
         for _ in range(views)
     ]
 

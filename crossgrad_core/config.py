@@ -83,12 +83,11 @@ class RunConfig(BaseModel):
     def _background(cls, value: str) -> str:
         if value in {"black", "white", "random"}:
             return value
-        parts = value.split(",")
         try:
-            inside = len(parts) == 3 and all(0.0 <= float(part) <= 1.0 for part in parts)
+            red, green, blue = (float(part) for part in value.split(","))
         except ValueError:
-            inside = False
-        if not inside:
+            red = green = blue = -1.0
+        if not all(0.0 <= level <= 1.0 for level in (red, green, blue)):
             raise ValueError("must be black, white, random, or three numbers r,g,b in [0, 1]")
         return value
 

@@ -18,6 +18,7 @@ from crossgrad_core.numba_kernels.pointers import float32_pointer
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Rows = NDArray[np.float32]
 
 #: Elements of one chunk, 16 kB per view.
 CHUNK = 4096
@@ -148,29 +149,49 @@ def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
 
 
 @njit(cache=True)
-def _weighted(rows: Ints, weights: Floats, count: int, start: int, wide: Floats) -> None:
-    """Fills `wide` with the sum of weights times rows.
+def _weighted(
+    rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
+) -> None:
+    """Fills `narrow` with the sum of weights times rows, rounded once.
 
     In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
     """
-    n = wide.size
-    if count == 1:
-        a, u = row(rows[0], start, n), weights[0]
-        for i in range(n):
-            wide[i] = u * np.float64(a[i])
-        return
+    n = narrow.size
     a, u = row(rows[0], start, n), weights[0]
-    b, v = row(rows[1], start, n), weights[1]
-    for i in range(n):
-        wide[i] = u * np.float64(a[i]) + v * np.float64(b[i])
-    for k in range(2, count):
-        c, w = row(rows[k], start, n), weights[k]
+    if count == 1:
         for i in range(n):
-            wide[i] += w * np.float64(c[i])
+            narrow[i] = np.float32(u * np.float64(a[i]))
+        return
+    b, v = row(rows[1], start, n), weights[1]
+    if count == 2:
+        for i in range(n):
+            narrow[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
+        return
+    c, w = row(rows[2], start, n), weights[2]
+    if count == 3:
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            narrow[i] = np.float32(x + w * np.float64(c[i]))
+        return
+    d, z = row(rows[3], start, n), weights[3]
+    if count == 4:
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            narrow[i] = np.float32((x + w * np.float64(c[i])) + z * np.float64(d[i]))
+        return
+    for i in range(n):
+        x = u * np.float64(a[i]) + v * np.float64(b[i])
+        wide[i] = (x + w * np.float64(c[i])) + z * np.float64(d[i])
+    for k in range(4, count):
+        e, s = row(rows[k], start, n), weights[k]
+        for i in range(n):
+            wide[i] += s * np.float64(e[i])
+    for i in range(n):
+        narrow[i] = np.float32(wide[i])
 
 
 @njit(cache=True)
-def _plain(rows: Ints, count: int, start: int, narrow: NDArray[np.float32]) -> None:
+def _plain(rows: Ints, count: int, start: int, narrow: Rows) -> None:
     """Fills `narrow` with the rows added in order in float32: the bits of accumulation."""
     n = narrow.size
     a = row(rows[0], start, n)
@@ -209,14 +230,13 @@ def _combine_chunk(
         if count == 0:
             for i in range(length):
                 result[i] = 0.0
-        elif plain:
-            _plain(rows, count, start, narrow[:length])
+        else:
+            if plain:
+                _plain(rows, count, start, narrow[:length])
+            else:
+                _weighted(rows, used, count, start, wide[:length], narrow[:length])
             for i in range(length):
                 result[i] = narrow[i]
-        else:
-            _weighted(rows, used, count, start, wide[:length])
-            for i in range(length):
-                result[i] = np.float32(wide[i])
 
 
 @njit(cache=True, parallel=True)
@@ -234,7 +254,8 @@ def combine(
         table: From `chunk_table`.
     """
     for c in prange(table.shape[0]):
-        t, first = table[c, 0], table[c, 1]
+        last = table.shape[0] - 1 - c
+        t, first = table[last, 0], table[last, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 
@@ -245,7 +266,8 @@ def combine_serial(
 ) -> None:
     """The same bits without the cost of waking up other cores."""
     for c in range(table.shape[0]):
-        t, first = table[c, 0], table[c, 1]
+        last = table.shape[0] - 1 - c
+        t, first = table[last, 0], table[last, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 

@@ -10,14 +10,13 @@ from typing_extensions import override
 from crossgrad_core.gaussians import Gaussians, Render, Screen
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.scene.types import Camera
-from crossgrad_plugins.rasterizers.numba_kernels.frame import (
+from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
     Frame,
     GaussianArrays,
-    backward,
-    forward,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
 
 #: The differentiable inputs in the order in which autograd sees them.
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")

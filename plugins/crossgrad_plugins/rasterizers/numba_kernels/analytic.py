@@ -71,7 +71,9 @@ def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, f
     degrees; it is halved without trigonometric functions, so that loops over it are vectorised.
 
     Args:
-        a, b, c: Covariance [[a, b], [b, c]], undilated.
+        a: Entry of the undilated covariance [[a, b], [b, c]], px^2.
+        b: See `a`.
+        c: See `a`.
         det: Its determinant.
     """
     half = 0.5 * (a - c)
@@ -115,8 +117,10 @@ def window_reach(sigma: float, log_contrast: float) -> float:
     y(t) = log_contrast has one real root.
     """
     p = LINEAR / (3.0 * CUBIC)
-    t = 2.0 * math.sqrt(p) * math.sinh(
-        math.asinh(max(log_contrast, 0.0) / (2.0 * CUBIC * p * math.sqrt(p))) / 3.0
+    t = (
+        2.0
+        * math.sqrt(p)
+        * math.sinh(math.asinh(max(log_contrast, 0.0) / (2.0 * CUBIC * p * math.sqrt(p))) / 3.0)
     )
     return 0.5 + sigma * t
 
@@ -207,9 +211,7 @@ def windows(
     one = _number(1.0)
     upper = _exp(_number(0.0) - _cubics(x + h), constants)
     lower = _exp(_cubics(x - h), constants)
-    difference = (h + h) * fma(
-        _number(CUBIC), fma(_number(3.0), x * x, h * h), _number(LINEAR)
-    )
+    difference = (h + h) * fma(_number(CUBIC), fma(_number(3.0), x * x, h * h), _number(LINEAR))
     share = _one_minus_exp(difference, constants) / ((one + upper) * (one + lower))
     return _number(_ROOT_2_PI) * sigma * share
 

@@ -82,8 +82,9 @@ def in_registers(pose: NDArray[np.float64]) -> Pose:
 
 
 @device
-def to_camera(pose: Pose, x: float, y: float, z: float) -> Triple:
+def to_camera(pose: Pose, point: Triple) -> Triple:
     """Returns a point in the camera's frame."""
+    x, y, z = point
     return (
         pose[0][0] * x + pose[0][1] * y + pose[0][2] * z + pose[0][3],
         pose[1][0] * x + pose[1][1] * y + pose[1][2] * z + pose[1][3],
@@ -92,18 +93,18 @@ def to_camera(pose: Pose, x: float, y: float, z: float) -> Triple:
 
 
 @device
-def unit_quaternion(
-    w: float, x: float, y: float, z: float
-) -> tuple[float, float, float, float, float]:
-    """Returns the quaternion at unit length and the inverse of its norm (0 for a zero one)."""
+def unit_quaternion(quat: Row) -> tuple[Row, float]:
+    """Returns the quaternion wxyz at unit length and the inverse of its norm (0 for a zero one)."""
+    w, x, y, z = quat
     square = w * w + x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
 
 
 @device
-def rotation(w: float, x: float, y: float, z: float) -> tuple[Triple, Triple, Triple]:
+def rotation(unit: Row) -> tuple[Triple, Triple, Triple]:
     """Returns the columns of the rotation matrix of a unit quaternion."""
+    w, x, y, z = unit
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),

@@ -32,7 +32,7 @@ class _PackageCache(FunctionCache):  # type: ignore[misc]
     what the kernel inlines.
     """
 
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+    def _index_key(self, sig: object, codegen: object) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), _fingerprint())
 
 

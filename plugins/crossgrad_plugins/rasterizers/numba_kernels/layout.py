@@ -20,8 +20,6 @@ SEGMENTS = COLUMNS * TILE_HEIGHT
 
 #: Gaussians that one job of the projection handles.
 CHUNK = 2048
-#: Gaussians that are projected at once, before it is known which are seen; divides CHUNK.
-BLOCK = 128
 
 #: Floats of a record (one cache line), and what is where.
 RECORD = 16

@@ -6,13 +6,19 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_plugins.rasterizers.numba_kernels.analytic import SIGMA_FLOOR, main_axes
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import main_axes
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
+from crossgrad_plugins.rasterizers.numba_kernels.blocks import (
+    BLOCK,
+    get,
+    get_four,
+    get_three,
+    put,
+    put_four,
+    put_three,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
-    LEAST_DET,
     Pinhole,
-    Row,
-    Triple,
     clamped,
     covariance,
     dot,
@@ -24,9 +30,16 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     to_camera,
     unit_quaternion,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.gradients import (
+    axes_gradient,
+    combined,
+    covariance_gradient,
+    factor_gradient,
+    turn_gradient,
+    weighted_sum,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    BLOCK,
     CHUNK,
     PARTIAL,
     SUM_1,
@@ -62,120 +75,6 @@ _ROWS = _INVERSE_VARIANCE + 1
 
 
 @device
-def _outer_sum(
-    a: Triple, p: float, b: Triple, q: float
-) -> Triple:
-    """Returns a p + b q."""
-    return a[0] * p + b[0] * q, a[1] * p + b[1] * q, a[2] * p + b[2] * q
-
-
-@device
-def _covariance_gradient(
-    b: float, c: float, det: float, sum_dd: float, sum_dy: float, sum_yy: float
-) -> Triple:
-    """Returns the gradients of A, B (as one number) and C of the dilated covariance."""
-    inverse_c = 1.0 / c
-    slope, inverse_variance = b * inverse_c, c / det
-    v_variance = 0.5 * inverse_variance * inverse_variance * sum_dd
-    v_slope = inverse_variance * inverse_c * sum_dy
-    v_decay = 0.5 * inverse_c * inverse_c * sum_yy
-    return (
-        v_variance,
-        v_slope - 2.0 * slope * v_variance,
-        v_decay - slope * v_slope + slope * slope * v_variance,
-    )
-
-
-@device
-def _factor_gradient(
-    m: Triple, n: Triple, dilation: float, det: float, factor: float, v_log_factor: float
-) -> Triple:
-    """Returns what the antialiasing factor adds to the gradients of A, B and C."""
-    a, b, c = dot(m, m), dot(m, n), dot(n, n)
-    raw_det = det - dilation * (a + c) - dilation * dilation
-    # factor^2 = raw_det / (det + e) + e, so d(log factor) = d(factor^2) / (2 factor^2)
-    v_square = 0.5 * v_log_factor / (factor * factor)
-    v_raw_det = v_square / (det + LEAST_DET)
-    v_det = -v_raw_det * raw_det / (det + LEAST_DET)
-    return (
-        v_raw_det * c + v_det * (c + dilation),
-        -2.0 * b * (v_raw_det + v_det),
-        v_raw_det * a + v_det * (a + dilation),
-    )
-
-
-@device
-def _axes_gradient(
-    cosine: float,
-    sine: float,
-    variance_1: float,
-    variance_2: float,
-    sum_sigma_1: float,
-    sum_sigma_2: float,
-    v_angle: float,
-) -> Triple:
-    """Returns the gradients of A, B (as one number) and C of the analytic response.
-
-    The sums are those of gradients by the logarithms of the standard deviations. A floored one has
-    no gradient, and the axes of a round Gaussian do not turn.
-    """
-    floor = SIGMA_FLOOR * SIGMA_FLOOR
-    v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0
-    v_2 = 0.5 * sum_sigma_2 / variance_2 if variance_2 > floor else 0.0
-    gap = variance_1 - variance_2
-    v_turn = v_angle / gap if gap > 0.0 else 0.0
-    mixed = cosine * sine
-    return (
-        cosine * cosine * v_1 + sine * sine * v_2 - mixed * v_turn,
-        2.0 * mixed * (v_1 - v_2) + (cosine * cosine - sine * sine) * v_turn,
-        sine * sine * v_1 + cosine * cosine * v_2 + mixed * v_turn,
-    )
-
-
-@device
-def _turn_gradient(
-    q: Row,
-    inverse_norm: float,
-    x: Triple,
-    y: Triple,
-    z: Triple,
-) -> Row:
-    """Returns the gradient of a quaternion, given those of its rotation matrix' columns."""
-    w, a, b, c = q
-    v_w = 2.0 * (a * (y[2] - z[1]) + b * (z[0] - x[2]) + c * (x[1] - y[0]))
-    v_a = 2.0 * (w * (y[2] - z[1]) + b * (x[1] + y[0]) + c * (x[2] + z[0])) - 4.0 * a * (
-        y[1] + z[2]
-    )
-    v_b = 2.0 * (w * (z[0] - x[2]) + a * (x[1] + y[0]) + c * (y[2] + z[1])) - 4.0 * b * (
-        x[0] + z[2]
-    )
-    v_c = 2.0 * (w * (x[1] - y[0]) + a * (x[2] + z[0]) + b * (y[2] + z[1])) - 4.0 * c * (
-        x[0] + y[1]
-    )
-    along = w * v_w + a * v_a + b * v_b + c * v_c
-    return (
-        (v_w - w * along) * inverse_norm,
-        (v_a - a * along) * inverse_norm,
-        (v_b - b * along) * inverse_norm,
-        (v_c - c * along) * inverse_norm,
-    )
-
-
-@device
-def _weighted(
-    columns: tuple[Triple, Triple, Triple], weights: Triple
-) -> Triple:
-    """Returns the sum of the three columns times their weights."""
-    a, b, c = columns
-    p, q, r = weights
-    return (
-        a[0] * p + b[0] * q + c[0] * r,
-        a[1] * p + b[1] * q + c[1] * r,
-        a[2] * p + b[2] * q + c[2] * r,
-    )
-
-
-@device
 def _unproject_block(
     count: int,
     camera: Pinhole,
@@ -186,79 +85,68 @@ def _unproject_block(
 ) -> None:
     """Finds the gradients of `count` Gaussians; no branches on them, so it is vectorised."""
     pose = in_registers(camera.pose)
-    pose_z = (pose[2][0], pose[2][1], pose[2][2])
+    pose_x, pose_y, pose_z = pose[0][:3], pose[1][:3], pose[2][:3]
     for k in range(count):
-        x, y, z = to_camera(pose, block[_MEAN * BLOCK + k], block[(_MEAN + 1) * BLOCK + k], block[(_MEAN + 2) * BLOCK + k])
-        qw, qx, qy, qz, inverse_norm = unit_quaternion(
-            block[_QUAT * BLOCK + k], block[(_QUAT + 1) * BLOCK + k], block[(_QUAT + 2) * BLOCK + k], block[(_QUAT + 3) * BLOCK + k]
-        )
-        scale = block[_SCALE * BLOCK + k], block[(_SCALE + 1) * BLOCK + k], block[(_SCALE + 2) * BLOCK + k]
+        x, y, z = to_camera(pose, get_three(block, _MEAN, k))
+        unit, inverse_norm = unit_quaternion(get_four(block, _QUAT, k))
+        scale = get_three(block, _SCALE, k)
         inverse_z = 1.0 / z
         ratio_x, ratio_y = x * inverse_z, y * inverse_z
         slope_x = clamped(ratio_x, camera.left, camera.right)
         slope_y = clamped(ratio_y, camera.top, camera.bottom)
         row_x, row_y = jacobian_rows(camera, pose, inverse_z, slope_x, slope_y)
-        columns = rotation(qw, qx, qy, qz)
+        columns = rotation(unit)
         p, q = in_axes(row_x, columns), in_axes(row_y, columns)
         m, n = times(p, scale), times(q, scale)
         a, b, c, det, factor = covariance(m, n, dilation, antialiased)
 
         if analytic is None:
-            v_a, v_b, v_c = _covariance_gradient(
-                b,
-                c,
-                det,
-                block[SUM_DD * BLOCK + k],
-                block[SUM_DY * BLOCK + k],
-                block[SUM_YY * BLOCK + k],
+            v_a, v_b, v_c = covariance_gradient(
+                b, c, det, get(block, SUM_DD, k), get(block, SUM_DY, k), get(block, SUM_YY, k)
             )
             if antialiased:
-                add_a, add_b, add_c = _factor_gradient(
-                    m, n, dilation, det, factor, block[SUM_1 * BLOCK + k]
+                add_a, add_b, add_c = factor_gradient(
+                    m, n, dilation, det, factor, get(block, SUM_1, k)
                 )
                 v_a += add_a
                 v_b += add_b
                 v_c += add_c
             inverse_det = 1.0 / det
-            v_u = c * inverse_det * block[SUM_D * BLOCK + k]
-            v_v = block[SUM_Y * BLOCK + k] / c - b * inverse_det * block[SUM_D * BLOCK + k]
-            block[_INVERSE_VARIANCE * BLOCK + k] = c * inverse_det
+            v_u = c * inverse_det * get(block, SUM_D, k)
+            v_v = get(block, SUM_Y, k) / c - b * inverse_det * get(block, SUM_D, k)
+            put(block, _INVERSE_VARIANCE, k, c * inverse_det)
         else:
             cosine, sine, variance_1, variance_2 = main_axes(a, b, c, det)
-            v_a, v_b, v_c = _axes_gradient(
+            v_a, v_b, v_c = axes_gradient(
                 cosine,
                 sine,
                 variance_1,
                 variance_2,
-                block[SUM_SIGMA_1 * BLOCK + k],
-                block[SUM_SIGMA_2 * BLOCK + k],
-                block[SUM_TURN * BLOCK + k],
+                get(block, SUM_SIGMA_1, k),
+                get(block, SUM_SIGMA_2, k),
+                get(block, SUM_TURN, k),
             )
-            v_u = sine * block[SUM_V * BLOCK + k] - cosine * block[SUM_U * BLOCK + k]
-            v_v = -sine * block[SUM_U * BLOCK + k] - cosine * block[SUM_V * BLOCK + k]
-        v_m = _outer_sum(m, 2.0 * v_a, n, v_b)
-        v_n = _outer_sum(n, 2.0 * v_c, m, v_b)
-        v_p, v_q = times(v_m, scale), times(v_n, scale)
-        block[_V_SCALE * BLOCK + k] = v_m[0] * p[0] + v_n[0] * q[0]
-        block[(_V_SCALE + 1) * BLOCK + k] = v_m[1] * p[1] + v_n[1] * q[1]
-        block[(_V_SCALE + 2) * BLOCK + k] = v_m[2] * p[2] + v_n[2] * q[2]
-        v_quat = _turn_gradient(
-            (qw, qx, qy, qz),
-            inverse_norm,
-            _outer_sum(row_x, v_p[0], row_y, v_q[0]),
-            _outer_sum(row_x, v_p[1], row_y, v_q[1]),
-            _outer_sum(row_x, v_p[2], row_y, v_q[2]),
-        )
-        block[_V_QUAT * BLOCK + k] = v_quat[0]
-        block[(_V_QUAT + 1) * BLOCK + k] = v_quat[1]
-        block[(_V_QUAT + 2) * BLOCK + k] = v_quat[2]
-        block[(_V_QUAT + 3) * BLOCK + k] = v_quat[3]
+            v_u = sine * get(block, SUM_V, k) - cosine * get(block, SUM_U, k)
+            v_v = -sine * get(block, SUM_U, k) - cosine * get(block, SUM_V, k)
+        put(block, _V_CENTRE, k, v_u)
+        put(block, _V_CENTRE + 1, k, v_v)
 
-        block[_V_CENTRE * BLOCK + k] = v_u
-        block[(_V_CENTRE + 1) * BLOCK + k] = v_v
+        v_m = combined(m, 2.0 * v_a, n, v_b)
+        v_n = combined(n, 2.0 * v_c, m, v_b)
+        v_p, v_q = times(v_m, scale), times(v_n, scale)
+        by_m, by_n = times(v_m, p), times(v_n, q)
+        put_three(block, _V_SCALE, k, combined(by_m, 1.0, by_n, 1.0))
+        v_quat = turn_gradient(
+            unit,
+            inverse_norm,
+            combined(row_x, v_p[0], row_y, v_q[0]),
+            combined(row_x, v_p[1], row_y, v_q[1]),
+            combined(row_x, v_p[2], row_y, v_q[2]),
+        )
+        put_four(block, _V_QUAT, k, v_quat)
 
         # row_x = fx / z (pose_x - slope_x pose_z), and the same in y
-        v_row_x, v_row_y = _weighted(columns, v_p), _weighted(columns, v_q)
+        v_row_x, v_row_y = weighted_sum(columns, v_p), weighted_sum(columns, v_q)
         v_slope_x = -camera.fx * inverse_z * dot(pose_z, v_row_x)
         v_slope_y = -camera.fy * inverse_z * dot(pose_z, v_row_y)
         # u = fx x / z + cx; the Jacobian's slope is x / z only inside its bounds
@@ -266,11 +154,9 @@ def _unproject_block(
         v_ratio_y = camera.fy * v_v + (v_slope_y if slope_y == ratio_y else 0.0)
         v_inverse_z = z * (dot(row_x, v_row_x) + dot(row_y, v_row_y))
         v_inverse_z += v_ratio_x * x + v_ratio_y * y
-        v_x, v_y = v_ratio_x * inverse_z, v_ratio_y * inverse_z
-        v_z = block[SUM_DEPTH * BLOCK + k] - inverse_z * inverse_z * v_inverse_z
-        block[_V_MEAN * BLOCK + k] = pose[0][0] * v_x + pose[1][0] * v_y + pose[2][0] * v_z
-        block[(_V_MEAN + 1) * BLOCK + k] = pose[0][1] * v_x + pose[1][1] * v_y + pose[2][1] * v_z
-        block[(_V_MEAN + 2) * BLOCK + k] = pose[0][2] * v_x + pose[1][2] * v_y + pose[2][2] * v_z
+        v_z = get(block, SUM_DEPTH, k) - inverse_z * inverse_z * v_inverse_z
+        v_camera = v_ratio_x * inverse_z, v_ratio_y * inverse_z, v_z
+        put_three(block, _V_MEAN, k, weighted_sum((pose_x, pose_y, pose_z), v_camera))
 
 
 @device
@@ -286,12 +172,12 @@ def _bring(
 ) -> None:
     """Puts the first `used` sums and the parameters of Gaussian i into place k of a block."""
     for number in range(SUM_DEPTH + 1):
-        block[number * BLOCK + k] = sums[number] if number < used else 0.0
+        put(block, number, k, sums[number] if number < used else 0.0)
     for axis in range(3):
-        block[(_MEAN + axis) * BLOCK + k] = means[i, axis]
-        block[(_SCALE + axis) * BLOCK + k] = scales[i, axis]
+        put(block, _MEAN + axis, k, means[i, axis])
+        put(block, _SCALE + axis, k, scales[i, axis])
     for axis in range(4):
-        block[(_QUAT + axis) * BLOCK + k] = quats[i, axis]
+        put(block, _QUAT + axis, k, quats[i, axis])
 
 
 @parallel_kernel
@@ -318,17 +204,24 @@ def unproject(
     v_centres: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> None:
-    """Adds up each Gaussian's entries and carries the sums on to its parameters.
+    """Adds up each Gaussian's slots and carries the sums on to its parameters.
 
     Args:
-        camera, dilation, antialiased, analytic: As in `project`.
+        camera: As in `project`, like all up to `owners`.
+        dilation: Px^2.
+        antialiased: Whether opacities were lowered.
+        analytic: Any vector says that the response is analytic.
         with_depth: Whether the partial sums hold gradients of the depth.
-        means, quats, scales, opacities: As in `project`.
-        drawn, owners: From `project`.
-        shelves: From binning.
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        drawn: [chunks].
+        owners: [N].
+        shelves: [N, SHELF] from binning.
         written: [slots] from `differentiate`.
         partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
-        v_means: [N, 3] written for Gaussians with entries, zero before; and so on:
+        v_means: [N, 3] written for Gaussians with gradients, zero before; like all below.
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].
@@ -365,13 +258,13 @@ def unproject(
             for k in range(size):
                 i = numbers[k]
                 for axis in range(3):
-                    v_means[i, axis] = block[(_V_MEAN + axis) * BLOCK + k]
-                    v_scales[i, axis] = block[(_V_SCALE + axis) * BLOCK + k]
+                    v_means[i, axis] = get(block, _V_MEAN + axis, k)
+                    v_scales[i, axis] = get(block, _V_SCALE + axis, k)
                 for axis in range(4):
-                    v_quats[i, axis] = block[(_V_QUAT + axis) * BLOCK + k]
+                    v_quats[i, axis] = get(block, _V_QUAT + axis, k)
                 for axis in range(2):
-                    v_centres[i, axis] = block[(_V_CENTRE + axis) * BLOCK + k]
+                    v_centres[i, axis] = get(block, _V_CENTRE + axis, k)
                 if analytic is None and v_absolute.shape[0] > 0:
                     # These sums are in units of the decays of the records.
-                    v_absolute[i, 0] *= block[_INVERSE_VARIANCE * BLOCK + k]
+                    v_absolute[i, 0] *= get(block, _INVERSE_VARIANCE, k)
                     v_absolute[i, 1] *= 2.0 * math.log(2.0)

@@ -46,8 +46,9 @@ def count_pixels(
     """Adds up the pixels in which each Gaussian was blended.
 
     Args:
-        drawn, owners: From `project`.
-        shelves: From binning.
+        drawn: [chunks] from `project`.
+        owners: [N] from `project`.
+        shelves: [N, SHELF] from binning.
         counts: [slots] pixels per slot.
         pixels: [N] written for the Gaussians drawn; zero before.
     """

@@ -8,7 +8,7 @@ each; LLVM splits them where a machine has narrower ones). Operations are never 
 
 Everything below exists only inside compiled kernels; `Lanes` and `Mask` are annotations.
 """
-# ruff: noqa: ANN401 - Numba's and llvmlite's objects have no types.
+# ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and it fixes the arguments.
 
 import operator
 from collections.abc import Callable, Sequence
@@ -91,7 +91,9 @@ def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
     """
 
     def define(*given: Any) -> Any:
-        kinds = [other if kind is None else kind for kind, other in zip(operands, given)]
+        kinds = [
+            other if kind is None else kind for kind, other in zip(operands, given, strict=True)
+        ]
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             return emit(_Site(context, builder, signature.args), *args)
@@ -226,9 +228,7 @@ splat: Callable[[np.float32], Lanes] = _function(_splat, _lanes, types.float32)
 ramp: Callable[[], Lanes] = _function(lambda at: _RAMP, _lanes)
 #: Returns eight consecutive numbers of a flat float32 array, from an index on.
 load: Callable[[_Array, int], Lanes] = _function(
-    lambda at, array, index: at.builder.load(
-        _element(at, array, index, _FLOATS), align=_ALIGNMENT
-    ),
+    lambda at, array, index: at.builder.load(_element(at, array, index, _FLOATS), align=_ALIGNMENT),
     *(_lanes, None, types.intp),
 )
 #: Returns one number of a flat float32 array in all lanes.

@@ -119,7 +119,8 @@ def shade(
         means: [N, 3].
         dc: [N, 1, 3] coefficients of degree 0.
         rest: [N, B - 1, 3] of the higher degrees; only those active are read.
-        drawn, owners: From `project`.
+        drawn: [chunks] from `project`.
+        owners: [N] from `project`.
         records: Flat records, colours written; a colour that is not finite draws nothing.
         radii: [N] set to 0 for these.
     """
@@ -158,7 +159,13 @@ def unshade(
     """Carries gradients of the colours on to coefficients and centres.
 
     Args:
-        degree, eye, means, rest, drawn, owners, records: As in `shade`.
+        degree: As in `shade`, like the next six.
+        eye: [3].
+        means: [N, 3].
+        rest: [N, B - 1, 3].
+        drawn: [chunks].
+        owners: [N].
+        records: Flat records.
         v_colors: [N, 3] gradients of the clamped colours.
         v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
         v_rest: [N, B - 1, 3] likewise, active degrees only.

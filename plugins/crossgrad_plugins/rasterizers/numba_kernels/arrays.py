@@ -1,0 +1,169 @@
+"""What goes into and comes out of a render, as plain arrays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.gaussians import Response
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import Pinhole
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """N Gaussians as contiguous float32 arrays; colour is `colors`, or `dc` and `rest`.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4] wxyz, any norm; a zero quaternion is not drawn.
+        scales: [N, 3] linear.
+        opacities: [N].
+        colors: [N, 3] RGB as drawn.
+        dc: [N, 1, 3] harmonics of degree 0.
+        rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
+        degree: Active degree, 0 to 3.
+    """
+
+    means: Float32
+    quats: Float32
+    scales: Float32
+    opacities: Float32
+    colors: Float32 | None = None
+    dc: Float32 | None = None
+    rest: Float32 | None = None
+    degree: int = 0
+
+
+@dataclass(frozen=True)
+class CameraArrays:
+    """A pinhole camera.
+
+    Attributes:
+        viewmat: [4, 4] world to camera.
+        intrinsics: [3, 3] K in pixels, pixel centres at + 0.5.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    viewmat: NDArray[np.floating]
+    intrinsics: NDArray[np.floating]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """The rule set's free numbers, and which optional outputs to compute.
+
+    Attributes:
+        max_alpha: Cap of a Gaussian's alpha, below 1.
+        near: Gaussians are drawn if their centre's depth is larger.
+        dilation: Added to both diagonal entries of the 2-D covariance, px^2.
+        response: How a Gaussian fills a pixel; `antialiased` lowers opacities by what the dilation
+            adds in area (Mip-Splatting's 2-D filter), `analytic` is not dilated.
+        depth: Whether to composite the depth.
+        pixels: Whether to count the pixels of each Gaussian.
+    """
+
+    max_alpha: float = 0.99
+    near: float = 1e-3
+    dilation: float = 0.3
+    response: Response = "plain"
+    depth: bool = False
+    pixels: bool = False
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The drawn Gaussians, as records that fill each chunk of Gaussians from its start.
+
+    Attributes:
+        camera: The view.
+        radii: [N] int32, pixels; 0 where no pixel is touched.
+        records: [N * RECORD] float32.
+        owners: [N] int32, the Gaussian of each record.
+        drawn: [chunks] int64, records per chunk.
+    """
+
+    camera: Pinhole
+    radii: Int32
+    records: Float32
+    owners: Int32
+    drawn: Int64
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """The records that reach each tile, front to back.
+
+    Attributes:
+        tiles: [T] int32, the order in which tiles are worked on.
+        starts: [T + 1] int64, first entry of each tile.
+        entries: [E, 2] int32, records and slots.
+        shelves: [N, SHELF] int32, the slots of each record.
+        slots: Number of slots.
+    """
+
+    tiles: Int32
+    starts: Int64
+    entries: Int32
+    shelves: Int32
+    slots: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered view and what its backward pass needs.
+
+    Attributes:
+        image: [H, W, 3] over the background, not clamped.
+        alpha: [H, W].
+        depth: [H, W] sum of weight times depth, None unless asked for.
+        pixels: [N] int32, pixels blended, None unless asked for.
+        gaussians: The input.
+        options: The input.
+        projected: Drawn Gaussians.
+        lists: Tile lists.
+        masks: [E] uint64, segments that each entry was blended into.
+    """
+
+    image: Float32
+    alpha: Float32
+    depth: Float32 | None
+    pixels: Int32 | None
+    gaussians: GaussianArrays
+    options: DrawOptions
+    projected: Projected
+    lists: TileLists
+    masks: NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class GaussianGradients:
+    """Gradients of N Gaussians and their screen statistics, float32.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        colors: [N, 3] by the RGB drawn (after the clamp of harmonics).
+        dc: [N, 1, 3], None without harmonics.
+        rest: [N, B - 1, 3], None without harmonics.
+        centres: [N, 2] by the projected mean, per pixel.
+        absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
+    """
+
+    means: Float32
+    quats: Float32
+    scales: Float32
+    opacities: Float32
+    colors: Float32
+    dc: Float32 | None
+    rest: Float32 | None
+    centres: Float32
+    absolute: Float32 | None

@@ -1,0 +1,257 @@
+"""Records of the Gaussians that touch a pixel, made from projected ones."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    SIGMA_FLOOR,
+    main_axes,
+    window,
+    window_reach,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.blocks import get
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import clamped
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    COSINE,
+    DECAY,
+    LEAST_ALPHA,
+    LOG2_E,
+    LOG_OPACITY,
+    OPACITY,
+    REACH_1,
+    REACH_2,
+    RECORD,
+    ROW_DECAY,
+    SIGMA_1,
+    SIGMA_2,
+    SINE,
+    SLOPE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TOUCH,
+    U_PART,
+    U_WHOLE,
+    V_PART,
+    V_WHOLE,
+    WIDTH,
+)
+
+#: Rows of a block of projected Gaussians, seen or not: camera depth, projected mean (pixels),
+#: dilated 2-D covariance (px^2) and its determinant (negative for what cannot be drawn), and the
+#: factor of the opacity.
+CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
+FOUND = 8
+
+_LARGEST_RADIUS = 2.0**30
+# Projected values beyond this are dropped; well inside float32.
+_LARGEST = 1e30
+_STEEPEST = 1e15
+# Smallest decay in a record (px^-2): flat over any image, and its inverse is a float32.
+_FLAT = 1e-30
+
+
+@device
+def first_pixel(low: float) -> float:
+    """Returns the first pixel (from 0) whose centre is not before `low`."""
+    return max(np.ceil(low - 0.5), 0.0)
+
+
+@device
+def last_pixel(high: float, size: int) -> float:
+    """Returns the last pixel of `size` whose centre is not beyond `high`."""
+    return min(np.floor(high - 0.5), size - 1.0)
+
+
+@device
+def _row_hits(
+    y: float,
+    u: float,
+    v: float,
+    inverse_c: float,
+    slope: float,
+    variance: float,
+    reach: float,
+    width: int,
+) -> bool:
+    """Whether the footprint covers a pixel centre in image row `y`."""
+    dy = y + 0.5 - v
+    left_over = (reach - dy * dy * inverse_c) * variance
+    if not left_over >= 0.0:
+        return False
+    extent = math.sqrt(left_over)
+    centre = u + slope * dy
+    return first_pixel(centre - extent) <= last_pixel(centre + extent, width)
+
+
+@device
+def _hits(
+    y0: float,
+    y1: float,
+    u: float,
+    v: float,
+    inverse_c: float,
+    slope: float,
+    variance: float,
+    reach: float,
+    width: int,
+) -> bool:
+    """Whether the footprint covers any pixel centre in the image rows y0 to y1."""
+    middle = clamped(np.floor(v), y0, y1)
+    if _row_hits(middle, u, v, inverse_c, slope, variance, reach, width):
+        return True
+    y = y0
+    while y <= y1:
+        if _row_hits(y, u, v, inverse_c, slope, variance, reach, width):
+            return True
+        y += 1.0
+    return False
+
+
+@device
+def _place(
+    j: int,
+    u: float,
+    v: float,
+    extent_x: float,
+    extent_y: float,
+    width: int,
+    height: int,
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+) -> tuple[float, float, float, float]:
+    """Writes mean and tile box of record j; returns its pixels x0, x1, y0, y1 (x0 > x1: none)."""
+    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, width)
+    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, height)
+    if x0 > x1 or y0 > y1:
+        return 1.0, 0.0, 1.0, 0.0
+    at = j * RECORD
+    records[at + U_WHOLE] = np.floor(u)
+    records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
+    records[at + V_WHOLE] = np.floor(v)
+    records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
+    boxes[j, 0] = np.int32(x0) // TILE_WIDTH
+    boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
+    boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
+    boxes[j, 3] = np.int32(y1) // TILE_HEIGHT + 1
+    return x0, x1, y0, y1
+
+
+@device
+def _radius(extent: float) -> int:
+    """Returns the radius that is reported for a footprint of half-extent `extent`."""
+    return np.int32(max(1.0, np.ceil(min(extent, _LARGEST_RADIUS))))
+
+
+@device
+def plain_record(
+    k: int,
+    j: int,
+    opacity: float,
+    width: int,
+    height: int,
+    found: NDArray[np.float64],
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+) -> int:
+    """Makes record j of projected Gaussian k; returns its radius, 0 where it touches no pixel."""
+    u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
+    a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
+    inverse_c = 1.0 / c
+    slope, variance = get(found, COVARIANCE, k) * inverse_c, det * inverse_c
+    log_opacity = math.log2(opacity * get(found, FACTOR, k))
+    reach = 2.0 / LOG2_E * (log_opacity - TOUCH)  # largest squared distance in standard deviations
+    decay = 0.5 * LOG2_E / variance
+    # The sums are NaN or infinite if any term is, and then fail the comparison.
+    if not (
+        det > 0.0
+        and reach >= 0.0
+        and a + c + det < math.inf
+        and abs(u) + abs(v) + decay + inverse_c < _LARGEST
+        and abs(slope) < _STEEPEST
+    ):
+        return 0
+    extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    if x0 > x1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
+        return 0
+    at = j * RECORD
+    records[at + SLOPE] = slope
+    records[at + ROW_DECAY] = max(0.5 * LOG2_E * inverse_c, _FLAT)
+    records[at + DECAY] = max(decay, _FLAT)
+    records[at + WIDTH] = min(2.0 / LOG2_E * variance, 1.0 / _FLAT)
+    records[at + LOG_OPACITY] = log_opacity
+    return _radius(max(extent_x, extent_y))
+
+
+@device
+def _covers(
+    x: float,
+    y: float,
+    u: float,
+    v: float,
+    axis: tuple[float, float],
+    sigma: tuple[float, float],
+    reach: tuple[float, float],
+    opacity: float,
+) -> bool:
+    """Whether the analytic response touches pixel (x, y)."""
+    dx, dy = x + 0.5 - u, y + 0.5 - v
+    along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
+    if abs(along) > reach[0] or abs(across) > reach[1]:
+        return False
+    return opacity * window(along, sigma[0]) * window(across, sigma[1]) >= LEAST_ALPHA
+
+
+@device
+def analytic_record(
+    k: int,
+    j: int,
+    opacity: float,
+    width: int,
+    height: int,
+    found: NDArray[np.float64],
+    records: NDArray[np.float32],
+    boxes: NDArray[np.int32],
+) -> int:
+    """As `plain_record` for the analytic response."""
+    u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
+    a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
+    if not (det >= 0.0 and a + c + det < math.inf and abs(u) + abs(v) < _LARGEST):
+        return 0
+    cosine, sine, variance_1, variance_2 = main_axes(a, get(found, COVARIANCE, k), c, det)
+    sigma_1 = math.sqrt(max(variance_1, SIGMA_FLOOR * SIGMA_FLOOR))
+    sigma_2 = math.sqrt(max(variance_2, SIGMA_FLOOR * SIGMA_FLOOR))
+    peak_1, peak_2 = window(0.0, sigma_1), window(0.0, sigma_2)
+    if not opacity * peak_1 * peak_2 >= LEAST_ALPHA:
+        return 0
+    contrast = opacity * math.sqrt(2.0 * math.pi) / LEAST_ALPHA
+    reach_1 = window_reach(sigma_1, math.log(contrast * sigma_1 * peak_2))
+    reach_2 = window_reach(sigma_2, math.log(contrast * sigma_2 * peak_1))
+    if not reach_1 + reach_2 < _LARGEST:
+        return 0
+    extent_x = abs(cosine) * reach_1 + abs(sine) * reach_2
+    extent_y = abs(sine) * reach_1 + abs(cosine) * reach_2
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    if x0 > x1:
+        return 0
+    axis, sigma, reach = (cosine, sine), (sigma_1, sigma_2), (reach_1, reach_2)
+    x, y = clamped(np.floor(u), x0, x1), clamped(np.floor(v), y0, y1)
+    touched = _covers(x, y, u, v, axis, sigma, reach, opacity)
+    y = y0
+    while not touched and y <= y1:
+        x = x0
+        while not touched and x <= x1:
+            touched = _covers(x, y, u, v, axis, sigma, reach, opacity)
+            x += 1.0
+        y += 1.0
+    if not touched:
+        return 0
+    at = j * RECORD
+    records[at + COSINE], records[at + SINE] = cosine, sine
+    records[at + SIGMA_1], records[at + SIGMA_2] = sigma_1, sigma_2
+    records[at + REACH_1], records[at + REACH_2] = reach_1, reach_2
+    records[at + OPACITY] = opacity
+    return _radius(math.sqrt(2.0 * math.log(opacity / LEAST_ALPHA) * max(a, c)))
