@@ -7,8 +7,9 @@ One JSON line per operator:
 For K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of a vanilla backbone,
 `ratio` is (time of the aggregation - time of the additions) / time of the additions, where the
 additions are `torch.add(g1, g2, out=)` and its like for the other views, measured in turn with the
-aggregation. `arithmetic_us` is the operator's own arithmetic for six blocks. Times are the least of
-the repeats; a machine that does other work shows in `load`.
+aggregation. The aggregation writes its results over the gradients of one view, which are restored
+between repeats. `arithmetic_us` is the operator's own arithmetic for six blocks. Times are the
+least of the repeats; a machine that does other work shows in `load`.
 """
 
 import argparse
@@ -29,6 +30,7 @@ from crossgrad_core.dense_gradients import DenseViewGradients
 from crossgrad_core.operator import Operator
 from crossgrad_core.registry import build, entries
 from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.threads import configure_threads
 
 #: Block -> elements per Gaussian and kind, as in the vanilla backbone with SH degree 3.
 WIDTHS: dict[str, tuple[int, BlockKind]] = {
@@ -48,6 +50,7 @@ ADDITIONS = "torch.add"
 def main() -> None:
     """Prints one line per operator, and one for the additions themselves."""
     arguments = _arguments()
+    configure_threads()
     names = arguments.operators or list(entries("operators"))
     operators = {name: cast("Operator", build("operators", name, {})) for name in names}
     lines: dict[str, dict[str, Any]] = {name: {"operator": name} for name in operators}
@@ -69,19 +72,19 @@ def _arguments() -> argparse.Namespace:
 def _measured(
     operators: dict[str, Operator], views: int, arguments: argparse.Namespace
 ) -> dict[str, dict[str, float]]:
+    kept = _gradients(views, arguments.parameters)
     gradients = _gradients(views, arguments.parameters)
     out = {name: torch.empty_like(gradient) for name, gradient in gradients[0].items()}
     results = {}
     for name, operator in operators.items():
         if not operator.views.admits(views):
             continue
-        work = {
-            "aggregation": lambda chosen=operator: chosen.aggregate(
-                _context(gradients), EMPTY_STATE
-            ),
-            ADDITIONS: lambda: _add(gradients, out),
-        }
-        times = _least(work, arguments.repeats)
+
+        def aggregation(chosen: Operator = operator) -> None:
+            chosen.aggregate(_context(gradients), EMPTY_STATE)
+
+        work = {"aggregation": aggregation, ADDITIONS: lambda: _add(gradients, out)}
+        times = _least(work, arguments.repeats, lambda: _restore(kept, gradients))
         added = times["aggregation"] - times[ADDITIONS]
         results[name] = {
             f"ratio_k{views}": round(added / times[ADDITIONS], 3),
@@ -104,6 +107,12 @@ def _gradients(views: int, parameters: int) -> list[dict[str, Tensor]]:
     ]
 
 
+def _restore(kept: list[dict[str, Tensor]], gradients: list[dict[str, Tensor]]) -> None:
+    for saved, changed in zip(kept, gradients, strict=True):
+        for name, gradient in changed.items():
+            gradient.copy_(saved[name])
+
+
 def _add(gradients: list[dict[str, Tensor]], out: dict[str, Tensor]) -> None:
     for name, total in out.items():
         torch.add(gradients[0][name], gradients[1][name], out=total)
@@ -111,11 +120,16 @@ def _add(gradients: list[dict[str, Tensor]], out: dict[str, Tensor]) -> None:
             torch.add(total, view[name], out=total)
 
 
-def _least(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+def _least(
+    work: dict[str, Callable[[], object]],
+    repeats: int,
+    prepare: Callable[[], object] = lambda: None,
+) -> dict[str, float]:
     """Least seconds of each piece of work, in turn, after one call to warm up."""
     least = dict.fromkeys(work, float("inf"))
     for repeat in range(repeats + 1):
         for name, run in work.items():
+            prepare()
             start = perf_counter()
             run()
             if repeat:
@@ -131,7 +145,7 @@ def _context(gradients: list[dict[str, Tensor]]) -> AggregateContext:
         scene=cast("Any", None),
         states={},
         rng=np.random.default_rng(0),
-        gradients=DenseViewGradients(gradients, BLOCKS),
+        gradients=DenseViewGradients(gradients, BLOCKS, overwrite=True),
         losses=np.ones(views),
         labels=tuple(("near", "far")[k % 2] for k in range(views)),
         distances=np.linspace(0.5, 2.0, views),

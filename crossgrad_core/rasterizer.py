@@ -47,6 +47,6 @@ class Rasterizer(Component):
     ) -> Render:
         """Draws the Gaussians over `background` [3].
 
-        The image, alpha and (where asked for) depth are differentiable in every tensor of `gaussians`;
+        Image, alpha and (where asked for) depth are differentiable in all tensors of `gaussians`;
         the backward pass fills `Render.screen`. `outputs` names the optional outputs to compute.
         """

@@ -19,12 +19,14 @@ class Sampler(Component):
         default_views: K where the user names none, unless its options say otherwise.
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no groups.
+        own_labels: Labels of its draws where it makes its own groups and ignores the grouping.
     """
 
     slot: ClassVar[str] = "samplers"
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 1
     default_grouping: ClassVar[str | None] = None
+    own_labels: ClassVar[tuple[str, ...]] = ()
 
     @property
     def view_counts(self) -> ViewCounts:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.diagnostics.table import ALL, AMPLITUDES, Row, rows_of
+from crossgrad_core.diagnostics.table import ALL, AMPLITUDES, Row, rows_of, touched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,10 +33,11 @@ def draw(title: str, probes: Sequence[Row], cameras: Sequence[Row]) -> bytes:
     axes = figure.subplots(2, 3)
     figure.suptitle(title)
     last = max(int(row["step"]) for row in probes)
-    now = [row for row in probes if row["step"] == last]
-    _trajectory(axes[0, 0], probes, "conflict_rate", "conflict rate (near, far)")
+    shown = touched(probes)
+    now = [row for row in shown if row["step"] == last]
+    _trajectory(axes[0, 0], shown, "conflict_rate", "conflict rate (near, far)")
     axes[0, 0].set_ylim(-0.02, 1.02)
-    _trajectory(axes[0, 1], probes, "ratio_of_means", "gradient length, near / far")
+    _trajectory(axes[0, 1], shown, "ratio_of_means", "gradient length, near / far")
     axes[0, 1].set_yscale("log")
     axes[0, 1].axhline(1.0, color="0.6", linewidth=0.8)
     _intervals(axes[0, 2], now, "rho", f"sigma_b^2 / sigma_w^2, step {last}, 95 %")
@@ -47,6 +48,11 @@ def draw(title: str, probes: Sequence[Row], cameras: Sequence[Row]) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
+
+
+def _legend(axes: "Axes") -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
 
 
 def _blocks(rows: Sequence[Row]) -> list[str]:
@@ -65,7 +71,7 @@ def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) ->
         axes.plot(steps, values, marker="o", markersize=4, color=color, label=block)
     axes.set_xlabel("step")
     axes.set_ylabel(label)
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> None:
@@ -84,7 +90,7 @@ def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> No
         axes.plot(places, values, marker, color=color, label=f"{metric} metric")
     axes.set_xticks(range(len(blocks)), blocks, rotation=30, ha="right", fontsize=8)
     axes.set_ylabel(label)
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,9 +103,8 @@ def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np
 def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
     """Conflict of all pairs of views by how much their distances differ, one line per block."""
     plain = rows_of(rows, "plain")
-    for number, row in enumerate(plain):
-        if row["block"] in {ALL, "+".join(AMPLITUDES)}:
-            continue
+    singles = [row for row in plain if row["block"] not in {ALL, "+".join(AMPLITUDES)}]
+    for number, row in enumerate(singles):
         bins = [name for name in row if name.startswith("conflict_radial_bin")]
         rates = [float(row[name]) for name in bins]
         color = _COLORS[number % len(_COLORS)]
@@ -108,7 +113,7 @@ def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.set_xlabel("quarter of pairs by |log r_i - log r_j|, small to large")
     axes.set_ylabel("conflict rate (all pairs of views)")
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
@@ -125,4 +130,4 @@ def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
     axes.set_ylim(0.0, 1.05)
     axes.set_xticks(places, names, fontsize=8)
     axes.set_ylabel(f"Sarle's bimodality, n = {count}")
-    axes.legend(fontsize=8)
+    _legend(axes)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
 
-from crossgrad_core.diagnostics.table import ALL, Row, rows_of
+from crossgrad_core.diagnostics.table import ALL, Row, rows_of, touched
 from crossgrad_core.files import write_atomically
 
 PROBES = "diagnostics.csv"
@@ -51,7 +51,13 @@ class Report:
 
     def lines(self) -> list[str]:
         """The report for a terminal."""
-        return [self.title, *self.notes, "", *_camera_lines(self.cameras), "", *self._blocks()]
+        parts = (
+            [self.title, *self.notes],
+            _camera_lines(self.cameras),
+            self._blocks(),
+            _grouping_lines(self.groupings),
+        )
+        return [line for part in parts for line in ("", *part)][1:]
 
     def _blocks(self) -> list[str]:
         last = max(int(row["step"]) for row in self.probes)
@@ -63,7 +69,7 @@ class Report:
         ]
         for metric in dict.fromkeys(str(row["metric"]) for row in now):
             lines += ["", f"{metric} metric", _HEADER]
-            lines += [_block_line(row) for row in rows_of(now, metric)]
+            lines += [_block_line(row) for row in touched(rows_of(now, metric))]
         return lines
 
 
@@ -102,6 +108,23 @@ def _camera_lines(rows: Sequence[Row]) -> list[str]:
         spread = "" if isnan(variance) else f"; Var(r)/mean(r)^2 = {variance:.3g}"
         note = f" ({row['note']})" if row["note"] else ""
         lines.append(f"  {row['quantity']}: {figures}{spread}{note}")
+    return lines
+
+
+def _grouping_lines(rows: Sequence[Row]) -> list[str]:
+    """The first block as other groupings see it: the choice of near and far matters."""
+    lines = ["the same probe by grouping, plain metric"]
+    for name in dict.fromkeys(str(row["grouping"]) for row in rows):
+        first = next(row for row in rows if row["grouping"] == name)
+        if first["note"]:
+            lines.append(f"  {name}: {first['note']}")
+            continue
+        lines.append(
+            f"  {name} ({first['near_cameras']} near, {first['far_cameras']} far): "
+            f"{first['block']} near/far {_figure(float(first['ratio_of_means']), '.2f')}, "
+            f"sigma_b2/sigma_w2 {_figure(float(first['rho']), '.2g')}, blocks in conflict per pair "
+            f"{_figure(100.0 * float(first['per_pair_conflict']), '.0f')} %"
+        )
     return lines
 
 

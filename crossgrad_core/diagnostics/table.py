@@ -156,6 +156,11 @@ def per_pair_conflict(measurement: Measurement, near: NDArray[np.bool_]) -> floa
     return conflict(measurement.plain, near, measurement.overlap).per_pair
 
 
+def touched(rows: Sequence[Row]) -> list[Row]:
+    """The rows of blocks that any view touched; the others (inactive SH bands) have no figures."""
+    return [row for row in rows if float(row["sigma_w2"]) != 0.0]
+
+
 def rows_of(rows: Sequence[Row], metric: str) -> list[Row]:
     """The rows of one metric."""
     return [row for row in rows if row["metric"] == metric]

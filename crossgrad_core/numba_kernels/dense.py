@@ -209,6 +209,36 @@ def _plain(rows: Ints, count: int, start: int, narrow: Rows) -> None:
 
 
 @njit(cache=True)
+def _weighted_into(a: Rows, u: float, b: Rows, v: float) -> None:
+    for i in range(a.size):
+        a[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
+
+
+@njit(cache=True)
+def _plain_into(a: Rows, b: Rows) -> None:
+    for i in range(a.size):
+        a[i] += b[i]
+
+
+@njit(cache=True)
+def _combine_pieces(
+    rows: Ints, weights: Floats, count: int, plain: bool, out: int, first: int, end: int
+) -> None:
+    """Results pass through a piece of fast memory, as they may overwrite one of the rows."""
+    wide = np.empty(PIECE)
+    narrow = np.empty(PIECE, np.float32)
+    for start in range(first, end, PIECE):
+        length = min(PIECE, end - start)
+        if plain:
+            _plain(rows, count, start, narrow[:length])
+        else:
+            _weighted(rows, weights, count, start, wide[:length], narrow[:length])
+        result = row(out, start, length)
+        for i in range(length):
+            result[i] = narrow[i]
+
+
+@njit(cache=True)
 def _combine_chunk(
     addresses: Ints, weights: Floats, plain: bool, out: int, first: int, end: int
 ) -> None:
@@ -221,22 +251,20 @@ def _combine_chunk(
             rows[count] = addresses[k]
             used[count] = weights[k]
             count += 1
-    # Results pass through a piece of fast memory, as they may overwrite one of the rows.
-    wide = np.empty(PIECE)
-    narrow = np.empty(PIECE, np.float32)
-    for start in range(first, end, PIECE):
-        length = min(PIECE, end - start)
-        result = row(out, start, length)
-        if count == 0:
-            for i in range(length):
-                result[i] = 0.0
+    if count == 0:
+        result = row(out, first, end - first)
+        for i in range(result.size):
+            result[i] = 0.0
+    elif count == 2 and (out == rows[0] or out == rows[1]):
+        # Two views, one of them overwritten: the commonest case. Both sums are commutative.
+        this = 0 if out == rows[0] else 1
+        a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
+        if plain:
+            _plain_into(a, b)
         else:
-            if plain:
-                _plain(rows, count, start, narrow[:length])
-            else:
-                _weighted(rows, used, count, start, wide[:length], narrow[:length])
-            for i in range(length):
-                result[i] = narrow[i]
+            _weighted_into(a, used[this], b, used[1 - this])
+    else:
+        _combine_pieces(rows, used, count, plain, out, first, end)
 
 
 @njit(cache=True, parallel=True)
@@ -254,8 +282,7 @@ def combine(
         table: From `chunk_table`.
     """
     for c in prange(table.shape[0]):
-        last = table.shape[0] - 1 - c
-        t, first = table[last, 0], table[last, 1]
+        t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 
@@ -266,8 +293,7 @@ def combine_serial(
 ) -> None:
     """The same bits without the cost of waking up other cores."""
     for c in range(table.shape[0]):
-        last = table.shape[0] - 1 - c
-        t, first = table[last, 0], table[last, 1]
+        t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
 

@@ -27,17 +27,17 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
 
 def label_objections(selection: Selection, needed: Sequence[str] = ()) -> list[str]:
     """Reasons why views will not carry (the needed) labels."""
-    name = selection.names["operator"]
+    name, sampler = selection.names["operator"], selection.names["sampler"]
     grouping = cast("Grouping | None", selection.components.get("grouping"))
-    if grouping is None:
-        sampler = selection.names["sampler"]
+    if selection.sampler.own_labels:
+        source, given = f"sampler {sampler}", selection.sampler.own_labels
+    elif grouping is not None:
+        source, given = f"grouping {selection.names['grouping']}", grouping.labels
+    else:
         return [f"operator {name} needs labelled views; sampler {sampler} draws from no groups"]
-    # A grouping by folders or lists learns its labels from the scene.
-    missing = [label for label in needed if label not in grouping.labels]
-    if not missing or not grouping.labels:
+    # A grouping by folders or lists learns its labels from the scene and declares none.
+    if not given or set(needed) <= set(given):
         return []
-    found = ", ".join(grouping.labels)
     return [
-        f"operator {name} needs the labels {', '.join(needed)}; "
-        f"grouping {selection.names['grouping']} gives {found}"
+        f"operator {name} needs the labels {', '.join(needed)}; {source} gives {', '.join(given)}"
     ]

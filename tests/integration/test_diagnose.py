@@ -25,7 +25,7 @@ def scene(tmp_path_factory):
 
 
 def run(scene, out, **settings):
-    given = {"scene": str(scene), "out": str(out), "steps": 24, "eval_every": 12, "threads": 1}
+    given = {"scene": str(scene), "out": str(out), "steps": 12, "eval_every": 12, "threads": 1}
     assert app.run({**given, **settings}, verbosity=-1) == 0
     return load(latest(out))
 
@@ -39,7 +39,7 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-OBSERVER = {"name": "diagnostics", "every": 8, "views": 4}
+OBSERVER = {"name": "diagnostics", "every": 6, "views": 4}
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_watching_changes_no_bit_of_the_training(scene, tmp_path, settings):
     assert same(plain.exp_avg_sq, watched.exp_avg_sq)
     assert plain.generators == watched.generators
     assert {path.name for path in (tmp_path / "watched").iterdir()} >= FILES
-    assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [8, 16, 24]
+    assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
 def test_a_probe_uses_the_run_s_own_groups(scene, tmp_path):
@@ -78,7 +78,7 @@ def test_each_probe_tells_how_long_it_took(scene, tmp_path):
 def test_a_resumed_run_continues_its_table(scene, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run(scene, whole, observers=[OBSERVER])
-    run(scene, parts, observers=[OBSERVER], stop_after=12)
+    run(scene, parts, observers=[OBSERVER], stop_after=7)
     assert app.run({}, resume=parts, verbosity=-1) == 0
 
     def figures(folder):
@@ -108,8 +108,8 @@ def test_a_run_is_diagnosed_where_it_is(scene, tmp_path, capsys):
         main([*arguments, "--out", str(tmp_path / "out")])
     assert not end.value.code
     printed = capsys.readouterr().out
-    assert f"run {tmp_path / 'run'} (vanilla, near-far, symmetric) at step 24" in printed
-    assert {row["step"] for row in table(tmp_path / "out")} == {"24"}
+    assert f"run {tmp_path / 'run'} (vanilla, near-far, symmetric) at step 12" in printed
+    assert {row["step"] for row in table(tmp_path / "out")} == {"12"}
     assert {row["near_views"] for row in table(tmp_path / "out")} == {"3"}
 
 

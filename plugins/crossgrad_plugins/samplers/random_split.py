@@ -26,6 +26,7 @@ class RandomSplit(Sampler):
 
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
     default_views: ClassVar[int] = 2
+    own_labels: ClassVar[tuple[str, ...]] = HALVES
 
     order: Order = Field(
         "iid",

@@ -104,7 +104,7 @@ def test_accumulation_and_separate_gradients_give_the_same_bits(count, dtype):
     views = make_views(count, dtype)
     views[-1]["scales"] = None
     accumulated = AccumulatedGradients.empty(BLOCKS)
-    grown = {name: None for name in SHAPES}
+    grown = dict.fromkeys(SHAPES)
     for view in views:
         accumulated.add({n: None if g is None else g.clone() for n, g in view.items()})
         for name, g in view.items():

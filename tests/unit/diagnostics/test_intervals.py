@@ -14,8 +14,8 @@ from crossgrad_core.diagnostics.variance import split_of, variance_split
 
 
 def benchmark():
-    path = Path(__file__).parents[3] / "benchmarks" / "coverage.py"
-    spec = importlib.util.spec_from_file_location("coverage_benchmark", path)
+    path = Path(__file__).parents[3] / "benchmarks" / "interval_coverage.py"
+    spec = importlib.util.spec_from_file_location("interval_coverage", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -230,3 +230,15 @@ def test_tables_survive_the_file(tmp_path):
     assert found[0] == {**rows[0], "d": pytest.approx(float("nan"), nan_ok=True)}
     assert found[1]["b"] == float("inf")
     assert read_csv(tmp_path / "none.csv") == []
+
+
+def test_a_report_is_drawn_whatever_is_missing(model, monkeypatch, tmp_path):
+    made_up(monkeypatch, model, lambda view, made: {"means": made["means"]} if view else {})
+    watch = Watch(plan(2), 1, sample_phase().step, 0)
+    watch.crossgrad_model(model)
+    report = watch.report(model.scene, "a model of which little is known")
+    report.write(tmp_path)
+    text = "\n".join(report.lines())
+    assert (tmp_path / "diagnostics.png").stat().st_size > 0
+    assert "means" in text
+    assert "opacities " not in text

@@ -65,9 +65,7 @@ def gradient_rows(draw, max_views=6):
     entry = st.integers(-8, 8)
     rows = np.array(
         draw(
-            st.lists(
-                st.lists(entry, min_size=size, max_size=size), min_size=views, max_size=views
-            )
+            st.lists(st.lists(entry, min_size=size, max_size=size), min_size=views, max_size=views)
         ),
         float,
     )

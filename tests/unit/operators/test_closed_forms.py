@@ -47,8 +47,8 @@ def test_gradients_that_agree_are_added(name, ask):
 
 def test_cagrad_meets_its_own_optimality(ask):
     """max over |d - g0| <= c |g0| of min g_k.d, against a fine grid of directions."""
-    for rows in (PAIR, [[3.0, 1.0], [-1.0, 2.0]], [[1.0, 0.0], [-0.9, 0.1]]):
-        rows = np.array(rows)
+    pairs = (PAIR, np.array([[3.0, 1.0], [-1.0, 2.0]]), np.array([[1.0, 0.0], [-0.9, 0.1]]))
+    for rows in pairs:
         mean = rows.mean(axis=0)
         angles = np.linspace(0, 2 * np.pi, 100_001)
         circle = mean + 0.5 * np.linalg.norm(mean) * np.stack([np.cos(angles), np.sin(angles)], 1)
@@ -93,7 +93,8 @@ def test_aligned_brings_all_singular_values_to_the_smallest(ask):
 
 @pytest.mark.parametrize("views", [2, 3, 4, 7])
 def test_imtl_g_projects_equally_on_all(views, ask):
-    rows = np.random.default_rng(views).standard_normal((views, 12)) * np.arange(1, views + 1)[:, None]
+    rows = np.random.default_rng(views).standard_normal((views, 12))
+    rows *= np.arange(1, views + 1)[:, None]
     found = ask("imtl-g", rows)
     projections = rows @ found.result / np.linalg.norm(rows, axis=1)
     np.testing.assert_allclose(projections, projections[0], rtol=1e-11)

@@ -8,7 +8,8 @@ from crossgrad_core.registry import build
 
 def pairs():
     rng = np.random.default_rng(0)
-    yield from (rng.standard_normal((2, 3)) * 10.0 ** rng.uniform(-8, 8, (2, 1)) for _ in range(300))
+    for _ in range(300):
+        yield rng.standard_normal((2, 3)) * 10.0 ** rng.uniform(-8, 8, (2, 1))
     yield np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
     yield np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
     yield np.array([[1.0, 2.0, 0.0], [-1.0, -2.0, 0.0]])

@@ -72,9 +72,12 @@ def test_dispatch_serves_each_kind_by_its_own_operator(context_of):
         operator = build("operators", "dispatch", options)
         return operator.transform(gramians, context, EMPTY_STATE, rng)[0].sum(axis=1)
 
-    plain, projected = np.ones(2), build("operators", "symmetric", {}).transform(
-        gramians[:1], context, EMPTY_STATE, rng
-    )[0].sum(axis=1)[0]
+    plain, projected = (
+        np.ones(2),
+        build("operators", "symmetric", {})
+        .transform(gramians[:1], context, EMPTY_STATE, rng)[0]
+        .sum(axis=1)[0],
+    )
     np.testing.assert_allclose(weights(), [plain, plain, plain])
     found = weights(preset="geometry-projection")
     np.testing.assert_allclose(found, [projected, plain, plain])
@@ -115,7 +118,8 @@ def selection(operator, views, blocks=()):
         def blocks():
             return blocks
 
-    components = {"operator": operator, "backbone": Backbone()}
+    sampler = build("samplers", "random", {})
+    components = {"operator": operator, "backbone": Backbone(), "sampler": sampler}
     names = {"operator": "it", "sampler": "random"}
     return Selection(components, names, views, "cpu")
 

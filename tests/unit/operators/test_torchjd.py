@@ -109,9 +109,7 @@ def test_adapter_is_scale_free_and_leaves_zero_views_out(ask):
 
 
 def test_adapter_passes_options_and_leaves_the_global_generator_alone(ask):
-    operator = build(
-        "operators", "torchjd", {"weighting": "Krum", "options": {"n_byzantine": 0}}
-    )
+    operator = build("operators", "torchjd", {"weighting": "Krum", "options": {"n_byzantine": 0}})
     assert hash(operator) == hash(type(operator).model_validate(operator.model_dump(mode="json")))
     rows = np.random.default_rng(0).standard_normal((4, 8))
     before = torch.get_rng_state()

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
@@ -37,8 +38,11 @@ class _PackageCache(FunctionCache):  # type: ignore[misc]
 
 
 def _compiled(function: Callable[P, R], *, parallel: bool) -> Callable[P, R]:
-    dispatcher = njit(cache=True, parallel=parallel, **_OPTIONS)(function)
-    dispatcher._cache = _PackageCache(function)  # noqa: SLF001 (Numba has no public way)
+    dispatcher = njit(parallel=parallel, **_OPTIONS)(function)
+    # Without a folder to write to, neither beside the package nor in the user's cache, every
+    # process compiles anew.
+    with suppress(RuntimeError):
+        dispatcher._cache = _PackageCache(function)  # noqa: SLF001 (Numba has no public way)
     return cast("Callable[P, R]", dispatcher)
 
 

@@ -1,0 +1,50 @@
+"""The page on operators is complete and true."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from crossgrad_core.registry import build, entries
+
+PAGE = (Path(__file__).parents[2] / "docs" / "operators.md").read_text(encoding="utf-8")
+STARTS = ("- Formula:", "- Differs from `sum`:", "- At the edges:", "- Options:", "- Source:")
+#: Built-in operators; third parties have pages of their own.
+OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
+
+
+def sections():
+    """Name -> text of its section."""
+    parts = re.split(r"^## `(.+)`\n", PAGE, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def rows():
+    """Name -> the other cells of its row in the table."""
+    lines = [line for line in PAGE.splitlines() if line.startswith("| `")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {row[0].strip("`"): row[1:] for row in cells}
+
+
+def test_every_built_in_has_a_section_and_a_row_and_nothing_else_has():
+    assert list(sections()) == OURS
+    assert list(rows()) == OURS
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_section_has_its_five_lines_and_names_every_option(name):
+    lines = sections()[name].strip().splitlines()
+    assert len(lines) == len(STARTS)
+    assert all(line.startswith(start) for line, start in zip(lines, STARTS, strict=True))
+    options = set(type(build("operators", name, {})).model_fields) - {"granularity"}
+    assert all(f"`{option}`" in lines[3] for option in options)
+    assert lines[3].startswith("- Options: none") == (not options)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_table_tells_which_views_are_admitted_and_kept_apart(name):
+    operator = build("operators", name, {})
+    one, two, more, apart, _ = rows()[name]
+    admitted = [operator.views.admits(views) for views in (1, 2, 3)]
+    assert [cell != "refused" for cell in (one, two, more)] == admitted
+    assert apart == ("yes" if operator.separate else "no")
