@@ -71,11 +71,11 @@ def _arguments() -> argparse.Namespace:
 
 def _measured(
     operators: dict[str, Operator], views: int, arguments: argparse.Namespace
-) -> dict[str, dict[str, float]]:
+) -> dict[str, dict[str, float | None]]:
     kept = _gradients(views, arguments.parameters)
     gradients = _gradients(views, arguments.parameters)
     out = {name: torch.empty_like(gradient) for name, gradient in gradients[0].items()}
-    results = {}
+    results: dict[str, dict[str, float | None]] = {}
     for name, operator in operators.items():
         if not operator.views.admits(views):
             continue
@@ -83,7 +83,10 @@ def _measured(
         def aggregation(chosen: Operator = operator) -> None:
             chosen.aggregate(_context(gradients), EMPTY_STATE)
 
-        work = {"aggregation": aggregation, ADDITIONS: lambda: _add(gradients, out)}
+        work: dict[str, Callable[[], object]] = {
+            "aggregation": aggregation,
+            ADDITIONS: lambda: _add(gradients, out),
+        }
         times = _least(work, arguments.repeats, lambda: _restore(kept, gradients))
         added = times["aggregation"] - times[ADDITIONS]
         results[name] = {

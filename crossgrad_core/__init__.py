@@ -1,3 +1,3 @@
-"""Core of crossgrad: the training loop, the plugin contract, the data types and the command line."""
+"""Core of crossgrad: training loop, plugin contract, data types and command line."""
 
 __version__ = "0.1.0"

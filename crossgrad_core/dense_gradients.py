@@ -60,6 +60,7 @@ class DenseViewGradients(ViewGradients):
         self._views = len(views)
         self._overwrite = overwrite
         self._spent = False
+        self._known: dict[Granularity, NDArray[np.float64]] = {}
         self._tensors = tuple(name for block in self._blocks for name in block.tensors)
         self._columns: tuple[Column, ...] = tuple(
             [_prepared(view.get(name)) for view in views] for name in self._tensors
@@ -85,7 +86,7 @@ class DenseViewGradients(ViewGradients):
         raw = self._raw(granularity)
         finite = _finite(raw)
         if finite.all():
-            return raw
+            return raw.copy()
         return np.where(finite[:, :, None] & finite[:, None, :], raw, 0.0)
 
     @override
@@ -167,8 +168,14 @@ class DenseViewGradients(ViewGradients):
         return Groups(kinds, np.repeat(places, counts))
 
     def _raw(self, granularity: Granularity) -> NDArray[np.float64]:
+        """[B, K, K] Gramians, computed once; NaN or infinite where a view is not finite."""
+        if granularity not in self._known:
+            self._known[granularity] = self._gathered(granularity)
+        return self._known[granularity]
+
+    def _gathered(self, granularity: Granularity) -> NDArray[np.float64]:
         if granularity == "gaussian":
-            return self._row_squares
+            return self._row_squares()
         groups = self._groups(granularity)
         if len(groups.names) == len(self._tensors) and granularity == "tensor":
             return self._squares
@@ -178,7 +185,6 @@ class DenseViewGradients(ViewGradients):
             np.add.at(raw, groups.of_tensor, self._squares)
         return raw
 
-    @cached_property
     def _row_squares(self) -> NDArray[np.float64]:
         self._require_unspent()
         parts = []

@@ -69,7 +69,8 @@ def judge(exact: ExactCase, found: Tensor | None, expected: Answer | ElementRule
     if expected is None:
         return Finding("ok")
     if not isinstance(expected, Answer):
-        scale = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
+        longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
+        scale = max(longest, float(found.double().norm()))
         return _measured(exact.case, expected(exact.case, found), scale, scale)
     if all(w == 0 for w in expected.weights):
         return _either(not bool(found.any()), "must be exactly zero")

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
@@ -44,7 +45,7 @@ class NumbaRasterizer(Rasterizer):
             pixels="pixels" in outputs,
         )
         screen = Screen(radii=torch.empty(0, dtype=torch.int32))
-        call = _Call(gaussians.sh_degree, camera, background, options, screen, outputs)
+        call = _Call(_arrays(gaussians), camera, background, options, screen, outputs)
         tensors = [getattr(gaussians, name) for name in _INPUTS]
         image, alpha, depth = _Draw.apply(call, *tensors)  # type: ignore[no-untyped-call]
         return Render(image, alpha, screen, depth)
@@ -55,14 +56,14 @@ class _Call:
 
     def __init__(
         self,
-        degree: int,
+        gaussians: GaussianArrays,
         camera: Camera,
         background: Tensor,
         options: DrawOptions,
         screen: Screen,
         outputs: frozenset[str],
     ) -> None:
-        self.degree = degree
+        self.gaussians = gaussians
         self.camera = camera
         self.background = background
         self.options = options
@@ -71,15 +72,28 @@ class _Call:
         self.frame: Frame | None = None
 
 
-def _array(tensor: Tensor | None) -> Any:
-    return None if tensor is None else np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+def _array(tensor: Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
 
 
-def _gaussians(degree: int, tensors: tuple[Tensor | None, ...]) -> GaussianArrays:
-    means, quats, scales, opacities, colors, dc, rest = (_array(tensor) for tensor in tensors)
-    if dc is not None and rest is None:
-        rest = np.empty((dc.shape[0], 0, 3), np.float32)
-    return GaussianArrays(means, quats, scales, opacities, colors, dc, rest, degree)
+def _optional(tensor: Tensor | None) -> NDArray[np.float32] | None:
+    return None if tensor is None else _array(tensor)
+
+
+def _arrays(gaussians: Gaussians) -> GaussianArrays:
+    rest = _optional(gaussians.sh_rest)
+    if gaussians.sh_dc is not None and rest is None:
+        rest = np.empty((len(gaussians), 0, 3), np.float32)
+    return GaussianArrays(
+        means=_array(gaussians.means),
+        quats=_array(gaussians.quats),
+        scales=_array(gaussians.scales),
+        opacities=_array(gaussians.opacities),
+        colors=_optional(gaussians.colors),
+        dc=_optional(gaussians.sh_dc),
+        rest=rest,
+        degree=gaussians.sh_degree,
+    )
 
 
 class _Draw(torch.autograd.Function):
@@ -88,7 +102,7 @@ class _Draw(torch.autograd.Function):
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> Any:
         camera = call.camera
         frame = forward(
-            _gaussians(call.degree, tensors),
+            call.gaussians,
             CameraArrays(
                 camera.world_to_camera.numpy(),
                 camera.matrix.numpy(),
@@ -108,13 +122,15 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     @override
-    def backward(ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, v_depth: Any) -> Any:
+    def backward(
+        ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None
+    ) -> Any:
         call: _Call = ctx.call
         frame = call.frame
         if frame is None:
             raise RuntimeError("the forward pass did not run")
         v = np.zeros_like(frame.image) if v_image is None else _array(v_image)
-        found = backward(frame, v, _array(v_alpha), _array(v_depth), absolute=call.absolute)
+        found = backward(frame, v, _optional(v_alpha), _optional(v_depth), absolute=call.absolute)
         call.screen.mean_gradient = torch.from_numpy(found.centres)
         if found.absolute is not None:
             call.screen.abs_gradient = torch.from_numpy(found.absolute)
