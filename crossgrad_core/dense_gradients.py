@@ -65,6 +65,8 @@ class DenseViewGradients(ViewGradients):
         self._columns: tuple[Column, ...] = tuple(
             [_prepared(view.get(name)) for view in views] for name in self._tensors
         )
+        self._native = tuple(is_native(column) for column in self._columns)
+        self._grouped: dict[Granularity, Groups] = {}
 
     @property
     @override
@@ -74,11 +76,10 @@ class DenseViewGradients(ViewGradients):
     @override
     def names(self, granularity: Granularity) -> tuple[str, ...]:
         if granularity == "gaussian":
-            return tuple(
-                name
-                for block, rows in zip(self._blocks, self._rows, strict=True)
-                for name in (block.name,) * rows
-            )
+            names: tuple[str, ...] = ()
+            for block, rows in zip(self._blocks, self._rows, strict=True):
+                names += (block.name,) * rows
+            return names
         return self._groups(granularity).names
 
     @override
@@ -157,6 +158,11 @@ class DenseViewGradients(ViewGradients):
         return column_gramians(self._columns, self._views)
 
     def _groups(self, granularity: Granularity) -> Groups:
+        if granularity not in self._grouped:
+            self._grouped[granularity] = self._grouping(granularity)
+        return self._grouped[granularity]
+
+    def _grouping(self, granularity: Granularity) -> Groups:
         counts = [len(block.tensors) for block in self._blocks]
         if granularity == "tensor":
             places = np.arange(len(self._blocks))
@@ -236,32 +242,41 @@ class DenseViewGradients(ViewGradients):
     ) -> dict[str, Tensor | None]:
         """Weighted sums of all tensors; `weights` and `finite` are [T, K]."""
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
-        compiled: list[tuple[Column, NDArray[np.float64], bool, Tensor]] = []
         used = weights != 0
-        order = np.argsort(-(weights**2) * self._norms(), axis=1, kind="stable")
         plain = ((weights == 1) | ~used).all(axis=1) & used.any(axis=1)
-        order[plain] = np.arange(self._views)
+        order = self._order(weights, plain)
+        compiled: list[int] = []
+        chosen = list(self._columns)
         for t, (name, column) in enumerate(zip(self._tensors, self._columns, strict=True)):
-            out = self._result(column, finite[t])
+            out = results[name] = self._result(column, finite[t])
             if out is None:
                 continue
-            results[name] = out
-            places = order[t].tolist()
-            chosen = _selected([column[k] for k in places], used[t][places])
-            simple = bool(plain[t]) and any(g is not None for g in chosen)
-            if is_native(column):
-                compiled.append((chosen, weights[t][places], simple, out))
+            chosen[t] = [column[k] if used[t, k] else None for k in order[t].tolist()]
+            if self._native[t]:
+                compiled.append(t)
             else:
-                generic.combine(chosen, weights[t][places], simple, out)
+                generic.combine(chosen[t], weights[t, order[t]], bool(plain[t]), out)
         if compiled:
-            columns, factors, plains, outs = zip(*compiled, strict=True)
-            native.combine(columns, np.stack(factors), np.array(plains), outs)
+            outs = [results[self._tensors[t]] for t in compiled]
+            native.combine(
+                [chosen[t] for t in compiled],
+                np.take_along_axis(weights, order, axis=1)[compiled],
+                plain[compiled],
+                [out for out in outs if out is not None],
+            )
         self._spent = self._overwrite
         return results
 
-    def _norms(self) -> NDArray[np.float64]:
-        """[T, K] squared norms, finite ones only, to order the terms of a sum by size."""
-        return np.nan_to_num(_diagonal(self._squares), nan=0.0, posinf=0.0)
+    def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """[T, K] views with the longest summand first; those of plain sums stay in order."""
+        order = np.tile(np.arange(self._views), (len(self._tensors), 1))
+        # The order of two summands makes no difference.
+        if self._views > 2 and not plain.all():  # noqa: PLR2004
+            squares = _diagonal(self._squares)
+            norms = np.sqrt(np.where(np.isfinite(squares), squares, 0.0))
+            sorting = ~plain
+            order[sorting] = np.argsort(-np.abs(weights * norms)[sorting], axis=1, kind="stable")
+        return order
 
     def _combine_rows(self, weights: NDArray[np.float64]) -> dict[str, Tensor | None]:
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)

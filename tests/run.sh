@@ -22,5 +22,5 @@ cd "$work"
 "$venv/bin/ruff" check "$here"
 "$venv/bin/ruff" format --check "$here"
 (cd "$here" && "$venv/bin/mypy")
-exec "$venv/bin/python" -m pytest --rootdir "$here" --config-file "$here/pyproject.toml" \
-    "$here/tests" "$@"
+exec "$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --quiet \
+    --rootdir "$here" --config-file "$here/pyproject.toml" "$here/tests" "$@"

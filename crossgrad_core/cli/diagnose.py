@@ -53,9 +53,13 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         ),
     ] = 0,
     grouping: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="Which views are near and far.", rich_help_panel=_PROBE),
-    ] = "radial",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Which views are near and far. Default: the grouping of --run, or else radial.",
+            rich_help_panel=_PROBE,
+        ),
+    ] = None,
     views: Annotated[
         int,
         typer.Option(

@@ -8,7 +8,13 @@ import numpy as np
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contexts import Model
-from crossgrad_core.diagnostics.plan import ProbePlan, labelled, plan_probe
+from crossgrad_core.diagnostics.plan import (
+    DEFAULT_GROUPING,
+    OF_THE_RUN,
+    ProbePlan,
+    labelled,
+    plan_probe,
+)
 from crossgrad_core.diagnostics.probe import ModelProbe
 from crossgrad_core.diagnostics.report import Report
 from crossgrad_core.diagnostics.watch import Watch
@@ -31,7 +37,7 @@ class Options:
     """How a scene is diagnosed.
 
     Attributes:
-        grouping: Name of the grouping.
+        grouping: Name of the grouping; by default that of the run, or else the paper's.
         per_group: Probed views per group.
         probes: Probes during the vanilla run, evenly spaced; the last one at its end.
         seconds: Training seconds of the vanilla run.
@@ -39,7 +45,7 @@ class Options:
         signature: File for the labels of grouping `conflict-signature`, or None.
     """
 
-    grouping: str = "radial"
+    grouping: str | None = None
     per_group: int = 12
     probes: int = 4
     seconds: float = 60.0
@@ -87,7 +93,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
     Raises:
         UserError: The grouping cannot group its scene.
     """
-    plan = _plan(setup.scene, options)
+    plan = _plan(setup.scene, options, setup.groups)
     watch = Watch(plan, 1, state.step, options.seed)
     model = model_of(setup, state)
     watch.crossgrad_model(model)
@@ -109,10 +115,13 @@ class _NoSink:
         pass
 
 
-def _plan(scene: Scene, options: Options) -> ProbePlan:
-    labels, notes = labelled(scene, options.grouping, options.seed)
-    plan = plan_probe(scene, options.grouping, labels, options.per_group, options.seed)
-    return replace(plan, notes=notes)
+def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
+    """The views to probe; `groups` are the labels that the probed run was trained with."""
+    if options.grouping is None and groups is not None:
+        return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
+    name = options.grouping or DEFAULT_GROUPING
+    labels, notes = labelled(scene, name, options.seed)
+    return replace(plan_probe(scene, name, labels, options.per_group, options.seed), notes=notes)
 
 
 def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:

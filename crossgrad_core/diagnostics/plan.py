@@ -16,6 +16,8 @@ from crossgrad_core.scene.types import Scene
 
 #: The grouping of a probe where the run has none: the paper's.
 DEFAULT_GROUPING = "radial"
+#: What the groups that a run was trained with are called.
+OF_THE_RUN = "of the run"
 
 
 @dataclass(frozen=True, eq=False)

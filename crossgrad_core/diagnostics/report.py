@@ -52,7 +52,7 @@ class Report:
     def lines(self) -> list[str]:
         """The report for a terminal."""
         parts = (
-            [self.title, *self.notes],
+            [f"scene: {self.scene}", *self.notes],
             _camera_lines(self.cameras),
             self._blocks(),
             _grouping_lines(self.groupings),

@@ -14,4 +14,7 @@ Column: TypeAlias = Sequence[Tensor | None]
 
 def is_native(column: Column) -> bool:
     """Whether the compiled passes take the column."""
-    return all(g is None or (g.dtype == torch.float32 and g.device.type == "cpu") for g in column)
+    for gradient in column:
+        if gradient is not None and (gradient.dtype != torch.float32 or not gradient.is_cpu):
+            return False
+    return True

@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.float32]
 
-#: Elements of one chunk, 16 kB per view.
-CHUNK = 4096
+#: Elements of one chunk, 64 kB per view: a chunk of sixteen views stays in the second cache.
+CHUNK = 16384
 #: Elements of a chunk that a weighted sum works on at a time.
 PIECE = 1024
 

@@ -36,10 +36,8 @@ class Preconditioner(Operator):
         ratios = np.ones(gramians.shape[1])
         if context.reference_distance > 0:
             ratios = np.clip(context.distances / context.reference_distance, *_BOUNDS)
-        powers = {
-            "geometry": ratios**self.geometry,
-            "appearance": ratios**self.appearance,
-            "neutral": ratios**self.neutral,
-        }
-        weights = np.array([powers[kind] for kind in context.kinds])
-        return weighting(weights.reshape(gramians.shape[:2])), state
+        places = {"geometry": 0, "appearance": 1, "neutral": 2}
+        powers = np.array([self.geometry, self.appearance, self.neutral])
+        table = ratios ** powers[:, None]  # [3, K]
+        kinds = np.fromiter(map(places.__getitem__, context.kinds), np.int64, len(context.kinds))
+        return weighting(table[kinds]), state

@@ -111,6 +111,7 @@ def test_a_run_is_diagnosed_where_it_is(scene, tmp_path, capsys):
     assert f"run {tmp_path / 'run'} (vanilla, near-far, symmetric) at step 12" in printed
     assert {row["step"] for row in table(tmp_path / "out")} == {"12"}
     assert {row["near_views"] for row in table(tmp_path / "out")} == {"3"}
+    assert {row["grouping"] for row in table(tmp_path / "out")} == {"of the run"}
 
 
 def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):

@@ -70,12 +70,17 @@ class Diagnostics(Observer):
 
     def _start(self, model: Model) -> "Watch":
         """The views to look at, and the rows of a run that is being continued."""
-        from crossgrad_core.diagnostics.plan import DEFAULT_GROUPING, labelled, plan_probe
+        from crossgrad_core.diagnostics.plan import (
+            DEFAULT_GROUPING,
+            OF_THE_RUN,
+            labelled,
+            plan_probe,
+        )
         from crossgrad_core.diagnostics.report import PROBES, read_csv
         from crossgrad_core.diagnostics.watch import Watch
 
         if self.grouping is None and model.groups is not None:
-            name, labels = "of the run", model.groups
+            name, labels = OF_THE_RUN, model.groups
         else:
             name = self.grouping or DEFAULT_GROUPING
             labels, _ = labelled(model.scene, name, self.seed)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries
 from crossgrad_core.stress.case import Case, short
 from crossgrad_core.stress.cases import cases
@@ -121,3 +122,9 @@ def test_the_command_tells_by_its_exit_status(monkeypatch):
     bad = CliRunner().invoke(app, arguments)
     assert bad.exit_code == 1
     assert "checks fail" in bad.output
+
+
+def test_without_mpmath_the_suite_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mpmath", None)
+    with pytest.raises(UserError, match=r"crossgrad\[test\]"):
+        list(run_suite(["sum"], []))

@@ -101,14 +101,12 @@ class TileLists:
     """The records that reach each tile, front to back.
 
     Attributes:
-        tiles: [T] int32, the order in which tiles are worked on.
         starts: [T + 1] int64, first entry of each tile.
         entries: [E, 2] int32, records and slots.
         shelves: [N, SHELF] int32, the slots of each record.
         slots: Number of slots.
     """
 
-    tiles: Int32
     starts: Int64
     entries: Int32
     shelves: Int32

@@ -39,6 +39,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     fill_rows,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     COSINE,
@@ -298,7 +299,7 @@ def _backward(
 
 @parallel_kernel
 def differentiate(
-    tiles: NDArray[np.int32],
+    jobs: NDArray[np.int64],
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
     masks: NDArray[np.uint64],
@@ -318,7 +319,7 @@ def differentiate(
     """Sums the gradients of every entry with a mask over its tile's pixels.
 
     Args:
-        tiles: [T] every tile once.
+        jobs: From `new_jobs`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
         masks: [E] segments per entry, as the forward pass left them.
@@ -335,22 +336,25 @@ def differentiate(
         partials: [slots * PARTIAL] written for slots of entries with a mask.
         written: [slots] 1 written for these; zero before.
     """
-    for job in prange(tiles.shape[0]):
-        _backward(
-            tiles[job],
-            starts,
-            entries,
-            masks,
-            records,
-            constants,
-            image,
-            alpha,
-            depth,
-            v_image,
-            v_alpha,
-            v_depth,
-            absolute,
-            analytic,
-            partials,
-            written,
-        )
+    for _worker in prange(jobs[WORKERS]):
+        tile = take(jobs)
+        while tile < starts.shape[0] - 1:
+            _backward(
+                tile,
+                starts,
+                entries,
+                masks,
+                records,
+                constants,
+                image,
+                alpha,
+                depth,
+                v_image,
+                v_alpha,
+                v_depth,
+                absolute,
+                analytic,
+                partials,
+                written,
+            )
+            tile = take(jobs)

@@ -9,6 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     LOG_OPACITY,
@@ -167,6 +168,7 @@ def _find(
 
 @parallel_kernel
 def find_tiles(
+    jobs: NDArray[np.int64],
     tile_columns: int,
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
@@ -179,6 +181,7 @@ def find_tiles(
     """Finds the tiles that each footprint reaches.
 
     Args:
+        jobs: From `new_jobs`.
         tile_columns: Tiles in a row of tiles.
         records: Flat records.
         boxes: [N, 4] tile boxes per record.
@@ -189,25 +192,28 @@ def find_tiles(
         counts: [PARTS, T] written: entries per part and tile; zero before.
     """
     chunks = drawn.shape[0]
-    for part in prange(PARTS):
+    for _worker in prange(jobs[WORKERS]):
         begins = np.empty(LANES, np.float32)
         ends = np.empty(LANES, np.float32)
-        for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
-            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                shelves[j, SLOTS] = _find(
-                    j,
-                    tile_columns,
-                    records,
-                    boxes,
-                    np.intp(shelves[j, FIRST_SLOT]),
-                    tile_of_slot,
-                    counts[part],
-                    begins,
-                    ends,
-                    boxed,
-                )
-                shelves[j, FIRST_ROW] = boxes[j, 2]
-                shelves[j, LAST_ROW] = boxes[j, 3] - 1
+        part = take(jobs)
+        while part < PARTS:
+            for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
+                for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+                    shelves[j, SLOTS] = _find(
+                        j,
+                        tile_columns,
+                        records,
+                        boxes,
+                        np.intp(shelves[j, FIRST_SLOT]),
+                        tile_of_slot,
+                        counts[part],
+                        begins,
+                        ends,
+                        boxed,
+                    )
+                    shelves[j, FIRST_ROW] = boxes[j, 2]
+                    shelves[j, LAST_ROW] = boxes[j, 3] - 1
+            part = take(jobs)
 
 
 @kernel

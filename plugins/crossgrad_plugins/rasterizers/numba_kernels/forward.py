@@ -24,6 +24,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     fill_rows,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     DECAY,
@@ -229,7 +230,7 @@ def _composite(
 
 @parallel_kernel
 def composite(
-    tiles: NDArray[np.int32],
+    jobs: NDArray[np.int64],
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
     records: NDArray[np.float32],
@@ -242,10 +243,10 @@ def composite(
     analytic: NDArray[np.float32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composites the tiles in the given order.
+    """Composites all tiles.
 
     Args:
-        tiles: [T] every tile once.
+        jobs: From `new_jobs`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
         records: Records of the drawn Gaussians, flat.
@@ -258,18 +259,21 @@ def composite(
         analytic: Any vector says that the records are of the analytic response; None: plain.
         masks: [E] segments per entry, written; zero before.
     """
-    for job in prange(tiles.shape[0]):
-        _composite(
-            tiles[job],
-            starts,
-            entries,
-            records,
-            constants,
-            background,
-            image,
-            alpha,
-            depth,
-            counts,
-            analytic,
-            masks,
-        )
+    for _worker in prange(jobs[WORKERS]):
+        tile = take(jobs)
+        while tile < starts.shape[0] - 1:
+            _composite(
+                tile,
+                starts,
+                entries,
+                records,
+                constants,
+                background,
+                image,
+                alpha,
+                depth,
+                counts,
+                analytic,
+                masks,
+            )
+            tile = take(jobs)

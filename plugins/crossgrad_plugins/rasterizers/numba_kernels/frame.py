@@ -1,7 +1,5 @@
 """One rendered view as plain arrays: forward, backward, and what the two share."""
 
-import math
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +28,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import (
 from crossgrad_plugins.rasterizers.numba_kernels.constants import vector_constants
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import pinhole
 from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import new_jobs
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,
@@ -57,7 +56,7 @@ def forward(
     counts = np.zeros(lists.slots, np.int32) if options.pixels else None
     masks = np.zeros(lists.entries.shape[0], np.uint64)
     composite(
-        lists.tiles,
+        new_jobs(),
         lists.starts,
         lists.entries,
         projected.records,
@@ -74,6 +73,7 @@ def forward(
     if counts is not None:
         pixels = np.zeros_like(projected.radii)
         count_pixels(
+            new_jobs(),
             projected.drawn,
             projected.owners,
             lists.shelves,
@@ -110,7 +110,7 @@ def backward(
     partials[-PARTIAL:] = 0.0
     written = np.zeros(lists.slots, np.uint8)
     differentiate(
-        lists.tiles,
+        new_jobs(),
         lists.starts,
         lists.entries,
         frame.masks,
@@ -140,6 +140,7 @@ def backward(
         absolute=np.zeros((count, 2), np.float32) if absolute else None,
     )
     unproject(
+        new_jobs(),
         projected.camera,
         _dilation(options),
         options.response == "antialiased",
@@ -164,6 +165,7 @@ def backward(
     )
     if gradients.dc is not None and gradients.rest is not None and gaussians.rest is not None:
         unshade(
+            new_jobs(),
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,
@@ -205,6 +207,7 @@ def _project(
     depths = np.empty(count, np.float64)
     room = np.empty(chunks, np.int64)
     project(
+        new_jobs(),
         projected.camera,
         options.near,
         _dilation(options),
@@ -226,6 +229,7 @@ def _project(
     )
     if gaussians.dc is not None and gaussians.rest is not None:
         shade(
+            new_jobs(),
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,
@@ -258,22 +262,18 @@ def _bin(
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
     find_tiles(
-        columns, projected.records, boxes, boxed, projected.drawn, shelves, tile_of_slot, counts
+        new_jobs(),
+        columns,
+        projected.records,
+        boxes,
+        boxed,
+        projected.drawn,
+        shelves,
+        tile_of_slot,
+        counts,
     )
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
     entries = np.empty((int(starts[-1]), 2), np.int32)
     fill_tiles(order, columns, bands, shelves, tile_of_slot, starts, entries)
-    return TileLists(_tile_order(columns, rows), starts, entries, shelves, slots)
-
-
-def _tile_order(columns: int, rows: int) -> Int32:
-    """Spreads the rows of tiles so that any run of tiles costs about the same.
-
-    Threads take runs of equal length; the busy tiles of an image lie together.
-    """
-    step = max(1, round(rows * (math.sqrt(5.0) - 1.0) / 2.0))
-    while math.gcd(step, rows) > 1:
-        step += 1
-    spread = (np.arange(rows) * step) % rows
-    return (spread[:, None] * columns + np.arange(columns)).ravel().astype(np.int32)
+    return TileLists(starts, entries, shelves, slots)

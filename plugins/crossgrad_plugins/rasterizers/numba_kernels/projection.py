@@ -23,6 +23,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     unit_quaternion,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     CHUNK,
@@ -109,8 +110,59 @@ def _tint(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float
     return math.isfinite(red) and math.isfinite(green) and math.isfinite(blue)
 
 
+@device
+def _give_slots(first: int, end: int, boxes: NDArray[np.int32], shelves: NDArray[np.int32]) -> int:
+    """Reserves a slot for each tile in the records' boxes; returns their number."""
+    slots = 0
+    for j in range(first, end):
+        shelves[j, FIRST_SLOT] = slots
+        slots += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])
+    return slots
+
+
+@device
+def _record_block(
+    begin: int,
+    size: int,
+    first_record: int,
+    camera: Pinhole,
+    near: float,
+    analytic: NDArray[np.float32] | None,
+    opacities: NDArray[np.float32],
+    colors: NDArray[np.float32] | None,
+    found: NDArray[np.float64],
+    radii: NDArray[np.int32],
+    records: NDArray[np.float32],
+    depths: NDArray[np.float64],
+    boxes: NDArray[np.int32],
+    owners: NDArray[np.int32],
+) -> int:
+    """Makes records of the Gaussians of a block that touch a pixel; returns the next record."""
+    j = first_record
+    width, height = camera.width, camera.height
+    for k in range(size):
+        i = begin + k
+        radii[i] = 0
+        opacity, z = np.float64(opacities[i]), get(found, CAMERA_DEPTH, k)
+        if not (z > near and z < math.inf and opacity >= LEAST_ALPHA and opacity < math.inf):
+            continue
+        if analytic is None:
+            radius = plain_record(k, j, opacity, width, height, found, records, boxes)
+        else:
+            radius = analytic_record(k, j, opacity, width, height, found, records, boxes)
+        if radius == 0 or (colors is not None and not _tint(i, j, colors, records)):
+            continue
+        radii[i] = radius
+        records[j * RECORD + DEPTH] = z
+        depths[j] = z
+        owners[j] = i
+        j += 1
+    return j
+
+
 @parallel_kernel
 def project(
+    jobs: NDArray[np.int64],
     camera: Pinhole,
     near: float,
     dilation: float,
@@ -133,6 +185,7 @@ def project(
     """Projects N Gaussians; those drawn of each chunk take the first records of that chunk.
 
     Args:
+        jobs: From `new_jobs`.
         camera: The view.
         near: Least depth.
         dilation: Added to both variances, px^2.
@@ -154,50 +207,40 @@ def project(
         room: [chunks] written: tiles in the boxes of each chunk.
     """
     count = means.shape[0]
-    for chunk in prange(drawn.shape[0]):
+    for _worker in prange(jobs[WORKERS]):
         found = np.empty(FOUND * BLOCK, np.float64)
-        first = chunk * CHUNK
-        j = first
-        tiles = 0
-        for begin in range(first, min(first + CHUNK, count), BLOCK):
-            size = min(BLOCK, count - begin)
-            _project_block(
-                size,
-                camera,
-                dilation,
-                antialiased,
-                means.reshape(-1)[3 * begin :],
-                quats.reshape(-1)[4 * begin :],
-                scales.reshape(-1)[3 * begin :],
-                found,
-            )
-            for k in range(size):
-                i = begin + k
-                radii[i] = 0
-                opacity = np.float64(opacities[i])
-                z = get(found, CAMERA_DEPTH, k)
-                if not (z > near and z < math.inf):
-                    continue
-                if not (opacity >= LEAST_ALPHA and opacity < math.inf):
-                    continue
-                if analytic is None:
-                    radius = plain_record(
-                        k, j, opacity, camera.width, camera.height, found, records, boxes
-                    )
-                else:
-                    radius = analytic_record(
-                        k, j, opacity, camera.width, camera.height, found, records, boxes
-                    )
-                if radius == 0:
-                    continue
-                if colors is not None and not _tint(i, j, colors, records):
-                    continue
-                radii[i] = radius
-                records[j * RECORD + DEPTH] = z
-                depths[j] = z
-                owners[j] = i
-                shelves[j, FIRST_SLOT] = tiles
-                tiles += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])
-                j += 1
-        drawn[chunk] = j - first
-        room[chunk] = tiles
+        chunk = take(jobs)
+        while chunk < drawn.shape[0]:
+            first = chunk * CHUNK
+            end = first
+            for begin in range(first, min(first + CHUNK, count), BLOCK):
+                size = min(BLOCK, count - begin)
+                _project_block(
+                    size,
+                    camera,
+                    dilation,
+                    antialiased,
+                    means.reshape(-1)[3 * begin :],
+                    quats.reshape(-1)[4 * begin :],
+                    scales.reshape(-1)[3 * begin :],
+                    found,
+                )
+                end = _record_block(
+                    begin,
+                    size,
+                    end,
+                    camera,
+                    near,
+                    analytic,
+                    opacities,
+                    colors,
+                    found,
+                    radii,
+                    records,
+                    depths,
+                    boxes,
+                    owners,
+                )
+            drawn[chunk] = end - first
+            room[chunk] = _give_slots(first, end, boxes, shelves)
+            chunk = take(jobs)

@@ -39,6 +39,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.gradients import (
     weighted_sum,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,
@@ -163,16 +164,17 @@ def _unproject_block(
 def _bring(
     i: int,
     k: int,
-    used: int,
+    with_depth: bool,
     sums: NDArray[np.float32],
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
     block: NDArray[np.float64],
 ) -> None:
-    """Puts the first `used` sums and the parameters of Gaussian i into place k of a block."""
-    for number in range(SUM_DEPTH + 1):
-        put(block, number, k, sums[number] if number < used else 0.0)
+    """Puts the sums and the parameters of Gaussian i into place k of a block."""
+    for number in range(SUM_DEPTH):
+        put(block, number, k, sums[number])
+    put(block, SUM_DEPTH, k, sums[SUM_DEPTH] if with_depth else 0.0)
     for axis in range(3):
         put(block, _MEAN + axis, k, means[i, axis])
         put(block, _SCALE + axis, k, scales[i, axis])
@@ -180,8 +182,83 @@ def _bring(
         put(block, _QUAT + axis, k, quats[i, axis])
 
 
+@device
+def _fill_block(
+    first_record: int,
+    end: int,
+    with_depth: bool,
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    owners: NDArray[np.int32],
+    shelves: NDArray[np.int32],
+    written: NDArray[np.uint8],
+    partials: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    block: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    v_opacities: NDArray[np.float32],
+    v_colors: NDArray[np.float32],
+    v_absolute: NDArray[np.float32],
+) -> tuple[int, int]:
+    """Fills a block with Gaussians that have gradients, and writes what needs no projection.
+
+    Returns:
+        The next record, and how many Gaussians there are in the block; `numbers` says which.
+    """
+    size = 0
+    j = first_record
+    while size < BLOCK and j < end:
+        first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
+        i = np.intp(owners[j])
+        j += 1
+        if not add_up(first, count, written, partials, sums):
+            continue
+        v_colors[i, 0] = sums[SUM_RED]
+        v_colors[i, 1] = sums[SUM_GREEN]
+        v_colors[i, 2] = sums[SUM_BLUE]
+        v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
+        if v_absolute.shape[0] > 0:
+            v_absolute[i, 0] = sums[SUM_ABS_X]
+            v_absolute[i, 1] = sums[SUM_ABS_Y]
+        _bring(i, size, with_depth, sums, means, quats, scales, block)
+        numbers[size] = i
+        size += 1
+    return j, size
+
+
+@device
+def _write_block(
+    size: int,
+    analytic: NDArray[np.float32] | None,
+    numbers: NDArray[np.int64],
+    block: NDArray[np.float64],
+    v_means: NDArray[np.float32],
+    v_quats: NDArray[np.float32],
+    v_scales: NDArray[np.float32],
+    v_centres: NDArray[np.float32],
+    v_absolute: NDArray[np.float32],
+) -> None:
+    """Writes the gradients of a block."""
+    for k in range(size):
+        i = numbers[k]
+        for axis in range(3):
+            v_means[i, axis] = get(block, _V_MEAN + axis, k)
+            v_scales[i, axis] = get(block, _V_SCALE + axis, k)
+        for axis in range(4):
+            v_quats[i, axis] = get(block, _V_QUAT + axis, k)
+        for axis in range(2):
+            v_centres[i, axis] = get(block, _V_CENTRE + axis, k)
+        if analytic is None and v_absolute.shape[0] > 0:
+            # These sums are in units of the decays of the records.
+            v_absolute[i, 0] *= get(block, _INVERSE_VARIANCE, k)
+            v_absolute[i, 1] *= 2.0 * math.log(2.0)
+
+
 @parallel_kernel
 def unproject(
+    jobs: NDArray[np.int64],
     camera: Pinhole,
     dilation: float,
     antialiased: bool,
@@ -207,6 +284,7 @@ def unproject(
     """Adds up each Gaussian's slots and carries the sums on to its parameters.
 
     Args:
+        jobs: From `new_jobs`.
         camera: As in `project`, like all up to `owners`.
         dilation: Px^2.
         antialiased: Whether opacities were lowered.
@@ -229,42 +307,44 @@ def unproject(
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
-    used = SUM_DEPTH + 1 if with_depth else SUM_DEPTH
-    for chunk in prange(drawn.shape[0]):
+    for _worker in prange(jobs[WORKERS]):
         sums = np.empty(PARTIAL, np.float32)
         block = np.empty(_ROWS * BLOCK, np.float64)
         numbers = np.empty(BLOCK, np.int64)
-        begin = chunk * CHUNK
-        j = begin
-        while j < begin + drawn[chunk]:
-            size = 0
-            while size < BLOCK and j < begin + drawn[chunk]:
-                first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
-                i = np.intp(owners[j])
-                j += 1
-                if not add_up(first, count, written, partials, sums):
-                    continue
-                v_colors[i, 0] = sums[SUM_RED]
-                v_colors[i, 1] = sums[SUM_GREEN]
-                v_colors[i, 2] = sums[SUM_BLUE]
-                v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
-                if v_absolute.shape[0] > 0:
-                    v_absolute[i, 0] = sums[SUM_ABS_X]
-                    v_absolute[i, 1] = sums[SUM_ABS_Y]
-                _bring(i, size, used, sums, means, quats, scales, block)
-                numbers[size] = i
-                size += 1
-            _unproject_block(size, camera, dilation, antialiased, analytic, block)
-            for k in range(size):
-                i = numbers[k]
-                for axis in range(3):
-                    v_means[i, axis] = get(block, _V_MEAN + axis, k)
-                    v_scales[i, axis] = get(block, _V_SCALE + axis, k)
-                for axis in range(4):
-                    v_quats[i, axis] = get(block, _V_QUAT + axis, k)
-                for axis in range(2):
-                    v_centres[i, axis] = get(block, _V_CENTRE + axis, k)
-                if analytic is None and v_absolute.shape[0] > 0:
-                    # These sums are in units of the decays of the records.
-                    v_absolute[i, 0] *= get(block, _INVERSE_VARIANCE, k)
-                    v_absolute[i, 1] *= 2.0 * math.log(2.0)
+        chunk = take(jobs)
+        while chunk < drawn.shape[0]:
+            j = chunk * CHUNK
+            end = j + drawn[chunk]
+            while j < end:
+                j, size = _fill_block(
+                    j,
+                    end,
+                    with_depth,
+                    means,
+                    quats,
+                    scales,
+                    opacities,
+                    owners,
+                    shelves,
+                    written,
+                    partials,
+                    sums,
+                    block,
+                    numbers,
+                    v_opacities,
+                    v_colors,
+                    v_absolute,
+                )
+                _unproject_block(size, camera, dilation, antialiased, analytic, block)
+                _write_block(
+                    size,
+                    analytic,
+                    numbers,
+                    block,
+                    v_means,
+                    v_quats,
+                    v_scales,
+                    v_centres,
+                    v_absolute,
+                )
+            chunk = take(jobs)

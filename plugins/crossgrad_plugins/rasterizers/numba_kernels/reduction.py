@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
 from crossgrad_plugins.rasterizers.numba_kernels.simd import LANES, load, splat, store
 
@@ -37,6 +38,7 @@ def add_up(
 
 @parallel_kernel
 def count_pixels(
+    jobs: NDArray[np.int64],
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
     shelves: NDArray[np.int32],
@@ -46,16 +48,20 @@ def count_pixels(
     """Adds up the pixels in which each Gaussian was blended.
 
     Args:
+        jobs: From `new_jobs`.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         shelves: [N, SHELF] from binning.
         counts: [slots] pixels per slot.
         pixels: [N] written for the Gaussians drawn; zero before.
     """
-    for chunk in prange(drawn.shape[0]):
-        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-            first = np.intp(shelves[j, FIRST_SLOT])
-            total = 0
-            for slot in range(first, first + shelves[j, SLOTS]):
-                total += counts[slot]
-            pixels[owners[j]] = total
+    for _worker in prange(jobs[WORKERS]):
+        chunk = take(jobs)
+        while chunk < drawn.shape[0]:
+            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+                first = np.intp(shelves[j, FIRST_SLOT])
+                total = 0
+                for slot in range(first, first + shelves[j, SLOTS]):
+                    total += counts[slot]
+                pixels[owners[j]] = total
+            chunk = take(jobs)
