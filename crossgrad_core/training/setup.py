@@ -95,11 +95,15 @@ class Setup:
         return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
 
     @cached_property
+    def watchers(self) -> tuple[str, ...]:
+        """Names of the plugins that look at the gradients of single views."""
+        wants = "needs_separate_gradients"
+        return tuple(name for name, plugin in self.plugins.items() if getattr(plugin, wants, False))
+
+    @cached_property
     def separate(self) -> bool:
         """Whether the views' gradients are kept apart."""
-        return self.operator.separate or any(
-            getattr(plugin, "needs_separate_gradients", False) for plugin in self.plugins.values()
-        )
+        return self.operator.separate or bool(self.watchers)
 
     @cached_property
     def joint(self) -> bool:

@@ -19,8 +19,6 @@ from crossgrad_core.contexts import (
     Sampled,
     StepRecord,
 )
-from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
-from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.manager import call_seam
 from crossgrad_core.optimizer import adam_step
 from crossgrad_core.topology import Edit, NoEdit
@@ -83,7 +81,7 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
 def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) -> Aggregated:
     context = AggregateContext(
         **_common(setup, state, "operator"),
-        gradients=_view_gradients(setup, rendered),
+        gradients=rendered.gradients,
         losses=np.array([record.loss for record in rendered.records]),
         labels=draw.labels,
         distances=setup.distances[list(draw.views)],
@@ -94,15 +92,6 @@ def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) 
     state.commit(answer.states)
     state.counters.dropped += answer.counts.get("dropped", 0)
     return answer
-
-
-def _view_gradients(setup: Setup, rendered: Rendered) -> ViewGradients:
-    if rendered.per_view is not None:
-        return DenseViewGradients(rendered.per_view, setup.blocks)
-    accumulated = rendered.accumulated
-    if accumulated is None:
-        raise RuntimeError("a step without gradients")
-    return AccumulatedGradients(accumulated, setup.blocks, len(rendered.records))
 
 
 def _finish(

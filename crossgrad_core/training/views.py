@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contexts import Draw, Model, RegularizeContext, ViewRecord
+from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
 from crossgrad_core.gaussians import Gaussians, Render
+from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.photometric import photometric_loss
 from crossgrad_core.scene.types import View
 from crossgrad_core.training.failure import NonFiniteError
@@ -27,14 +29,12 @@ class Rendered:
 
     Attributes:
         records: One record per view.
-        per_view: The gradients view by view, where they are kept apart.
-        accumulated: Their sum, where they are not.
+        gradients: Their gradients, apart or summed up as the operator needs them.
         regular: Gradients of regularisation terms of the views, to join after aggregation.
     """
 
     records: tuple[ViewRecord, ...]
-    per_view: tuple[Gradients, ...] | None
-    accumulated: Gradients | None
+    gradients: ViewGradients
     regular: Gradients
 
 
@@ -58,6 +58,7 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     if setup.joint:
         return _render_jointly(setup, state, draw, regular)
     records, per_view = [], []
+    total = AccumulatedGradients.empty(setup.blocks)
     _clear(state.parameters)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot)
@@ -66,10 +67,14 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
         records.append(drawn.record)
         if setup.separate:
             per_view.append(_take(state.parameters))
+        else:
+            total.add(_take(state.parameters))
     state.counters.backward_passes += len(records)
-    if setup.separate:
-        return Rendered(tuple(records), tuple(per_view), None, regular)
-    return Rendered(tuple(records), None, _take(state.parameters), regular)
+    if not setup.separate:
+        return Rendered(tuple(records), total, regular)
+    # Nobody looks at single views after they are combined, unless a plugin says so.
+    apart = DenseViewGradients(per_view, setup.blocks, overwrite=not setup.watchers)
+    return Rendered(tuple(records), apart, regular)
 
 
 def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradients) -> Rendered:
@@ -81,7 +86,8 @@ def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradie
     _backward(torch.stack([view.loss for view in drawn]).sum())
     state.counters.backward_passes += 1
     records = tuple(view.record for view in drawn)
-    return Rendered(records, None, _take(state.parameters), regular)
+    total = AccumulatedGradients(_take(state.parameters), setup.blocks, len(records))
+    return Rendered(records, total, regular)
 
 
 def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn:
