@@ -42,6 +42,9 @@ def one_run(arguments: argparse.Namespace, method: str, seed: int) -> dict[str, 
     if not (out / "summary.json").is_file():
         app.run(settings(arguments, method, seed, out), verbosity=-1)
     summary = json.loads((out / "summary.json").read_text())
+    if summary["status"] == "stopped":
+        app.run({}, resume=out, verbosity=-1)
+        summary = json.loads((out / "summary.json").read_text())
     figures = {
         "psnr": summary["overall"]["psnr"],
         "ssim": summary["overall"]["ssim"],

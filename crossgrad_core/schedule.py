@@ -30,7 +30,8 @@ class Schedule:
         densify_until: ... and before this one.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None where there are none.
-        prune_large_from: Gaussians that are large in the world are pruned after this step.
+        prune_large_from: Gaussians that are large in the world are pruned after this step: after
+            the first opacity reset, as published, and never where there is none.
         anchors_from: Anchor growing starts after this step.
     """
 
@@ -61,7 +62,7 @@ class Schedule:
             densify_until=total // 2,
             densify_every=max(SHORTEST_INTERVAL, total // 300),
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
-            prune_large_from=total // 10,
+            prune_large_from=total // 10 if total >= SHORTEST_RUN_WITH_RESET else total,
             anchors_from=total // 20,
         )
 
