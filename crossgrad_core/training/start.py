@@ -12,6 +12,7 @@ from crossgrad_core.manager import make_manager
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.assemble import schedule_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
@@ -23,9 +24,9 @@ RANDOM_POINTS = 20_000
 PROBE_STEPS = 12
 #: ... and the share of the budget that it takes beyond that.
 PROBE_SHARE = 0.01
-#: Mean cost of a step over a run in units of one at its start: density control adds primitives.
-#: Measured with benchmarks/budget.py.
-GROWTH_COST = 1.35
+#: Mean cost of a step over a run that grows, in units of one at its start: 2,000 steps on the scene
+#: boruszyn_kap at 400 px took 89 s, the first 200 of them 5.0 s (docs/benchmarks.md, quality).
+GROWTH_COST = 1.8
 
 
 def first_state(setup: Setup) -> TrainState:
@@ -93,14 +94,26 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
         timed_step(far, state)
         steps += 1
     each = state.clock.train / steps
-    grows = setup.selection.names["densifier"] != "none"
-    cost = each * (GROWTH_COST if grows else 1.0)
-    total = max(1, ceil(seconds / cost))
+    total = _fitting(setup, seconds / each)
+    expected = total * each * (GROWTH_COST if _grows(setup, total) else 1.0)
     note = (
         f"{total} steps for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms each, "
-        f"expected to cost {cost / each:.2f} times that on average"
+        f"the whole run is expected to take {expected:.0f} s"
     )
     return total, note
+
+
+def _grows(setup: Setup, steps: int) -> bool:
+    return setup.selection.names["densifier"] != "none" and schedule_of(setup.config, steps).grows
+
+
+def _fitting(setup: Setup, affordable: float) -> int:
+    """The most steps that cost no more than `affordable` steps at the initial size."""
+    growing = max(1, ceil(affordable / GROWTH_COST))
+    if _grows(setup, growing):
+        return growing
+    plain = range(max(1, ceil(affordable)), growing, -1)
+    return next((steps for steps in plain if not _grows(setup, steps)), growing)
 
 
 def initial_bytes(setup: Setup) -> int:

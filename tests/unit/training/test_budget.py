@@ -1,0 +1,31 @@
+"""How many steps fit into a budget of training seconds."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.training.start import GROWTH_COST, _fitting
+
+
+def setup(densifier="adc"):
+    return SimpleNamespace(
+        config=RunConfig(), selection=SimpleNamespace(names={"densifier": densifier})
+    )
+
+
+@pytest.mark.parametrize(
+    ("affordable", "steps"),
+    [
+        (0.3, 1),
+        (400.0, 400),  # too short for density control: nothing grows
+        (1500.0, 1201),  # the longest run that does not grow
+        (18_000.0, int(18_000 / GROWTH_COST)),
+    ],
+)
+def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
+    assert _fitting(setup(), affordable) == steps
+
+
+def test_without_density_control_every_step_costs_the_same():
+    assert _fitting(setup("none"), 18_000.0) == 18_000
