@@ -11,7 +11,6 @@ final transmittance; the accumulated depth is one more colour channel.
 """
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
@@ -38,8 +37,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROWS,
     fill_rows,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     COSINE,
@@ -297,9 +296,9 @@ def _backward(
             )
 
 
-@parallel_kernel
+@kernel
 def differentiate(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
     masks: NDArray[np.uint64],
@@ -319,7 +318,7 @@ def differentiate(
     """Sums the gradients of every entry with a mask over its tile's pixels.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
         masks: [E] segments per entry, as the forward pass left them.
@@ -336,25 +335,24 @@ def differentiate(
         partials: [slots * PARTIAL] written for slots of entries with a mask.
         written: [slots] 1 written for these; zero before.
     """
-    for _worker in prange(jobs[WORKERS]):
+    tile = take(jobs)
+    while tile < starts.shape[0] - 1:
+        _backward(
+            tile,
+            starts,
+            entries,
+            masks,
+            records,
+            constants,
+            image,
+            alpha,
+            depth,
+            v_image,
+            v_alpha,
+            v_depth,
+            absolute,
+            analytic,
+            partials,
+            written,
+        )
         tile = take(jobs)
-        while tile < starts.shape[0] - 1:
-            _backward(
-                tile,
-                starts,
-                entries,
-                masks,
-                records,
-                constants,
-                image,
-                alpha,
-                depth,
-                v_image,
-                v_alpha,
-                v_depth,
-                absolute,
-                analytic,
-                partials,
-                written,
-            )
-            tile = take(jobs)

@@ -5,11 +5,10 @@ consecutive slots; the tile lists are then filled in the order of depth.
 """
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     LOG_OPACITY,
@@ -166,9 +165,9 @@ def _find(
     return slot - first_slot
 
 
-@parallel_kernel
+@kernel
 def find_tiles(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     tile_columns: int,
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
@@ -181,7 +180,7 @@ def find_tiles(
     """Finds the tiles that each footprint reaches.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         tile_columns: Tiles in a row of tiles.
         records: Flat records.
         boxes: [N, 4] tile boxes per record.
@@ -192,28 +191,27 @@ def find_tiles(
         counts: [PARTS, T] written: entries per part and tile; zero before.
     """
     chunks = drawn.shape[0]
-    for _worker in prange(jobs[WORKERS]):
-        begins = np.empty(LANES, np.float32)
-        ends = np.empty(LANES, np.float32)
+    begins = np.empty(LANES, np.float32)
+    ends = np.empty(LANES, np.float32)
+    part = take(jobs)
+    while part < PARTS:
+        for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
+            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+                shelves[j, SLOTS] = _find(
+                    j,
+                    tile_columns,
+                    records,
+                    boxes,
+                    np.intp(shelves[j, FIRST_SLOT]),
+                    tile_of_slot,
+                    counts[part],
+                    begins,
+                    ends,
+                    boxed,
+                )
+                shelves[j, FIRST_ROW] = boxes[j, 2]
+                shelves[j, LAST_ROW] = boxes[j, 3] - 1
         part = take(jobs)
-        while part < PARTS:
-            for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
-                for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                    shelves[j, SLOTS] = _find(
-                        j,
-                        tile_columns,
-                        records,
-                        boxes,
-                        np.intp(shelves[j, FIRST_SLOT]),
-                        tile_of_slot,
-                        counts[part],
-                        begins,
-                        ends,
-                        boxed,
-                    )
-                    shelves[j, FIRST_ROW] = boxes[j, 2]
-                    shelves[j, LAST_ROW] = boxes[j, 3] - 1
-            part = take(jobs)
 
 
 @kernel
@@ -243,8 +241,9 @@ def start_tiles(
     return starts
 
 
-@parallel_kernel
+@kernel
 def fill_tiles(
+    jobs: Jobs,
     order: NDArray[np.int32],
     tile_columns: int,
     bands: NDArray[np.int64],
@@ -256,6 +255,7 @@ def fill_tiles(
     """Writes the tile lists, each band of rows of tiles by one job.
 
     Args:
+        jobs: From `share`.
         order: [M] records front to back.
         tile_columns: Tiles in a row of tiles.
         bands: [bands + 1] first row of tiles of each band.
@@ -266,7 +266,8 @@ def fill_tiles(
             back.
     """
     count = order.shape[0]
-    for band in prange(bands.shape[0] - 1):
+    band = take(jobs)
+    while band < bands.shape[0] - 1:
         first_tile, end_tile = bands[band] * tile_columns, bands[band + 1] * tile_columns
         positions = starts[first_tile:end_tile].copy()
         for rank in range(count):
@@ -284,3 +285,4 @@ def fill_tiles(
                     positions[tile - first_tile] = entry + 1
                     entries[entry, 0] = j
                     entries[entry, 1] = slot
+        band = take(jobs)

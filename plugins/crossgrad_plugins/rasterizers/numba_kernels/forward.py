@@ -1,7 +1,6 @@
 """Compositing of the tiles, front to back."""
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
@@ -23,8 +22,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROWS,
     fill_rows,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     DECAY,
@@ -228,9 +227,9 @@ def _composite(
     _finish(state, top, left, background, image, alpha, depth)
 
 
-@parallel_kernel
+@kernel
 def composite(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
     records: NDArray[np.float32],
@@ -246,7 +245,7 @@ def composite(
     """Composites all tiles.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
         records: Records of the drawn Gaussians, flat.
@@ -259,21 +258,20 @@ def composite(
         analytic: Any vector says that the records are of the analytic response; None: plain.
         masks: [E] segments per entry, written; zero before.
     """
-    for _worker in prange(jobs[WORKERS]):
+    tile = take(jobs)
+    while tile < starts.shape[0] - 1:
+        _composite(
+            tile,
+            starts,
+            entries,
+            records,
+            constants,
+            background,
+            image,
+            alpha,
+            depth,
+            counts,
+            analytic,
+            masks,
+        )
         tile = take(jobs)
-        while tile < starts.shape[0] - 1:
-            _composite(
-                tile,
-                starts,
-                entries,
-                records,
-                constants,
-                background,
-                image,
-                alpha,
-                depth,
-                counts,
-                analytic,
-                masks,
-            )
-            tile = take(jobs)

@@ -28,7 +28,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import (
 from crossgrad_plugins.rasterizers.numba_kernels.constants import vector_constants
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import pinhole
 from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import new_jobs
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import share
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,
@@ -55,8 +55,8 @@ def forward(
     depth = np.empty(shape, np.float32) if options.depth else None
     counts = np.zeros(lists.slots, np.int32) if options.pixels else None
     masks = np.zeros(lists.entries.shape[0], np.uint64)
-    composite(
-        new_jobs(),
+    share(
+        composite,
         lists.starts,
         lists.entries,
         projected.records,
@@ -72,8 +72,8 @@ def forward(
     pixels = None
     if counts is not None:
         pixels = np.zeros_like(projected.radii)
-        count_pixels(
-            new_jobs(),
+        share(
+            count_pixels,
             projected.drawn,
             projected.owners,
             lists.shelves,
@@ -109,8 +109,8 @@ def backward(
     partials = np.empty((lists.slots + 1) * PARTIAL, np.float32)
     partials[-PARTIAL:] = 0.0
     written = np.zeros(lists.slots, np.uint8)
-    differentiate(
-        new_jobs(),
+    share(
+        differentiate,
         lists.starts,
         lists.entries,
         frame.masks,
@@ -139,8 +139,8 @@ def backward(
         centres=np.zeros((count, 2), np.float32),
         absolute=np.zeros((count, 2), np.float32) if absolute else None,
     )
-    unproject(
-        new_jobs(),
+    share(
+        unproject,
         projected.camera,
         _dilation(options),
         options.response == "antialiased",
@@ -164,8 +164,8 @@ def backward(
         np.empty((0, 2), np.float32) if gradients.absolute is None else gradients.absolute,
     )
     if gradients.dc is not None and gradients.rest is not None and gaussians.rest is not None:
-        unshade(
-            new_jobs(),
+        share(
+            unshade,
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,
@@ -206,8 +206,8 @@ def _project(
     shelves = np.empty((count, SHELF), np.int32)
     depths = np.empty(count, np.float64)
     room = np.empty(chunks, np.int64)
-    project(
-        new_jobs(),
+    share(
+        project,
         projected.camera,
         options.near,
         _dilation(options),
@@ -228,8 +228,8 @@ def _project(
         room,
     )
     if gaussians.dc is not None and gaussians.rest is not None:
-        shade(
-            new_jobs(),
+        share(
+            shade,
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,
@@ -261,8 +261,8 @@ def _bin(
     order = order_by_depth(keys, items)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
-    find_tiles(
-        new_jobs(),
+    share(
+        find_tiles,
         columns,
         projected.records,
         boxes,
@@ -275,5 +275,5 @@ def _bin(
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
     entries = np.empty((int(starts[-1]), 2), np.int32)
-    fill_tiles(order, columns, bands, shelves, tile_of_slot, starts, entries)
+    share(fill_tiles, order, columns, bands, shelves, tile_of_slot, starts, entries)
     return TileLists(starts, entries, shelves, slots)

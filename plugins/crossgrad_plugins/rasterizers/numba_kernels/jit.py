@@ -37,23 +37,14 @@ class _PackageCache(FunctionCache):  # type: ignore[misc]
         return (*super()._index_key(sig, codegen), _fingerprint())
 
 
-def _compiled(function: Callable[P, R], *, parallel: bool) -> Callable[P, R]:
-    dispatcher = njit(parallel=parallel, **_OPTIONS)(function)
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles an entry point; cached on disk."""
+    dispatcher = njit(**_OPTIONS)(function)
     # Without a folder to write to, neither beside the package nor in the user's cache, every
     # process compiles anew.
     with suppress(RuntimeError):
         dispatcher._cache = _PackageCache(function)  # noqa: SLF001 (Numba has no public way)
     return cast("Callable[P, R]", dispatcher)
-
-
-def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles an entry point that runs on one thread; cached on disk."""
-    return _compiled(function, parallel=False)
-
-
-def parallel_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles an entry point whose `prange` loops run on all Numba threads; cached on disk."""
-    return _compiled(function, parallel=True)
 
 
 def device(function: Callable[P, R]) -> Callable[P, R]:

@@ -1,46 +1,63 @@
-"""Jobs that the threads of a kernel share: whoever is free takes the next one.
+"""Jobs that threads share: whoever is free takes the next one.
 
-Numba divides a `prange` into equal runs beforehand, so the slowest thread (a busy core, a slow
-one) decides. A kernel instead starts one worker per thread, and each takes jobs until there are
-none left:
+A kernel takes jobs until there are none left,
 
-    for _worker in prange(jobs[WORKERS]):
+    job = take(jobs)
+    while job < count:
+        ...
         job = take(jobs)
-        while job < count:
-            ...
-            job = take(jobs)
 
-A job's result must not depend on who does it; then the bits do not depend on the threads.
+and `share` calls it on all threads at once. Numba's own `prange` divides the work into equal runs
+beforehand and waits for every thread; with a busy or a slow core that takes longer than one thread
+alone. Here a helper that did not get to run in time is simply not needed any more.
+
+What a job computes must not depend on who does it; then no bit depends on the threads.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
+import os
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, Concatenate, ParamSpec
 
+import numba
 import numpy as np
 from llvmlite import ir
-from numba import get_num_threads
 from numba.core import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-#: What is where in a kernel's `jobs`: the number of the next one, and of workers.
-NEXT, WORKERS = 0, 1
-
-
-def new_jobs() -> NDArray[np.int64]:
-    """Returns `jobs` for one call of a kernel on as many threads as Numba is set to."""
-    return np.array([0, get_num_threads()], np.int64)
+P = ParamSpec("P")
+Jobs = NDArray[np.int64]
 
 
 def _take(typing: Any, jobs: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        counter = builder.gep(data, [ir.IntType(64)(NEXT)])
+        counter = context.make_array(signature.args[0])(context, builder, args[0]).data
         return builder.atomic_rmw("add", counter, ir.IntType(64)(1), "monotonic")
 
     return types.int64(jobs), generate
 
 
-#: Returns the number of the next job, counted from 0 on over all threads.
-take: Callable[[NDArray[np.int64]], int] = intrinsic(_take)
+#: Returns the number of the next job, counted from 0 on over all threads; only in kernels.
+take: Callable[[Jobs], int] = intrinsic(_take)
+
+
+def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
+    """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
+    jobs = np.zeros(1, np.int64)
+    helpers = [
+        _pool(os.getpid()).submit(kernel, jobs, *args, **kwargs)
+        for _ in range(numba.get_num_threads() - 1)
+    ]
+    kernel(jobs, *args, **kwargs)
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The helpers of a process; one that was forked off has none of its parent's threads."""
+    return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "crossgrad-rasterizer")

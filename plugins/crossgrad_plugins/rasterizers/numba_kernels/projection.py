@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
@@ -22,8 +21,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     to_camera,
     unit_quaternion,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     CHUNK,
@@ -160,9 +159,9 @@ def _record_block(
     return j
 
 
-@parallel_kernel
+@kernel
 def project(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     camera: Pinhole,
     near: float,
     dilation: float,
@@ -185,7 +184,7 @@ def project(
     """Projects N Gaussians; those drawn of each chunk take the first records of that chunk.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         camera: The view.
         near: Least depth.
         dilation: Added to both variances, px^2.
@@ -207,40 +206,39 @@ def project(
         room: [chunks] written: tiles in the boxes of each chunk.
     """
     count = means.shape[0]
-    for _worker in prange(jobs[WORKERS]):
-        found = np.empty(FOUND * BLOCK, np.float64)
+    found = np.empty(FOUND * BLOCK, np.float64)
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        first = chunk * CHUNK
+        end = first
+        for begin in range(first, min(first + CHUNK, count), BLOCK):
+            size = min(BLOCK, count - begin)
+            _project_block(
+                size,
+                camera,
+                dilation,
+                antialiased,
+                means.reshape(-1)[3 * begin :],
+                quats.reshape(-1)[4 * begin :],
+                scales.reshape(-1)[3 * begin :],
+                found,
+            )
+            end = _record_block(
+                begin,
+                size,
+                end,
+                camera,
+                near,
+                analytic,
+                opacities,
+                colors,
+                found,
+                radii,
+                records,
+                depths,
+                boxes,
+                owners,
+            )
+        drawn[chunk] = end - first
+        room[chunk] = _give_slots(first, end, boxes, shelves)
         chunk = take(jobs)
-        while chunk < drawn.shape[0]:
-            first = chunk * CHUNK
-            end = first
-            for begin in range(first, min(first + CHUNK, count), BLOCK):
-                size = min(BLOCK, count - begin)
-                _project_block(
-                    size,
-                    camera,
-                    dilation,
-                    antialiased,
-                    means.reshape(-1)[3 * begin :],
-                    quats.reshape(-1)[4 * begin :],
-                    scales.reshape(-1)[3 * begin :],
-                    found,
-                )
-                end = _record_block(
-                    begin,
-                    size,
-                    end,
-                    camera,
-                    near,
-                    analytic,
-                    opacities,
-                    colors,
-                    found,
-                    radii,
-                    records,
-                    depths,
-                    boxes,
-                    owners,
-                )
-            drawn[chunk] = end - first
-            room[chunk] = _give_slots(first, end, boxes, shelves)
-            chunk = take(jobs)

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import main_axes
@@ -38,8 +37,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.gradients import (
     turn_gradient,
     weighted_sum,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,
@@ -256,9 +255,9 @@ def _write_block(
             v_absolute[i, 1] *= 2.0 * math.log(2.0)
 
 
-@parallel_kernel
+@kernel
 def unproject(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     camera: Pinhole,
     dilation: float,
     antialiased: bool,
@@ -284,7 +283,7 @@ def unproject(
     """Adds up each Gaussian's slots and carries the sums on to its parameters.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         camera: As in `project`, like all up to `owners`.
         dilation: Px^2.
         antialiased: Whether opacities were lowered.
@@ -307,44 +306,43 @@ def unproject(
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
-    for _worker in prange(jobs[WORKERS]):
-        sums = np.empty(PARTIAL, np.float32)
-        block = np.empty(_ROWS * BLOCK, np.float64)
-        numbers = np.empty(BLOCK, np.int64)
+    sums = np.empty(PARTIAL, np.float32)
+    block = np.empty(_ROWS * BLOCK, np.float64)
+    numbers = np.empty(BLOCK, np.int64)
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        j = chunk * CHUNK
+        end = j + drawn[chunk]
+        while j < end:
+            j, size = _fill_block(
+                j,
+                end,
+                with_depth,
+                means,
+                quats,
+                scales,
+                opacities,
+                owners,
+                shelves,
+                written,
+                partials,
+                sums,
+                block,
+                numbers,
+                v_opacities,
+                v_colors,
+                v_absolute,
+            )
+            _unproject_block(size, camera, dilation, antialiased, analytic, block)
+            _write_block(
+                size,
+                analytic,
+                numbers,
+                block,
+                v_means,
+                v_quats,
+                v_scales,
+                v_centres,
+                v_absolute,
+            )
         chunk = take(jobs)
-        while chunk < drawn.shape[0]:
-            j = chunk * CHUNK
-            end = j + drawn[chunk]
-            while j < end:
-                j, size = _fill_block(
-                    j,
-                    end,
-                    with_depth,
-                    means,
-                    quats,
-                    scales,
-                    opacities,
-                    owners,
-                    shelves,
-                    written,
-                    partials,
-                    sums,
-                    block,
-                    numbers,
-                    v_opacities,
-                    v_colors,
-                    v_absolute,
-                )
-                _unproject_block(size, camera, dilation, antialiased, analytic, block)
-                _write_block(
-                    size,
-                    analytic,
-                    numbers,
-                    block,
-                    v_means,
-                    v_quats,
-                    v_scales,
-                    v_centres,
-                    v_absolute,
-                )
-            chunk = take(jobs)

@@ -1,12 +1,11 @@
 """Sums over the tiles that a record reaches, in a fixed order."""
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
 from crossgrad_plugins.rasterizers.numba_kernels.simd import LANES, load, splat, store
 
@@ -36,9 +35,9 @@ def add_up(
     return found
 
 
-@parallel_kernel
+@kernel
 def count_pixels(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
     shelves: NDArray[np.int32],
@@ -48,20 +47,19 @@ def count_pixels(
     """Adds up the pixels in which each Gaussian was blended.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         shelves: [N, SHELF] from binning.
         counts: [slots] pixels per slot.
         pixels: [N] written for the Gaussians drawn; zero before.
     """
-    for _worker in prange(jobs[WORKERS]):
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            first = np.intp(shelves[j, FIRST_SLOT])
+            total = 0
+            for slot in range(first, first + shelves[j, SLOTS]):
+                total += counts[slot]
+            pixels[owners[j]] = total
         chunk = take(jobs)
-        while chunk < drawn.shape[0]:
-            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                first = np.intp(shelves[j, FIRST_SLOT])
-                total = 0
-                for slot in range(first, first + shelves[j, SLOTS]):
-                    total += counts[slot]
-                pixels[owners[j]] = total
-            chunk = take(jobs)

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_plugins.rasterizers.numba_kernels.jit import device, parallel_kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import WORKERS, take
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     LOG_OPACITY,
@@ -100,9 +99,9 @@ def _direction_gradient(
     return v_x, v_y, v_z
 
 
-@parallel_kernel
+@kernel
 def shade(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     degree: int,
     eye: NDArray[np.float64],
     means: NDArray[np.float32],
@@ -116,7 +115,7 @@ def shade(
     """Writes max(0, 1/2 + harmonics(direction)) to the colours of the records.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         degree: Active degree, 0 to 3.
         eye: [3] camera centre.
         means: [N, 3].
@@ -128,29 +127,28 @@ def shade(
         radii: [N] set to 0 for these.
     """
     count = (degree + 1) * (degree + 1)
-    for _worker in prange(jobs[WORKERS]):
-        basis = np.empty(BASIS, np.float64)
+    basis = np.empty(BASIS, np.float64)
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            i = np.intp(owners[j])
+            x, y, z, _ = _direction(means, i, eye)
+            _basis(degree, x, y, z, basis)
+            for channel in range(3):
+                colour = 0.5 + basis[0] * np.float64(dc[i, 0, channel])
+                for k in range(1, count):
+                    colour += basis[k] * np.float64(rest[i, k - 1, channel])
+                if not math.isfinite(colour):
+                    # Reaches no pixel.
+                    records[j * RECORD + LOG_OPACITY] = -math.inf
+                    radii[i] = 0
+                records[j * RECORD + RED + channel] = max(colour, 0.0)
         chunk = take(jobs)
-        while chunk < drawn.shape[0]:
-            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                i = np.intp(owners[j])
-                x, y, z, _ = _direction(means, i, eye)
-                _basis(degree, x, y, z, basis)
-                for channel in range(3):
-                    colour = 0.5 + basis[0] * np.float64(dc[i, 0, channel])
-                    for k in range(1, count):
-                        colour += basis[k] * np.float64(rest[i, k - 1, channel])
-                    if not math.isfinite(colour):
-                        # Reaches no pixel.
-                        records[j * RECORD + LOG_OPACITY] = -math.inf
-                        radii[i] = 0
-                    records[j * RECORD + RED + channel] = max(colour, 0.0)
-            chunk = take(jobs)
 
 
-@parallel_kernel
+@kernel
 def unshade(
-    jobs: NDArray[np.int64],
+    jobs: Jobs,
     degree: int,
     eye: NDArray[np.float64],
     means: NDArray[np.float32],
@@ -166,7 +164,7 @@ def unshade(
     """Carries gradients of the colours on to coefficients and centres.
 
     Args:
-        jobs: From `new_jobs`.
+        jobs: From `share`.
         degree: As in `shade`, like the next six.
         eye: [3].
         means: [N, 3].
@@ -180,30 +178,29 @@ def unshade(
         v_means: [N, 3] added to.
     """
     count = (degree + 1) * (degree + 1)
-    for _worker in prange(jobs[WORKERS]):
-        basis = np.empty(BASIS, np.float64)
-        v_basis = np.empty(BASIS, np.float64)
-        chunk = take(jobs)
-        while chunk < drawn.shape[0]:
-            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                if records[j * RECORD + LOG_OPACITY] == -math.inf:
+    basis = np.empty(BASIS, np.float64)
+    v_basis = np.empty(BASIS, np.float64)
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            if records[j * RECORD + LOG_OPACITY] == -math.inf:
+                continue
+            i = np.intp(owners[j])
+            x, y, z, inverse = _direction(means, i, eye)
+            _basis(degree, x, y, z, basis)
+            v_basis[:] = 0.0
+            for channel in range(3):
+                # A channel clamped at 0 has no gradient.
+                if records[j * RECORD + RED + channel] <= np.float32(0.0):
                     continue
-                i = np.intp(owners[j])
-                x, y, z, inverse = _direction(means, i, eye)
-                _basis(degree, x, y, z, basis)
-                v_basis[:] = 0.0
-                for channel in range(3):
-                    # A channel clamped at 0 has no gradient.
-                    if records[j * RECORD + RED + channel] <= np.float32(0.0):
-                        continue
-                    v = np.float64(v_colors[i, channel])
-                    v_dc[i, 0, channel] = v * basis[0]
-                    for k in range(1, count):
-                        v_rest[i, k - 1, channel] = v * basis[k]
-                        v_basis[k] += v * np.float64(rest[i, k - 1, channel])
-                v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_basis)
-                along = x * v_x + y * v_y + z * v_z
-                v_means[i, 0] += (v_x - x * along) * inverse
-                v_means[i, 1] += (v_y - y * along) * inverse
-                v_means[i, 2] += (v_z - z * along) * inverse
-            chunk = take(jobs)
+                v = np.float64(v_colors[i, channel])
+                v_dc[i, 0, channel] = v * basis[0]
+                for k in range(1, count):
+                    v_rest[i, k - 1, channel] = v * basis[k]
+                    v_basis[k] += v * np.float64(rest[i, k - 1, channel])
+            v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_basis)
+            along = x * v_x + y * v_y + z * v_z
+            v_means[i, 0] += (v_x - x * along) * inverse
+            v_means[i, 1] += (v_y - y * along) * inverse
+            v_means[i, 2] += (v_z - z * along) * inverse
+        chunk = take(jobs)
