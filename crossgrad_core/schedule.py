@@ -67,9 +67,14 @@ class Schedule:
         )
 
     @property
+    def edits(self) -> int:
+        """Number of steps after which density control edits."""
+        return sum(self.densifies(step) for step in range(self.densify_from, self.densify_until))
+
+    @property
     def grows(self) -> bool:
-        """Whether there is any step after which density control edits."""
-        return any(self.densifies(step) for step in range(self.densify_from, self.densify_until))
+        """Whether density control edits at all."""
+        return self.edits > 0
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
         """Active spherical-harmonics degree at a step."""

@@ -24,9 +24,12 @@ RANDOM_POINTS = 20_000
 PROBE_STEPS = 12
 #: ... and the share of the budget that it takes beyond that.
 PROBE_SHARE = 0.01
-#: Mean cost of a step over a run that grows, in units of one at its start: 2,000 steps on the scene
-#: boruszyn_kap at 400 px took 89 s, the first 200 of them 5.0 s (docs/benchmarks.md, quality).
-GROWTH_COST = 1.8
+#: What each edit of density control adds to the mean cost of a step, in units of a step at the
+#: start. Two thousand steps with four edits took 1.8 times as long as the first 200 times ten
+#: (89 s and 5.0 s, scene boruszyn_kap at 400 px, see docs/benchmarks.md).
+COST_PER_EDIT = 0.2
+#: Growth slows down: more edits than these are not counted.
+COUNTED_EDITS = 5
 
 
 def first_state(setup: Setup) -> TrainState:
@@ -95,7 +98,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
         steps += 1
     each = state.clock.train / steps
     total = _fitting(setup, seconds / each)
-    expected = total * each * (GROWTH_COST if _grows(setup, total) else 1.0)
+    expected = total * each * _cost(setup, total)
     note = (
         f"{total} steps for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms each, "
         f"the whole run is expected to take {expected:.0f} s"
@@ -103,17 +106,24 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
     return total, note
 
 
-def _grows(setup: Setup, steps: int) -> bool:
-    return setup.selection.names["densifier"] != "none" and schedule_of(setup.config, steps).grows
+def _cost(setup: Setup, steps: int) -> float:
+    """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
+    if setup.selection.names["densifier"] == "none":
+        return 1.0
+    edits = schedule_of(setup.config, steps).edits
+    return 1.0 + COST_PER_EDIT * min(edits, COUNTED_EDITS)
 
 
 def _fitting(setup: Setup, affordable: float) -> int:
-    """The most steps that cost no more than `affordable` steps at the initial size."""
-    growing = max(1, ceil(affordable / GROWTH_COST))
-    if _grows(setup, growing):
-        return growing
-    plain = range(max(1, ceil(affordable)), growing, -1)
-    return next((steps for steps in plain if not _grows(setup, steps)), growing)
+    """The most steps that cost no more than `affordable` steps at the initial size (bisection)."""
+    fits, too_many = 1, max(2, ceil(affordable) + 1)
+    while too_many - fits > 1:
+        steps = (fits + too_many) // 2
+        if steps * _cost(setup, steps) <= affordable:
+            fits = steps
+        else:
+            too_many = steps
+    return fits
 
 
 def initial_bytes(setup: Setup) -> int:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.training.start import GROWTH_COST, _fitting
+from crossgrad_core.training.start import _fitting
 
 
 def setup(densifier="adc"):
@@ -19,8 +19,9 @@ def setup(densifier="adc"):
     [
         (0.3, 1),
         (400.0, 400),  # too short for density control: nothing grows
-        (1500.0, 1201),  # the longest run that does not grow
-        (18_000.0, int(18_000 / GROWTH_COST)),
+        (1250.0, 1201),  # the longest run that does not grow
+        (1500.0, 1250),  # one edit: every step costs 1.2 times as much
+        (18_000.0, 9000),  # twice as much at the most
     ],
 )
 def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
