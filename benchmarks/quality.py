@@ -15,6 +15,7 @@ from statistics import mean, stdev
 from _machine import facts
 
 from crossgrad_core import app
+from crossgrad_core.results.summary import read_summary
 
 
 def settings(arguments: argparse.Namespace, method: str, seed: int, out: Path) -> dict[str, object]:
@@ -41,10 +42,10 @@ def one_run(arguments: argparse.Namespace, method: str, seed: int) -> dict[str, 
     out = arguments.out / f"{method.replace('/', '-')}-seed{seed}"
     if not (out / "summary.json").is_file():
         app.run(settings(arguments, method, seed, out), verbosity=-1)
-    summary = json.loads((out / "summary.json").read_text())
+    summary = read_summary(out)
     if summary["status"] == "stopped":
         app.run({}, resume=out, verbosity=-1)
-        summary = json.loads((out / "summary.json").read_text())
+        summary = read_summary(out)
     figures = {
         "psnr": summary["overall"]["psnr"],
         "ssim": summary["overall"]["ssim"],

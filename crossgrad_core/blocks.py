@@ -50,18 +50,6 @@ class Block:
     lr: LearningRate
 
 
-def block_of(blocks: tuple[Block, ...], tensor: str) -> Block:
-    """The block that holds the tensor of that name.
-
-    Raises:
-        KeyError: No block holds it.
-    """
-    for block in blocks:
-        if tensor in block.tensors:
-            return block
-    raise KeyError(tensor)
-
-
 def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> int:
     """The number of primitives, read off the first per-primitive tensor."""
     for block in blocks:

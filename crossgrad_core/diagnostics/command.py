@@ -114,6 +114,9 @@ class _NoSink:
     def save(self, setup: Setup, state: TrainState) -> None:
         pass
 
+    def rewind(self, setup: Setup, step: int) -> None:
+        pass
+
 
 def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
     """The views to probe; `groups` are the labels that the probed run was trained with."""

@@ -149,8 +149,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     manager = make_manager(plugins)
     _object(config, selection, manager.hook.crossgrad_objections(selection=selection))
     groups = _groups(config, scene, components.get("grouping"), notes)
-    notes += _linear_note(operator, operator_name, plugins)
-    return Setup(
+    setup = Setup(
         config=config,
         scene=scene,
         selection=selection,
@@ -162,6 +161,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=device,
         notes=tuple(notes),
     )
+    return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
 
 
 def schedule_of(config: RunConfig, steps: int) -> Schedule:
@@ -280,12 +280,12 @@ def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -
         )
 
 
-def _linear_note(operator: Operator, name: str, plugins: Mapping[str, object]) -> list[str]:
-    if operator.separate:
-        return []
-    watchers = [
-        plugin for plugin, it in plugins.items() if getattr(it, "needs_separate_gradients", False)
-    ]
-    if watchers:
-        return [f"gradients of single views kept apart for {', '.join(watchers)} (same bits)"]
-    return [f"no separate gradients: operator {name} is linear, the backward passes accumulate"]
+def _linear_note(setup: Setup) -> tuple[str, ...]:
+    name = setup.selection.names["operator"]
+    if setup.operator.separate:
+        return ()
+    if setup.watchers:
+        return (
+            f"gradients of single views kept apart for {', '.join(setup.watchers)} (same bits)",
+        )
+    return (f"no separate gradients: operator {name} is linear, the backward passes accumulate",)

@@ -37,6 +37,10 @@ class Sink(Protocol):
         """Writes a checkpoint."""
         ...
 
+    def rewind(self, setup: Setup, step: int) -> None:
+        """Forgets what was recorded after `step`."""
+        ...
+
 
 @dataclass
 class Stopper:
@@ -84,6 +88,7 @@ def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Stat
                 snapshot = Snapshot.of(state)
         except NonFiniteError as error:
             _rewind(setup, state, snapshot, error)
+            sink.rewind(setup, state.step)
             continue
         check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)

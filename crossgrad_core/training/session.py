@@ -7,7 +7,7 @@ from time import perf_counter
 
 from torch import Tensor
 
-from crossgrad_core.checkpoint import save
+from crossgrad_core.checkpoint import drop_later, save
 from crossgrad_core.checkpoint_folders import Keep
 from crossgrad_core.contexts import EvaluationReport
 from crossgrad_core.evaluation import EvaluationResult, evaluate
@@ -90,6 +90,12 @@ class Session:
         save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
         self._saved_step = state.step
         state.clock.report += perf_counter() - start
+
+    def rewind(self, setup: Setup, step: int) -> None:
+        """Drops rows and checkpoints of steps that training went back behind."""
+        self._table = MetricsCsv.resume(self.folder, regimes_of(setup), step)
+        drop_later(self.folder, step)
+        self._saved_step = self._evaluated_step = -1
 
     def finish(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None

@@ -51,7 +51,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     gradients = joined(aggregated.gradients, rendered.regular)
     _check_finite(state, rendered, gradients)
     counts = _finish(setup, state, rendered, gradients)
-    record = StepRecord(
+    return StepRecord(
         step=state.step,
         views=draw.views,
         names=tuple(record.view.name for record in rendered.records),
@@ -61,8 +61,6 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         counts={**aggregated.counts, **counts},
         train_seconds=state.clock.train,
     )
-    state.last = record
-    return record
 
 
 def _sample(setup: Setup, state: TrainState) -> Draw:

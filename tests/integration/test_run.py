@@ -204,6 +204,8 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run") == 0
     assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    # The evaluation of step 6 was before the rewind and is there once, from after it.
+    assert [row["step"] for row in quality(tmp_path / "run")] == ["6", "12"]
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 
