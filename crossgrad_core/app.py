@@ -30,11 +30,12 @@ from crossgrad_core.training.assemble import (
     schedule_of,
 )
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
+from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.loop import Stopper, train
 from crossgrad_core.training.persist import from_checkpoint
 from crossgrad_core.training.resolve import resolved
-from crossgrad_core.training.session import PANELS, Session, export_ply, renderer, totals
+from crossgrad_core.training.session import PANELS, Session, totals
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, steps_for, warm_up
 from crossgrad_core.training.state import TrainState
@@ -137,7 +138,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note = steps_for(setup, seconds)
     config = setup.config.model_copy(update={"steps": steps, "seconds": None})
-    schedule = schedule_of(config, steps)
+    schedule = schedule_of(config, setup.densifier, steps)
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
 
 
@@ -283,19 +284,26 @@ def render(folder: Path, *, split: str, out: Path | None, device: str | None = N
     print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
 
-def export(folder: Path, *, file_format: str, out: Path | None) -> None:
+def export(folder: Path, *, file_format: str, out: Path | None, camera: str | None = None) -> None:
     """Writes the trained scene to a file that viewers open.
 
+    Args:
+        folder: The run's folder.
+        file_format: `ply`.
+        out: The file; by default `point_cloud.ply` in the run's folder.
+        camera: Name of the view to bake for; by default the average over the training views.
+
     Raises:
-        UserError: It is no run, it has no checkpoint, or the file exists.
+        UserError: It is no run, it has no checkpoint, the file exists, or there is no such view.
     """
     path = out or folder / f"point_cloud.{file_format}"
     if out is not None and out.exists():
         raise UserError("the file exists", where=out, todo="choose another --out, or remove it")
     setup, state = opened(folder, {}, -1)
-    for note in export_ply(setup, state, path):
-        print(note)  # noqa: T201
-    print(f"{state.primitives(setup):,} Gaussians in {path}")  # noqa: T201
+    exported = export_ply(setup, state, path, camera)
+    for line in described(exported, path):
+        print(line)  # noqa: T201
+    print(f"{exported.gaussians:,} Gaussians in {path}")  # noqa: T201
 
 
 def _machine(device: str | None, threads: int | None) -> dict[str, Any]:

@@ -1,16 +1,17 @@
 """The backbone slot: the trained representation."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from crossgrad_core.blocks import Block, Parameters
 from crossgrad_core.component import Component
 from crossgrad_core.errors import UserError
-from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.gaussians import Gaussians, Response
 from crossgrad_core.scene.types import Camera, Scene
 from crossgrad_core.schedule import Phase
 
@@ -20,10 +21,15 @@ class Backbone(Component):
 
     Attributes:
         default_densifier: Name of the densifier that is used unless the user names another.
+        response: How its Gaussians fill a pixel.
+        plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
+            PLY loses nothing.
     """
 
     slot: ClassVar[str] = "backbones"
     default_densifier: ClassVar[str] = "adc"
+    response: ClassVar[Response] = "plain"
+    plain: ClassVar[bool] = False
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:
@@ -36,6 +42,10 @@ class Backbone(Component):
     @abstractmethod
     def decode(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Gaussians:
         """The Gaussians that `camera` sees, differentiable in the parameters."""
+
+    def trained_blocks(self) -> tuple[Block, ...]:
+        """The blocks that get gradients."""
+        return tuple(block for block in self.blocks() if not block.frozen)
 
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
         """This backbone with options that the scene does not need left out, and what was left out.
@@ -64,8 +74,16 @@ class Backbone(Component):
         """
         return parameters
 
+    def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
+        """The tensor `opacities` [N] (logits) with no Gaussian drawn more opaque than `cap`."""
+        limit = torch.logit(torch.tensor(cap, dtype=torch.float64)).item()
+        return parameters["opacities"].detach().clamp(max=limit)
+
     @abstractmethod
     def bake(
-        self, parameters: Mapping[str, Tensor], phase: Phase, camera: Camera | None = None
+        self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        """Plain SH Gaussians for a standard PLY; view-dependent ones are baked for `camera`."""
+        """Plain SH Gaussians without a graph, for a standard PLY.
+
+        What depends on the view is baked as `cameras` (one or more) see it, on average.
+        """

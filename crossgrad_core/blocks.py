@@ -40,7 +40,8 @@ class Block:
         tensors: Names of its tensors in `Parameters`; a single-tensor block carries its name.
         per_primitive: Whether the first dimension of every tensor counts primitives.
         kind: Geometry, appearance or neutral (for `group` granularity and per-block dispatch).
-        lr: Learning rate of all its tensors; 0 freezes the block.
+        lr: Learning rate of all its tensors; 0 freezes the block: its tensors get no gradient,
+            may be of any type, and take part in topology edits and checkpoints only.
     """
 
     name: str
@@ -48,6 +49,11 @@ class Block:
     per_primitive: bool
     kind: BlockKind
     lr: LearningRate
+
+    @property
+    def frozen(self) -> bool:
+        """Whether training leaves the block as it is."""
+        return self.lr.initial == 0.0
 
 
 def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> int:

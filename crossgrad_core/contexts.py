@@ -170,6 +170,7 @@ class DensifyContext(StepContext):
     Attributes:
         parameters: The parameters; to be changed through the answered edit only.
         backbone: The backbone.
+        rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
@@ -177,6 +178,7 @@ class DensifyContext(StepContext):
 
     parameters: Parameters
     backbone: "Backbone"
+    rasterizer: "Rasterizer"
     views: tuple[ViewRecord, ...]
     means_lr: float
     room: int

@@ -3,9 +3,11 @@
 from abc import abstractmethod
 from typing import ClassVar
 
+from crossgrad_core.blocks import Parameters
 from crossgrad_core.component import Component, Selection
 from crossgrad_core.contexts import Densified, DensifyContext
 from crossgrad_core.hooks import hookimpl
+from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import Edit, NoEdit
 
@@ -24,6 +26,18 @@ class Densifier(Component):
     slot: ClassVar[str] = "densifiers"
     needs: ClassVar[frozenset[str]] = frozenset()
     blocks: ClassVar[frozenset[str]] = frozenset()
+
+    def window(self, schedule: Schedule) -> Schedule:
+        """The schedule with the times at which this method edits; what the user set wins over it.
+
+        Args:
+            schedule: The schedule of the run, with the times of 3DGS.
+        """
+        return schedule
+
+    def started(self, parameters: Parameters) -> Parameters:
+        """The initial parameters as this method wants them; by default untouched."""
+        return parameters
 
     @abstractmethod
     def densify(

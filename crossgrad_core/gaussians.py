@@ -1,8 +1,10 @@
 """What every backbone decodes to and every rasterizer takes and returns."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 Response = Literal["plain", "antialiased", "analytic"]
@@ -28,6 +30,9 @@ class Gaussians:
         dilation: Added to both diagonal entries of the 2-D covariance, px^2; None takes the
             rasterizer's own.
         origin: [N] int64, the primitive of each Gaussian; None where Gaussian i is primitive i.
+        slot: [N] int64, which of its primitive's Gaussians each one is; None where there is one.
+        decoded: [P] bool, the primitives that were decoded for this view, whether or not they gave
+            a Gaussian; None where all were.
     """
 
     means: Tensor
@@ -41,9 +46,22 @@ class Gaussians:
     response: Response = "plain"
     dilation: float | None = None
     origin: Tensor | None = None
+    slot: Tensor | None = None
+    decoded: Tensor | None = None
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
+        """The same Gaussians with `function` applied to every floating-point tensor."""
+        names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+        tensors = {name: getattr(self, name) for name in names}
+        mapped: dict[str, Any] = {n: function(t) for n, t in tensors.items() if t is not None}
+        return replace(self, **mapped)
+
+    def detached(self) -> "Gaussians":
+        """The same Gaussians without their graph."""
+        return self.mapped(torch.Tensor.detach)
 
 
 @dataclass

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from crossgrad_core.component import Component
-from crossgrad_core.gaussians import Gaussians, Render
+from crossgrad_core.gaussians import Gaussians, Render, Response
 from crossgrad_core.scene.types import Camera
 
 #: A Gaussian touches a pixel where its alpha reaches this value.
@@ -26,11 +26,13 @@ class Rasterizer(Component):
         near: Gaussians whose centre is nearer than this camera depth are not drawn, local units.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
         provides: Optional outputs it can give: `depth`, `pixels`, `abs_gradient`.
+        responses: Pixel responses that it draws.
         devices: Torch device types it runs on.
     """
 
     slot: ClassVar[str] = "rasterizers"
     provides: ClassVar[frozenset[str]] = frozenset()
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
 
     max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")

@@ -1,7 +1,8 @@
 """Vanilla 3DGS: one explicit Gaussian per primitive (Kerbl et al. 2023)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import log
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ class Vanilla(Backbone):
     Blocks: means [N, 3]; scales [N, 3] (log); quats [N, 4] wxyz; opacities [N] (logit);
     f_dc [N, 1, 3]; f_rest [N, 15, 3]. Source: 3DGS, methods of section 5.
     """
+
+    plain: ClassVar[bool] = True
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")
     lr_means: float = Field(1.6e-4, gt=0, description="initial, per scene extent")
@@ -119,7 +122,10 @@ class Vanilla(Backbone):
 
     @override
     def decode(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Gaussians:
-        degree = phase.schedule.sh_degree(phase.step, self.sh_degree)
+        return self.splats(parameters, phase.schedule.sh_degree(phase.step, self.sh_degree))
+
+    def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:
+        """The Gaussians with spherical harmonics up to `degree`, differentiable."""
         return Gaussians(
             means=parameters["means"],
             quats=parameters["quats"],
@@ -132,14 +138,6 @@ class Vanilla(Backbone):
 
     @override
     def bake(
-        self, parameters: Mapping[str, Tensor], phase: Phase, camera: Camera | None = None
+        self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        return Gaussians(
-            means=parameters["means"].detach(),
-            quats=parameters["quats"].detach(),
-            scales=torch.exp(parameters["scales"].detach()),
-            opacities=torch.sigmoid(parameters["opacities"].detach()),
-            sh_dc=parameters["f_dc"].detach(),
-            sh_rest=parameters["f_rest"].detach() if "f_rest" in parameters else None,
-            sh_degree=self.sh_degree,
-        )
+        return self.splats(parameters, self.sh_degree).detached()

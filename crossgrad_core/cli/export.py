@@ -24,8 +24,15 @@ def export(
         Path | None,
         typer.Option(metavar="FILE", help="The file to write. Default: RUN/point_cloud.ply."),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEW",
+            help="Bake what depends on the view for this one. Default: mean of the training views.",
+        ),
+    ] = None,
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     from crossgrad_core import app
 
-    app.export(run, file_format=file_format.value, out=out)
+    app.export(run, file_format=file_format.value, out=out, camera=camera)

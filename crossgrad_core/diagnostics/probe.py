@@ -64,7 +64,7 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
         views: Positions in `scene.train_views`.
         rng: Chooses the subset.
     """
-    blocks = tuple(block for block in model.backbone.blocks() if block.lr.initial > 0.0)
+    blocks = model.backbone.trained_blocks()
     rows, share = _rows(model, len(views), rng)
     factors = _Subset(rows, {name for b in blocks if b.per_primitive for name in b.tensors}, share)
     names = [name for block in blocks for name in block.tensors]
@@ -103,7 +103,7 @@ class ModelProbe:
     @property
     def blocks(self) -> tuple[str, ...]:
         """[B] names of the blocks."""
-        return tuple(b.name for b in self.model.backbone.blocks() if b.lr.initial > 0.0)
+        return tuple(block.name for block in self.model.backbone.trained_blocks())
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
         """[B, V, V] Gramians; a view whose gradient is not finite counts as zero."""
@@ -145,7 +145,9 @@ class _Subset:
 
 def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | None, float]:
     """The rows to look at and their share of all."""
-    per_primitive = [t for b in model.backbone.blocks() if b.per_primitive for t in b.tensors]
+    per_primitive = [
+        t for b in model.backbone.trained_blocks() if b.per_primitive for t in b.tensors
+    ]
     if not per_primitive:
         return None, 1.0
     total = model.parameters[per_primitive[0]].shape[0]

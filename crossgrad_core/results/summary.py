@@ -40,6 +40,7 @@ class Summary:
         seconds: Wall-clock seconds by what they were spent on.
         config: The resolved configuration as plain data, the seed included.
         environment: Machine and versions.
+        ply: What is in the PLY; None where none was written.
         notes: What was chosen or left out, and why.
         error: Why the run failed; None otherwise.
     """
@@ -52,6 +53,7 @@ class Summary:
     seconds: Seconds
     config: Mapping[str, Any]
     environment: Mapping[str, Json]
+    ply: Mapping[str, Json] | None = None
     notes: Sequence[str] = ()
     error: str | None = None
 
@@ -90,6 +92,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         **asdict(summary.totals),
         **_metrics(summary.result),
         "best": _best(summary.rows),
+        "ply": None if summary.ply is None else dict(summary.ply),
         "seconds": asdict(summary.seconds),
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),

@@ -169,7 +169,7 @@ def parameters_stay_untouched(make: Make[Backbone]) -> None:
     parameters = created(backbone)
     copies = {name: tensor.detach().clone() for name, tensor in parameters.items()}
     backbone.decode(parameters, sample_camera(), sample_phase())
-    backbone.bake(parameters, sample_phase(training=False), sample_camera())
+    backbone.bake(parameters, sample_phase(training=False), [sample_camera()])
     _require_equal(parameters, copies)
 
 
@@ -181,7 +181,7 @@ def _require_equal(parameters: Mapping[str, Tensor], copies: Mapping[str, Tensor
 def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
     """What is written to a PLY are Gaussians with spherical harmonics, without a graph."""
     backbone = make()
-    baked = backbone.bake(created(backbone), sample_phase(training=False), sample_camera())
+    baked = backbone.bake(created(backbone), sample_phase(training=False), [sample_camera()])
     require(baked.sh_dc is not None and baked.colors is None, "bake() does not give sh_dc")
     require(not baked.means.requires_grad, "bake() gives tensors with a graph")
     require(len(baked) > 0, "bake() gives no Gaussians")

@@ -14,6 +14,7 @@ from crossgrad_core.contexts import DensifyContext, ViewRecord
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.errors import UserError
 from crossgrad_core.gaussians import Screen
+from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.registry import build, entries, load
 from crossgrad_core.state import EMPTY_STATE, PluginState
 from crossgrad_core.testing.backbones import created
@@ -79,6 +80,7 @@ class DensifierRun:
             **fields,
             parameters=self.parameters,
             backbone=self.backbone,
+            rasterizer=cast("Rasterizer", build("rasterizers", "torch", {})),
             views=tuple(self._rendered(index, step) for index in (step % 4, 4 + step % 5)),
             means_lr=1e-4,
             room=room,

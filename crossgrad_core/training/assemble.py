@@ -157,18 +157,18 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         manager=manager,
         plugins=plugins,
         groups=groups,
-        schedule=schedule_of(config, config.steps or DEFAULT_STEPS),
+        schedule=schedule_of(config, densifier, config.steps or DEFAULT_STEPS),
         device=device,
         notes=tuple(notes),
     )
     return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
 
 
-def schedule_of(config: RunConfig, steps: int) -> Schedule:
-    """The schedule of a run of `steps` steps with what the user set by hand."""
+def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
+    """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
     names = ("densify_from", "densify_until", "densify_every", "reset_every")
     given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
-    return replace(Schedule.for_run(steps, config.schedule), **given)
+    return replace(densifier.window(Schedule.for_run(steps, config.schedule)), **given)
 
 
 def growth_note(setup: Setup) -> tuple[str, ...]:
@@ -266,6 +266,11 @@ def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -
     if device not in rasterizer.devices:
         reasons.append(
             f"rasterizer {selection.names['rasterizer']} does not run on device {device}"
+        )
+    if selection.backbone.response not in rasterizer.responses:
+        reasons.append(
+            f"rasterizer {selection.names['rasterizer']} does not draw the pixel response "
+            f"{selection.backbone.response} of backbone {selection.names['backbone']}"
         )
     if config.backward == "joint" and selection.operator.separate:
         reasons.append(

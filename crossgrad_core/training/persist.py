@@ -35,7 +35,7 @@ def to_checkpoint(state: TrainState) -> Checkpoint:
 def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     """The state that continues bit for bit where the checkpoint was written."""
     scalars = cast("dict[str, Any]", checkpoint.scalars)
-    trained = {name for block in setup.blocks for name in block.tensors}
+    trained = {name for block in setup.trained_blocks for name in block.tensors}
     device = setup.device
     return TrainState(
         parameters={

@@ -1,17 +1,13 @@
 """Where the results of a run go while it trains and when it ends."""
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
-
-from torch import Tensor
 
 from crossgrad_core.checkpoint import drop_later, save
 from crossgrad_core.checkpoint_folders import Keep
 from crossgrad_core.contexts import EvaluationReport
 from crossgrad_core.evaluation import EvaluationResult, evaluate
-from crossgrad_core.ply import write_ply
 from crossgrad_core.results.curve import draw_curve
 from crossgrad_core.results.environment import environment
 from crossgrad_core.results.metrics_csv import MetricsCsv, metrics_row, read_metrics
@@ -19,14 +15,14 @@ from crossgrad_core.results.panels import PanelWriter
 from crossgrad_core.results.per_view import write_per_view
 from crossgrad_core.results.summary import Status, Summary, write_summary
 from crossgrad_core.results.totals import Seconds, Totals
-from crossgrad_core.scene.types import View
-from crossgrad_core.splat_cloud import SplatCloud
+from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.memory import peak_mebibytes
 from crossgrad_core.training.persist import to_checkpoint
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import eval_background
 
+#: The trained scene, for viewers.
+PLY = "point_cloud.ply"
 #: Held-out views of which panels are drawn.
 PANELS = 4
 
@@ -107,14 +103,17 @@ class Session:
             write_per_view(self.folder, self.result)
         if rows:
             draw_curve(self.folder, rows, title(setup), view_counts(setup))
-        for note in export_ply(setup, state, self.folder / "point_cloud.ply"):
-            setup.hook.crossgrad_message(text=note)
+        path = self.folder / PLY
+        exported = export_ply(setup, state, path)
+        for line in described(exported, path):
+            setup.hook.crossgrad_message(text=line)
         state.clock.report += perf_counter() - start
         summary = Summary(
             status=status,
             scene=setup.scene.name,
             totals=totals(setup, state),
             result=self.result,
+            ply=exported.as_data(),
             rows=rows,
             seconds=Seconds(**asdict(state.clock)),
             config=setup.config.model_dump(mode="json"),
@@ -123,26 +122,6 @@ class Session:
             error=error,
         )
         write_summary(self.folder, summary)
-
-
-def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
-    """Renders a view with the current parameters as an evaluation does."""
-    background = eval_background(setup)
-    phase = setup.phase(state.step, training=False)
-
-    def render_one(view: View) -> Tensor:
-        gaussians = setup.backbone.decode(state.parameters, view.camera, phase)
-        return setup.rasterizer.render(gaussians, view.camera, background).image
-
-    return render_one
-
-
-def export_ply(setup: Setup, state: TrainState, path: Path) -> tuple[str, ...]:
-    """Writes the standard PLY in the coordinates of the input; notes for the user."""
-    gaussians = setup.backbone.bake(state.parameters, setup.phase(state.step, training=False))
-    comments = (f"crossgrad step {state.step}",)
-    cloud = SplatCloud.from_gaussians(gaussians)
-    return write_ply(path, cloud, setup.scene.similarity, comments)
 
 
 def totals(setup: Setup, state: TrainState) -> Totals:

@@ -80,6 +80,11 @@ class Setup:
         return self.backbone.blocks()
 
     @cached_property
+    def trained_blocks(self) -> tuple[Block, ...]:
+        """The blocks that get gradients."""
+        return self.backbone.trained_blocks()
+
+    @cached_property
     def train_views(self) -> tuple[View, ...]:
         """The training views, in the order that samplers index."""
         return self.scene.train_views

@@ -35,9 +35,10 @@ COUNTED_EDITS = 5
 def first_state(setup: Setup) -> TrainState:
     """The state before the first step."""
     rngs = make_streams(setup.config.seed)
-    parameters = initial_parameters(setup, rngs["create"])
+    parameters = setup.densifier.started(initial_parameters(setup, rngs["create"]))
+    trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        name: tensor.detach().to(setup.device).requires_grad_(tensor.requires_grad)
+        name: tensor.detach().to(setup.device).requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
     parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
@@ -110,7 +111,7 @@ def _cost(setup: Setup, steps: int) -> float:
     """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
     if setup.selection.names["densifier"] == "none":
         return 1.0
-    edits = schedule_of(setup.config, steps).edits
+    edits = schedule_of(setup.config, setup.densifier, steps).edits
     return 1.0 + COST_PER_EDIT * min(edits, COUNTED_EDITS)
 
 

@@ -84,7 +84,7 @@ def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) 
         labels=draw.labels,
         distances=setup.distances[list(draw.views)],
         reference_distance=float(np.median(setup.distances)),
-        blocks=setup.blocks,
+        blocks=setup.trained_blocks,
     )
     answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
     state.commit(answer.states)
@@ -112,7 +112,8 @@ def _finish(
 
 def _optimize(setup: Setup, state: TrainState, gradients: Gradients) -> None:
     progress = state.step / setup.schedule.lr_steps
-    rates = {name: block.lr.at(progress) for block in setup.blocks for name in block.tensors}
+    blocks = setup.trained_blocks
+    rates = {name: block.lr.at(progress) for block in blocks for name in block.tensors}
     adam_step(state.parameters, gradients, state.adam, rates)
 
 
@@ -121,6 +122,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit 
         **_common(setup, state, "densifier"),
         parameters=state.parameters,
         backbone=setup.backbone,
+        rasterizer=setup.rasterizer,
         views=rendered.records,
         means_lr=_means_lr(setup, state.step),
         room=_room(setup, state) if setup.schedule.densifies(state.step) else 0,

@@ -1,7 +1,7 @@
 """Rendering the K views of a step and running their backward passes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isfinite
 from time import perf_counter
 
@@ -58,7 +58,7 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     if setup.joint:
         return _render_jointly(setup, state, draw, regular)
     records, per_view = [], []
-    total = AccumulatedGradients.empty(setup.blocks)
+    total = AccumulatedGradients.empty(setup.trained_blocks)
     _clear(state.parameters)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot)
@@ -73,7 +73,7 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     if not setup.separate:
         return Rendered(tuple(records), total, regular)
     # Nobody looks at single views after they are combined, unless a plugin says so.
-    apart = DenseViewGradients(per_view, setup.blocks, overwrite=not setup.watchers)
+    apart = DenseViewGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(tuple(records), apart, regular)
 
 
@@ -86,7 +86,7 @@ def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradie
     _backward(torch.stack([view.loss for view in drawn]).sum())
     state.counters.backward_passes += 1
     records = tuple(view.record for view in drawn)
-    total = AccumulatedGradients(_take(state.parameters), setup.blocks, len(records))
+    total = AccumulatedGradients(_take(state.parameters), setup.trained_blocks, len(records))
     return Rendered(records, total, regular)
 
 
@@ -109,7 +109,7 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn
         view=view,
         label=draw.labels[slot] if draw.labels is not None else None,
         loss=value,
-        gaussians=detached(gaussians),
+        gaussians=gaussians.detached(),
         screen=render.screen,
         background=background,
     )
@@ -155,13 +155,6 @@ def model_of(setup: Setup, state: TrainState) -> Model:
         ssim_weight=setup.config.ssim_weight,
         groups=setup.groups,
     )
-
-
-def detached(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians without their graph."""
-    names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
-    tensors = {name: getattr(gaussians, name) for name in names}
-    return replace(gaussians, **{name: t.detach() for name, t in tensors.items() if t is not None})
 
 
 def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Gradients) -> None:
@@ -227,6 +220,6 @@ def _clear(parameters: Mapping[str, Tensor]) -> None:
 
 
 def _take(parameters: Mapping[str, Tensor]) -> Gradients:
-    taken = {name: tensor.grad for name, tensor in parameters.items()}
+    taken = {name: tensor.grad for name, tensor in parameters.items() if tensor.requires_grad}
     _clear(parameters)
     return taken

@@ -100,7 +100,7 @@ class Dispatch(Operator):
             for operator in self._operators().values()
             for reason in inner_objections(selection, operator)
         ]
-        blocks = [block.name for block in selection.backbone.blocks()]
+        blocks = [block.name for block in selection.backbone.trained_blocks()]
         for rule in self.rules:
             if rule.block not in (*_KINDS, *blocks):
                 known = ", ".join((*_KINDS, *blocks))

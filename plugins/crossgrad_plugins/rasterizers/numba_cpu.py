@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.gaussians import Gaussians, Render, Screen
+from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.scene.types import Camera
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
@@ -27,6 +27,7 @@ class NumbaRasterizer(Rasterizer):
     """Draws float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
 
     provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
 
     @override
     def render(

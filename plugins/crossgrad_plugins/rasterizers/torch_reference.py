@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.gaussians import Gaussians, Render, Screen
+from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD, Rasterizer
 from crossgrad_core.scene.types import Camera
 from crossgrad_plugins.rasterizers.reference.compositing import composite_tiles, splat_table
@@ -25,6 +25,7 @@ class TorchRasterizer(Rasterizer):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
 
     @override

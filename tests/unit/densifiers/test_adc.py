@@ -49,6 +49,7 @@ def context(views, *, step, params=None, room=100, rng=0):
         rng=np.random.default_rng(rng),
         parameters=params or parameters(),
         backbone=Vanilla(),
+        rasterizer=None,
         views=tuple(views),
         means_lr=1e-4,
         room=room,

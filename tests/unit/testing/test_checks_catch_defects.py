@@ -309,14 +309,14 @@ class NeedsNeighbours(Vanilla):
 
 
 class Drifts(Vanilla):
-    def bake(self, parameters, phase, camera=None):
+    def bake(self, parameters, phase, cameras):
         parameters["means"].data.add_(1.0)
-        return super().bake(parameters, phase, camera)
+        return super().bake(parameters, phase, cameras)
 
 
 class BakesAGraph(Vanilla):
-    def bake(self, parameters, phase, camera=None):
-        return self.decode(parameters, camera, phase)
+    def bake(self, parameters, phase, cameras):
+        return self.decode(parameters, cameras[0], phase)
 
 
 class OverridesTheUser(Vanilla):

@@ -1,0 +1,194 @@
+"""What the densifiers of the 3DGS family share: clone, split, prune, opacity reset."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import log
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.densifier import Densifier
+from crossgrad_core.splats import rotation_matrices
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows, apply_to_parameters
+
+#: A split divides the scales by this (3DGS).
+SPLIT_SHRINK = 1.6
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Which primitives grow.
+
+    Attributes:
+        clone: [P] bool, to be duplicated in place.
+        split: [P] bool, to be replaced by two smaller ones; none of them is cloned too.
+        strength: [P], how much each asks for it: the strongest go first where room is short.
+    """
+
+    clone: Tensor
+    split: Tensor
+    strength: Tensor
+
+    def limited(self, room: int) -> tuple["Growth", int]:
+        """The strongest `room` of them, and how many were left out."""
+        wanted = self.clone | self.split
+        left_out = max(0, int(wanted.sum()) - room)
+        if left_out == 0:
+            return self, 0
+        ranked = torch.where(wanted, self.strength, torch.full_like(self.strength, -torch.inf))
+        chosen = torch.zeros_like(wanted)
+        chosen[torch.argsort(ranked, descending=True, stable=True)[:room]] = True
+        return replace(self, clone=self.clone & chosen, split=self.split & chosen), left_out
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The new set before pruning: survivors, clones, then first and second children.
+
+    Attributes:
+        source: [M] int64 old index of each new primitive.
+        fresh: [M] bool, clones and children.
+        child: [M] bool, children of a split.
+    """
+
+    source: Tensor
+    fresh: Tensor
+    child: Tensor
+
+    @classmethod
+    def of(cls, growth: Growth) -> "Plan":
+        """The plan of a growth."""
+        stay = (~growth.split).nonzero().squeeze(1)
+        clones = growth.clone.nonzero().squeeze(1)
+        parents = growth.split.nonzero().squeeze(1)
+        source = torch.cat([stay, clones, parents, parents])
+        place = torch.arange(source.shape[0], device=source.device)
+        return cls(source, place >= len(stay), place >= len(stay) + len(clones))
+
+
+class CloneSplit(Densifier):
+    """Grows where a screen statistic asks for it; prunes faint and huge Gaussians.
+
+    A method says which statistics it gathers and which primitives grow; the rest is that of 3DGS.
+    The published rule by screen radius never fires in the original code and is left out.
+    """
+
+    blocks = frozenset({"means", "scales", "quats", "opacities"})
+
+    split_scale: float = Field(0.01, gt=0, description="split above, clone below; scene extents")
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="prune below")
+    prune_scale: float = Field(0.1, gt=0, description="prune above, scene extents")
+    reset_opacity: float = Field(0.01, gt=0, lt=1, description="cap of an opacity reset")
+
+    @abstractmethod
+    def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
+        """The statistics with the views of this step added, view by view in order."""
+
+    @abstractmethod
+    def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
+        """What grows, given the statistics and which primitives are small [P] (to be cloned)."""
+
+    def grown_values(
+        self, context: DensifyContext, state: PluginState, plan: Plan
+    ) -> dict[str, Rows]:
+        """New values of rows of the plan; by default means and scales of the children.
+
+        Source: 3DGS: drawn from the parent's own Gaussian, scales divided by 1.6.
+        """
+        rows = plan.child.nonzero().squeeze(1)
+        parents = plan.source[rows]
+        log_scales = context.parameters["scales"].detach()[parents]
+        offsets = drawn_offsets(context, parents)
+        return {
+            "means": Rows(context.parameters["means"].detach()[parents] + offsets, rows),
+            "scales": Rows(log_scales - log(SPLIT_SHRINK), rows),
+        }
+
+    @override
+    def densify(
+        self, context: DensifyContext, state: PluginState
+    ) -> tuple[Edit | NoEdit, PluginState]:
+        if not context.schedule.collects(context.step):
+            return NO_EDIT, PluginState()
+        state = self.observed(context, state)
+        if context.schedule.densifies(context.step):
+            edit = self._edit(context, state)
+            return edit, _zeroed(state)
+        if context.schedule.resets(context.step):
+            return self._with_reset(context, Edit()), state
+        return NO_EDIT, state
+
+    def _edit(self, context: DensifyContext, state: PluginState) -> Edit:
+        largest = torch.exp(context.parameters["scales"].detach()).amax(dim=1)
+        small = largest <= self.split_scale
+        growth, held_back = self.growth(context, state, small).limited(context.room)
+        plan = Plan.of(growth)
+        values = self.grown_values(context, state, plan) if bool(plan.fresh.any()) else {}
+        keep = ~self._pruned(context, plan, values)
+        counts = {
+            "cloned": int(growth.clone.sum()),
+            "split": int(growth.split.sum()),
+            "pruned": int((~keep).sum()),
+        }
+        edit = Edit()
+        if any(counts.values()):
+            edit = Edit(plan.source[keep], plan.fresh[keep], _compacted(values, keep), counts)
+        if held_back > 0:
+            edit = replace(edit, counts={**edit.counts, "held_back": held_back})
+        resets = context.schedule.resets(context.step)
+        return self._with_reset(context, edit) if resets else edit
+
+    def _pruned(self, context: DensifyContext, plan: Plan, values: Mapping[str, Rows]) -> Tensor:
+        """[M] bool, new primitives that are too faint or too large."""
+        opacities = torch.sigmoid(_planned(context, plan, values, "opacities"))
+        pruned = opacities < self.prune_opacity
+        if context.step > context.schedule.prune_large_from:
+            scales = torch.exp(_planned(context, plan, values, "scales"))
+            pruned |= scales.amax(dim=1) > self.prune_scale
+        return pruned
+
+    def _with_reset(self, context: DensifyContext, edit: Edit) -> Edit:
+        backbone = context.backbone
+        after = apply_to_parameters(edit, backbone.blocks(), context.parameters)
+        capped = backbone.capped_opacities(after, self.reset_opacity)
+        values = {**edit.values, "opacities": Rows(capped)}
+        return replace(edit, values=values, counts={**edit.counts, "reset": capped.shape[0]})
+
+
+def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:
+    """[R, 3] one draw from each parent's Gaussian, relative to its mean."""
+    log_scales = context.parameters["scales"].detach()[parents]
+    draws = context.rng.standard_normal((parents.shape[0], 3)).astype(np.float32)
+    noise = torch.from_numpy(draws).to(log_scales)
+    rotations = rotation_matrices(context.parameters["quats"].detach()[parents])
+    return (rotations @ (torch.exp(log_scales) * noise)[:, :, None]).squeeze(-1)
+
+
+def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], name: str) -> Tensor:
+    """A parameter of the plan's primitives, with its new values."""
+    tensor = context.parameters[name].detach()[plan.source]
+    if name in values:
+        tensor[values[name].rows] = values[name].values
+    return tensor
+
+
+def _compacted(values: Mapping[str, Rows], keep: Tensor) -> dict[str, Rows]:
+    """The values of rows that are kept [M], at their new places."""
+    place = torch.cumsum(keep, 0) - 1
+    compacted = {}
+    for name, each in values.items():
+        rows = torch.arange(len(keep), device=keep.device) if each.rows is None else each.rows
+        kept = keep[rows]
+        compacted[name] = replace(each, values=each.values[kept], rows=place[rows[kept]])
+    return compacted
+
+
+def _zeroed(state: PluginState) -> PluginState:
+    zeros = {name: torch.zeros_like(old) for name, old in state.per_primitive.items()}
+    return PluginState(per_primitive=zeros)
