@@ -2,6 +2,7 @@
 
 from math import isnan
 
+import mpmath
 import numpy as np
 import pytest
 import torch
@@ -16,8 +17,6 @@ from crossgrad_core.stress.suite import made, reference_of, run_suite
 from crossgrad_core.stress.table import as_text, failed, write_csv
 from crossgrad_core.stress.verdict import ExactCase
 from crossgrad_operators.symmetric import Symmetric
-
-mpmath = pytest.importorskip("mpmath")
 
 OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
 #: The same cases with shorter gradients.

@@ -1,16 +1,27 @@
 """Agreement with TorchJD 0.18 on well-scaled Gramians, and the adapter to it."""
 
+from functools import partialmethod
+
+import cvxpy
 import numpy as np
 import pytest
 import torch
+from torchjd import aggregation
+from torchjd.linalg import QuadprogProjector
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import build
 
-aggregation = pytest.importorskip("torchjd.aggregation")
-
 TOLERANCE = 1e-6
 VIEWS = (2, 3, 4, 6)
+#: As far as Clarabel goes. An optimum is flat, so a gap of 1e-8 (the default) leaves 5e-5 in the
+#: weights; shorter steps keep the interior-point method from stalling at the edge.
+TIGHT = {
+    "tol_gap_abs": 1e-15,
+    "tol_gap_rel": 1e-15,
+    "tol_feas": 1e-15,
+    "max_step_fraction": 0.9,
+}
 
 
 def gradients(views, count=20):
@@ -75,26 +86,50 @@ def test_mgda(views, ask):
 
 
 @pytest.mark.parametrize("views", VIEWS)
+def test_mgda_where_every_view_counts(views, ask):
+    """Frank and Wolfe's steps converge fast where the shortest point lies well inside."""
+    theirs = aggregation.MGDAWeighting(epsilon=1e-16, max_iters=1000)
+    compared = 0
+    for rows in gradients(views):
+        found = ask("mgda", rows).weights
+        if found.min() > 0.09:
+            gramian = rows @ rows.T
+            expected = theirs(torch.from_numpy(gramian / np.trace(gramian))).numpy()
+            np.testing.assert_allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE)
+            compared += 1
+    assert compared
+
+
+@pytest.mark.parametrize("views", VIEWS)
 @pytest.mark.parametrize(("name", "weighting"), [("upgrad", "UPGrad"), ("dualproj", "DualProj")])
 def test_cone_projections(name, weighting, views, ask):
-    pytest.importorskip("quadprog")
-    pytest.importorskip("qpsolvers")
-    from torchjd.linalg import QuadprogProjector
-
-    projector = QuadprogProjector(norm_eps=1e-12, reg_eps=1e-12)
+    projector = QuadprogProjector(norm_eps=1e-12, reg_eps=1e-10)
     agree(name, getattr(aggregation, f"{weighting}Weighting")(projector=projector), views, ask)
 
 
 @pytest.mark.parametrize("views", VIEWS)
-def test_cagrad(views, ask):
-    pytest.importorskip("cvxpy")
-    pytest.importorskip("clarabel")
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
+def test_cagrad(views, ask, monkeypatch):
+    """With a tight solver, which warns that it could not get all the way to 1e-15."""
+    solve = partialmethod(cvxpy.Problem.solve, **TIGHT)
+    monkeypatch.setattr(cvxpy.Problem, "solve", solve)
+    agree("cagrad", aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12), views, ask)
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_cagrad_is_never_behind_theirs_as_it_comes(views, ask):
+    """With TorchJD's own solver settings the directions differ by its accuracy, about 6e-5.
+
+    Both stay within c |g_0| of the mean; theirs never serves the worst-off view better.
+    """
     theirs = aggregation.CAGradWeighting(c=0.5, norm_eps=1e-12)
     for rows in gradients(views):
         gramian = rows @ rows.T
         expected = theirs(torch.from_numpy(gramian / np.trace(gramian))).numpy() @ rows
         found = ask("cagrad", rows).result
-        # Their conic solver stops about 5e-5 short of the optimum: never ahead of ours.
+        mean = rows.mean(axis=0)
+        radius = 0.5 * np.linalg.norm(mean)
+        assert np.linalg.norm(found - mean) <= radius * (1 + 1e-12)
         assert (rows @ expected).min() <= (rows @ found).min() + 1e-12 * np.trace(gramian)
         np.testing.assert_allclose(found, expected, atol=2e-4 * np.linalg.norm(expected))
 
