@@ -1,0 +1,51 @@
+"""Errors of float32 against float64 on extreme parameters, as a Markdown table.
+
+    python benchmarks/extremes.py [BACKBONE ...] [--crowd 20000]
+
+Image error: largest difference of a channel of a pixel. Gradient error: largest relative L2 error
+of a parameter tensor. Both of the `numba` rasterizer in float32 against `torch` in float64.
+"""
+
+import argparse
+import json
+from typing import cast
+
+import torch
+from _machine import facts
+
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.extremes import cases, jittered, outcome
+from crossgrad_core.testing.fixtures import sample_camera
+from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
+from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
+
+
+def cell(backbone: Backbone, case: str, crowd: int) -> str:
+    """Image and gradient error of one case."""
+    extreme = cases(crowd)[case](jittered(backbone), sample_camera())
+    exact = outcome(backbone, TorchRasterizer(), extreme, torch.float64)
+    found = outcome(backbone, NumbaRasterizer(), extreme, torch.float32)
+    if not (exact.finite and found.finite):
+        return "not finite"
+    return f"{found.image_error(exact):.0e} / {found.gradient_error(exact):.0e}"
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("backbones", nargs="*", help="names; default: all installed")
+    parser.add_argument("--crowd", type=int, default=20_000)
+    arguments = parser.parse_args()
+    names = arguments.backbones or sorted(entries("backbones"))
+    print("| case | " + " | ".join(names) + " |")
+    print("|" + "---|" * (len(names) + 1))
+    models = [cast("Backbone", build("backbones", name, {})) for name in names]
+    for case in cases(arguments.crowd):
+        cells = [cell(model, case, arguments.crowd) for model in models]
+        print(f"| {case} | " + " | ".join(cells) + " |", flush=True)
+    print(f"\n{json.dumps(facts())}")
+
+
+if __name__ == "__main__":
+    main()
