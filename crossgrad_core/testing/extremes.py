@@ -11,11 +11,9 @@ from torch import Tensor
 
 from crossgrad_core.backbone import Backbone
 from crossgrad_core.blocks import Parameters
-from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.scene.types import Camera
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
-
 
 #: A tensor's gradient shorter than this share of the longest one is the rounding noise of a zero.
 NEGLIGIBLE = 1e-9

@@ -1,0 +1,134 @@
+"""Seconds of a whole training step of each backbone beside vanilla's, as a Markdown table.
+
+    python benchmarks/backbone_cost.py SCENE [--max-size 400] [--steps 400] [--reps 40]
+
+Each backbone is trained for --steps steps. Then one view is trained on again and again: by the
+backbone, and in turn by a vanilla model of exactly the Gaussians that the backbone draws for that
+view. So both draw the same number, and the ratio is taken pairwise, step by step. The first row is
+vanilla beside itself.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import torch
+from _machine import facts
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.scene.types import Scene
+from crossgrad_core.spherical import SH_C0
+from crossgrad_core.threads import configure_threads
+from crossgrad_core.training.assemble import assemble, read_scene
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state, warm_up
+from crossgrad_core.training.state import TrainState
+
+BACKBONES = ("vanilla", "pixel", "mip", "analytic", "distance", "scaffold", "octree")
+#: A step of the published schedule with all SH bands, and far enough from the next edit.
+START = 5001
+REPS_BETWEEN_EDITS = 90
+
+
+def trained(scene: Scene, config: RunConfig, steps: int) -> tuple[Setup, TrainState]:
+    """A backbone after some steps on the whole scene."""
+    setup = assemble(config, scene, "none")
+    warm_up(setup)
+    state = first_state(setup)
+    for _ in range(steps):
+        timed_step(setup, state)
+    return setup, state
+
+
+def on_one_view(setup: Setup, state: TrainState) -> Setup:
+    """The same run on its first training view alone, in the middle of the schedule."""
+    scene = replace(setup.scene, train=setup.scene.train[:1])
+    state.step = START
+    state.states.pop("sampler", None)  # It remembers an order of all views.
+    return replace(setup, scene=scene)
+
+
+def drawn(setup: Setup, state: TrainState) -> Gaussians:
+    """The Gaussians of the one view that touch a pixel."""
+    camera = setup.train_views[0].camera
+    with torch.no_grad():
+        gaussians = setup.backbone.decode(
+            state.parameters, camera, setup.phase(state.step, training=True)
+        )
+        render = setup.rasterizer.render(gaussians, camera, torch.zeros(3))
+    seen = (render.screen.radii > 0).nonzero().squeeze(1)
+    return gaussians.mapped(lambda tensor: tensor[seen])
+
+
+def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
+    """A vanilla state of these Gaussians."""
+    if gaussians.colors is not None:
+        dc = ((gaussians.colors - 0.5) / SH_C0)[:, None, :]
+        gaussians = replace(gaussians, colors=None, sh_dc=dc, sh_rest=None)
+    parameters = setup.backbone.adopt(replace(gaussians, response="plain", dilation=None))
+    state = first_state(setup)
+    state.parameters = {name: t.detach().requires_grad_() for name, t in parameters.items()}
+    state.step = START
+    return state
+
+
+def milliseconds(setup: Setup, state: TrainState) -> float:
+    """One step."""
+    before = state.clock.train
+    timed_step(setup, state)
+    return 1000.0 * (state.clock.train - before)
+
+
+def row(name: str, scene: Scene, vanilla: Setup, arguments: argparse.Namespace) -> str:
+    """One line of the table."""
+    config = vanilla.config.model_copy(
+        update={"backbone": ComponentChoice(name=name), "densifier": None}
+    )
+    setup, state = trained(scene, config, arguments.steps)
+    setup = on_one_view(setup, state)
+    shown = drawn(setup, state)
+    reference = as_vanilla(vanilla, shown)
+    beside = on_one_view(vanilla, reference)
+    for _ in range(3):
+        milliseconds(setup, state), milliseconds(beside, reference)
+    pairs = [
+        (milliseconds(setup, state), milliseconds(beside, reference)) for _ in range(arguments.reps)
+    ]
+    own, plain = (median(values) for values in zip(*pairs, strict=True))
+    ratio = median(mine / theirs for mine, theirs in pairs)
+    count = state.primitives(setup)
+    return f"| {name} | {len(shown):,} | {count:,} | {own:.1f} | {plain:.1f} | {ratio:.2f} |"
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--backbones", nargs="+", default=list(BACKBONES))
+    parser.add_argument("--max-size", type=int, default=400)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--reps", type=int, default=40)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    if arguments.reps > REPS_BETWEEN_EDITS:
+        parser.error(f"--reps must be at most {REPS_BETWEEN_EDITS}")
+    configure_threads(arguments.threads)
+    config = RunConfig.model_validate(
+        {"reading": {"max_size": arguments.max_size}, "sampler": {"name": "epoch"}}
+    )
+    scene, _ = read_scene(config, arguments.scene)
+    vanilla = assemble(config, scene, "none")
+    warm_up(vanilla)
+    print("| backbone | drawn | primitives | ms | vanilla, ms | ratio |")
+    print("|---|---|---|---|---|---|")
+    for name in arguments.backbones:
+        print(row(name, scene, vanilla, arguments), flush=True)
+    print(f"\n{arguments.scene.name} at {arguments.max_size} px, {json.dumps(facts())}")
+
+
+if __name__ == "__main__":
+    main()
