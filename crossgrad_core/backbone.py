@@ -54,7 +54,7 @@ class Backbone(Component):
         """
         return self, ()
 
-    def adopt(self, gaussians: Gaussians) -> Parameters:
+    def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
         """Initial parameters from existing Gaussians (`--init FILE.ply`), float32 on the CPU.
 
         Raises:

@@ -96,7 +96,7 @@ class Vanilla(Backbone):
         return self._with_rest(tensors, count)
 
     @override
-    def adopt(self, gaussians: Gaussians) -> Parameters:
+    def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
         if gaussians.sh_dc is None:
             raise ValueError("only spherical-harmonics Gaussians can be adopted")
         opacities = gaussians.opacities.clamp(1e-6, 1.0 - 1e-6)

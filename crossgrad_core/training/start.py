@@ -55,7 +55,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
     from crossgrad_core.ply import read_ply
 
     cloud = read_ply(Path(init)).to_local(setup.scene.similarity)
-    return setup.backbone.adopt(cloud.to_gaussians())
+    return setup.backbone.adopt(cloud.to_gaussians(), setup.scene, rng)
 
 
 def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:

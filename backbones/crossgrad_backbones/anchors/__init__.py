@@ -1,0 +1,1 @@
+"""Anchors that carry neural Gaussians: what the backbones of the Scaffold-GS family share."""

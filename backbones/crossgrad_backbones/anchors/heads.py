@@ -1,0 +1,126 @@
+"""What the networks say about the Gaussians of the anchors that a camera sees."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.nn.functional import linear, pad
+
+from crossgrad_backbones.anchors.networks import DIRECTION, Network
+
+#: Strides at which the feature bank reads the feature, from coarse to fine.
+BANK_STRIDES = (4, 2, 1)
+#: Numbers of a Gaussian's covariance: 3 scales and a quaternion wxyz.
+COVARIANCE = 7
+_CHANNELS = 3
+
+
+@dataclass(frozen=True)
+class Raw:
+    """Outputs of the networks for A anchors of k Gaussians each, before their activations.
+
+    Attributes:
+        opacities: [A, k].
+        covariances: [A, 7 k], per Gaussian 3 scales and a quaternion wxyz.
+        colors: [A, 3 k].
+    """
+
+    opacities: Tensor
+    covariances: Tensor
+    colors: Tensor
+
+
+@dataclass(frozen=True)
+class Heads:
+    """The networks that turn an anchor's feature and the view of it into its Gaussians.
+
+    Attributes:
+        offsets: k, Gaussians of an anchor.
+        feature: Width F of the feature and of the hidden layers.
+        far: Whether the networks of opacity, covariance and colour take the distance too.
+        code: Width of the appearance code, which the colour takes too; 0 without.
+        banked: Whether a feature bank mixes the feature at three strides by direction and distance.
+    """
+
+    offsets: int
+    feature: int
+    far: tuple[bool, bool, bool]
+    code: int
+    banked: bool
+
+    @cached_property
+    def networks(self) -> tuple[Network, ...]:
+        """Those of opacity, covariance and colour, then the feature bank's if there is one."""
+        outputs = (self.offsets, COVARIANCE * self.offsets, _CHANNELS * self.offsets)
+        codes = (0, 0, self.code)
+        three = tuple(
+            Network(name, self.feature + DIRECTION + far + code, self.feature, width)
+            for name, far, code, width in zip(
+                ("mlp_opacity", "mlp_cov", "mlp_color"), self.far, codes, outputs, strict=True
+            )
+        )
+        bank = Network("mlp_bank", DIRECTION + 1, self.feature, len(BANK_STRIDES))
+        return (*three, bank) if self.banked else three
+
+    def raw(
+        self,
+        parameters: Mapping[str, Tensor],
+        features: Tensor,
+        offset: Tensor,
+        code: Tensor | None = None,
+    ) -> Raw:
+        """Evaluates the networks.
+
+        Args:
+            parameters: The parameters, with the tensors of all networks.
+            features: [A, F] of the anchors.
+            offset: [A, 3] from the camera to each anchor, local units.
+            code: [C] appearance code; None without.
+
+        Source: Scaffold-GS, section 3.2; methods of section 2.2.
+        """
+        distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
+        # An anchor in the very centre of the camera has no direction.
+        direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
+        if self.banked:
+            seen = torch.cat([direction, distance], 1)
+            features = _mixed(features, _evaluated(self.networks[-1], parameters, seen))
+        inputs = (features, direction, distance) if any(self.far) else (features, direction)
+        hidden = self._hidden(parameters, torch.cat(inputs, 1), code)
+        opacities, covariances, colors = (
+            linear(each, *network.layers(parameters)[2:])
+            for network, each in zip(self.networks[:3], hidden, strict=True)
+        )
+        return Raw(opacities, covariances, colors)
+
+    def _hidden(
+        self, parameters: Mapping[str, Tensor], inputs: Tensor, code: Tensor | None
+    ) -> tuple[Tensor, ...]:
+        """[A, F] hidden layers of the three networks, from one product."""
+        weights, biases = [], []
+        for network, far in zip(self.networks[:3], self.far, strict=True):
+            weight, bias, _, _ = network.layers(parameters)
+            if code is not None and network.name == "mlp_color":
+                # The code is the same for all anchors: a part of the bias.
+                bias = torch.addmv(bias, weight[:, -self.code :], code)
+                weight = weight[:, : -self.code]
+            if any(self.far) and not far:
+                weight = pad(weight, (0, 1))
+            weights.append(weight)
+            biases.append(bias)
+        hidden = linear(inputs, torch.cat(weights), torch.cat(biases)).relu_()
+        return torch.split(hidden, self.feature, 1)
+
+
+def _evaluated(network: Network, parameters: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
+    first, first_bias, second, second_bias = network.layers(parameters)
+    return linear(linear(inputs, first, first_bias).relu_(), second, second_bias)
+
+
+def _mixed(features: Tensor, scores: Tensor) -> Tensor:
+    """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
+    shares = torch.softmax(scores, 1)
+    read = [features[:, ::stride].repeat(1, stride) for stride in BANK_STRIDES]
+    return shares[:, :1] * read[0] + shares[:, 1:2] * read[1] + shares[:, 2:] * read[2]
