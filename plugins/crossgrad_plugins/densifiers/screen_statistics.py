@@ -27,6 +27,11 @@ def ndc_abs_gradient(record: ViewRecord) -> Tensor:
     return gradient * half_size(record, gradient)
 
 
+def pixels(record: ViewRecord) -> Tensor:
+    """[N] number of pixels in which the Gaussian was blended, as floating-point numbers."""
+    return _present(record.screen.pixels).to(record.gaussians.means)
+
+
 def visible(record: ViewRecord) -> Tensor:
     """[N] 1 where the Gaussian touched a pixel, else 0."""
     return (record.screen.radii > 0).to(record.gaussians.means)

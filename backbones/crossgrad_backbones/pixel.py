@@ -1,0 +1,14 @@
+"""Pixel-GS: the Gaussians of 3DGS with density control by pixels (Zhang et al. 2024)."""
+
+from typing import ClassVar
+
+from crossgrad_backbones.vanilla import Vanilla
+
+
+class PixelGS(Vanilla):
+    """The 3DGS representation; densifier `pixel` unless another one is named.
+
+    Source: Pixel-GS, which changes nothing but the densification statistic.
+    """
+
+    default_densifier: ClassVar[str] = "pixel"

@@ -1,0 +1,87 @@
+"""Density control by absolute screen gradients (AbsGS, Ye et al. 2024, arXiv 2404.10484)."""
+
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.state import PluginState
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
+from crossgrad_plugins.densifiers.screen_statistics import (
+    add,
+    mean,
+    ndc_abs_gradient,
+    ndc_gradient,
+    sums,
+    visible,
+)
+
+
+class AbsGradDensityControl(CloneSplit):
+    """Adaptive density control that pixels pulling in opposite directions cannot hide from.
+
+    Beside the norm g of the projected mean's gradient, the pixels' absolute gradients are summed,
+    x and y apart, and their norm ga is averaged over the renders in which the Gaussian was visible.
+    Criteria: `abs` clones by g and splits by ga (AbsGS); `gsplat` clones and splits by ga alone;
+    `quantile` clones and splits where g is large enough, or ga among the largest of as many
+    Gaussians, with the 1-norm in place of the 2-norm (Mip-Splatting's code).
+    """
+
+    needs = frozenset({"abs_gradient"})
+
+    criterion: Literal["abs", "gsplat", "quantile"] = Field(
+        "abs", description="which statistic clones and which splits: abs, gsplat or quantile"
+    )
+    grad_threshold: float = Field(2e-4, gt=0, description="of g: abs (clones) and quantile")
+    abs_threshold: float = Field(4e-4, gt=0, description="of ga: abs (splits)")
+    gsplat_threshold: float = Field(8e-4, gt=0, description="of ga: gsplat (clones and splits)")
+
+    @override
+    def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
+        totals = sums(context, state, ("gradient", "absolute", "renders"))
+        order = 1 if self.criterion == "quantile" else 2
+        for record in context.views:
+            seen = visible(record)
+            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
+            absolute = torch.linalg.vector_norm(ndc_abs_gradient(record), ord=order, dim=1)
+            add(record, totals["gradient"], norms * seen)
+            add(record, totals["absolute"], absolute * seen)
+            add(record, totals["renders"], seen)
+        return PluginState(per_primitive=totals)
+
+    @override
+    def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
+        gradient = mean(state.per_primitive, "gradient", "renders")
+        absolute = mean(state.per_primitive, "absolute", "renders")
+        if self.criterion == "abs":
+            clones = gradient >= self.grad_threshold
+            splits = absolute >= self.abs_threshold
+        elif self.criterion == "gsplat":
+            clones = splits = absolute >= self.gsplat_threshold
+        else:
+            clones = splits = self._by_quantile(gradient, absolute)
+        return Growth(clone=clones & small, split=splits & ~small, strength=absolute)
+
+    def _by_quantile(self, gradient: Tensor, absolute: Tensor) -> Tensor:
+        """[P] bool, g >= threshold, or ga >= its (1 - rho) quantile, rho the share of the first.
+
+        Where rho is 0 nothing grows, and what was never seen (ga = 0) does not grow either.
+        """
+        moves = gradient >= self.grad_threshold
+        if not bool(moves.any()):
+            return moves
+        share = float(moves.double().mean())
+        among_largest = absolute >= quantile(absolute, 1.0 - share)
+        return moves | (among_largest & (absolute > 0))
+
+
+def quantile(values: Tensor, share: float) -> Tensor:
+    """The quantile of `values` [P > 0] by linear interpolation; torch's own takes at most 2^24."""
+    ordered = values.sort().values
+    place = share * (len(ordered) - 1)
+    below = int(place)
+    above = min(below + 1, len(ordered) - 1)
+    return torch.lerp(ordered[below], ordered[above], place - below)

@@ -1,0 +1,53 @@
+"""Density control of Pixel-GS (Zhang et al. 2024, arXiv 2403.15530)."""
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext, ViewRecord
+from crossgrad_core.state import PluginState
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
+from crossgrad_plugins.densifiers.screen_statistics import add, mean, ndc_gradient, pixels, sums
+
+
+class PixelDensityControl(CloneSplit):
+    """Adaptive density control whose statistic is weighted by pixels and scaled by depth.
+
+    A render in which a Gaussian fills many pixels counts for more: the statistic is
+    sum(m f |g|) / sum(m) with m the pixels in which it was blended, g the NDC gradient of its
+    projected mean and f = min(1, (z / depth_threshold)^2), which holds back what floats in front of
+    a camera (z is the depth of its centre). Only this statistic is scaled, never the gradients that
+    train. Source: Pixel-GS.
+    """
+
+    needs = frozenset({"pixels"})
+
+    grad_threshold: float = Field(2e-4, gt=0, description="scaled NDC gradient to densify at")
+    depth_threshold: float = Field(
+        0.37, gt=0, description="Gaussians nearer to the camera count for less; scene extents"
+    )
+
+    @override
+    def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
+        totals = sums(context, state, ("gradient", "pixels"))
+        for record in context.views:
+            weights = pixels(record)
+            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
+            add(record, totals["gradient"], weights * self._nearness(record) * norms)
+            add(record, totals["pixels"], weights)
+        return PluginState(per_primitive=totals)
+
+    def _nearness(self, record: ViewRecord) -> Tensor:
+        """[N] in [0, 1], the factor f of each Gaussian in this view."""
+        means = record.gaussians.means
+        pose = record.view.camera.world_to_camera.to(means)
+        depths = means @ pose[2, :3] + pose[2, 3]
+        # The unit of the local frame is the extent of the training cameras.
+        return (depths / self.depth_threshold).square().clamp(max=1.0)
+
+    @override
+    def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
+        gradient = mean(state.per_primitive, "gradient", "pixels")
+        grows = gradient >= self.grad_threshold
+        return Growth(clone=grows & small, split=grows & ~small, strength=gradient)
