@@ -5,12 +5,15 @@ from types import SimpleNamespace
 import pytest
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.registry import build
 from crossgrad_core.training.start import _fitting
 
 
 def setup(densifier="adc"):
     return SimpleNamespace(
-        config=RunConfig(), selection=SimpleNamespace(names={"densifier": densifier})
+        config=RunConfig(),
+        densifier=build("densifiers", densifier, {}),
+        selection=SimpleNamespace(names={"densifier": densifier}),
     )
 
 
