@@ -16,6 +16,23 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    Lanes,
+    bits,
+    broadcast,
+    fma,
+    fnma,
+    larger,
+    magnitude,
+    ramp,
+    round_down,
+    round_up,
+    smaller,
+    splat,
+    store,
+    where,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.constants import exp2
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
@@ -34,23 +51,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     U_WHOLE,
     V_PART,
     V_WHOLE,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    Lanes,
-    bits,
-    broadcast,
-    fma,
-    fnma,
-    larger,
-    magnitude,
-    ramp,
-    round_down,
-    round_up,
-    smaller,
-    splat,
-    store,
-    where,
 )
 
 LINEAR, CUBIC = 1.6, 0.07

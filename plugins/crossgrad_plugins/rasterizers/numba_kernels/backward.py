@@ -13,6 +13,23 @@ final transmittance; the accumulated depth is one more colour channel.
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    broadcast,
+    fma,
+    fnma,
+    load,
+    lowest_bit,
+    magnitude,
+    prefetch,
+    prefetch_write,
+    smaller,
+    splat,
+    store,
+    sums,
+    total,
+    where,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     axis_offsets,
     coverages,
@@ -61,23 +78,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SUM_DEPTH,
     TILE_HEIGHT,
     TILE_WIDTH,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    broadcast,
-    fma,
-    fnma,
-    load,
-    lowest_bit,
-    magnitude,
-    prefetch,
-    prefetch_write,
-    smaller,
-    splat,
-    store,
-    sums,
-    total,
-    where,
 )
 
 #: Entries whose row buffers are filled before the first of them is processed.

@@ -7,6 +7,23 @@ consecutive slots; the tile lists are then filled in the order of depth.
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    Lanes,
+    broadcast,
+    fma,
+    fnma,
+    larger,
+    prefetch,
+    ramp,
+    round_down,
+    round_up,
+    smaller,
+    splat,
+    square_root,
+    store,
+    where,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
@@ -24,23 +41,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
     WIDTH,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    Lanes,
-    broadcast,
-    fma,
-    fnma,
-    larger,
-    prefetch,
-    ramp,
-    round_down,
-    round_up,
-    smaller,
-    splat,
-    square_root,
-    store,
-    where,
 )
 
 #: Parts into which the chunks are divided for counting; fixed, so as not to depend on the threads.

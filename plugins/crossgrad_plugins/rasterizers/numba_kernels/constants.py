@@ -10,6 +10,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    Lanes,
+    fma,
+    load,
+    scale_by_power,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
@@ -17,13 +24,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SEGMENT,
     STOP,
     TOUCH,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    Lanes,
-    fma,
-    load,
-    scale_by_power,
 )
 
 # 2**f on [-1/2, 1/2] by rising power: least largest relative error (9e-8) with 2**0 exact.

@@ -3,6 +3,19 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    bits,
+    broadcast,
+    fma,
+    fnma,
+    ramp,
+    round_down,
+    round_up,
+    splat,
+    square_root,
+    store,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
@@ -18,19 +31,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
     WIDTH,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    bits,
-    broadcast,
-    fma,
-    fnma,
-    ramp,
-    round_down,
-    round_up,
-    splat,
-    square_root,
-    store,
 )
 
 #: Row buffer of one Gaussian: centre of each row, its largest exponent, its dy.

@@ -3,6 +3,22 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.simd import (
+    LANES,
+    as_negative,
+    bits,
+    broadcast,
+    count_bits,
+    fma,
+    fnma,
+    load,
+    lowest_bit,
+    prefetch,
+    smaller,
+    splat,
+    store,
+    where,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     axis_offsets,
     coverages,
@@ -35,22 +51,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SEGMENTS,
     TILE_HEIGHT,
     TILE_WIDTH,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.simd import (
-    LANES,
-    as_negative,
-    bits,
-    broadcast,
-    count_bits,
-    fma,
-    fnma,
-    load,
-    lowest_bit,
-    prefetch,
-    smaller,
-    splat,
-    store,
-    where,
 )
 
 #: Entries whose reach is computed before any of them is blended: hides the latency of their

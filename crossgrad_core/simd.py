@@ -12,7 +12,7 @@ Everything below exists only inside compiled kernels; `Lanes` and `Mask` are ann
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from llvmlite import ir
@@ -50,12 +50,12 @@ class Lanes(Protocol):
 
 class _LanesType(types.Type):
     def __init__(self) -> None:
-        super().__init__(name="Lanes")
+        cast("Any", super()).__init__(name="Lanes")
 
 
 class _MaskType(types.Type):
     def __init__(self) -> None:
-        super().__init__(name="Mask")
+        cast("Any", super()).__init__(name="Mask")
 
 
 _lanes, _mask = _LanesType(), _MaskType()
@@ -64,13 +64,13 @@ _lanes, _mask = _LanesType(), _MaskType()
 @register_model(_LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, _FLOATS)
+        cast("Any", super()).__init__(manager, numba_type, _FLOATS)
 
 
 @register_model(_MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, _FLAGS)
+        cast("Any", super()).__init__(manager, numba_type, _FLAGS)
 
 
 class _Site(NamedTuple):
