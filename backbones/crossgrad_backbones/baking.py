@@ -1,0 +1,77 @@
+"""Gaussians of another pixel response as plain ones, for files that viewers draw the 3DGS way."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from crossgrad_backbones.visibility import columns_of, depths_in_view, finest_pixels
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.scene.types import Camera
+from crossgrad_core.splats import rotation_matrices
+
+#: What viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
+FILE_DILATION = 0.3
+#: A variance keeps at least this share of itself.
+FLOOR = 1e-4
+
+
+@torch.no_grad()
+def as_plain(
+    gaussians: Gaussians, cameras: Sequence[Camera], blur: float, near: float
+) -> Gaussians:
+    """Gaussians that look, drawn plainly, as the given ones do with their own response.
+
+    A response adds the variance `blur` to the 2-D covariance S and keeps the volume, that is
+    opacity times sqrt(det S). Of the dilation of a viewer, the surplus over `blur` is taken off the
+    3-D variances beforehand; at depth z a pixel is z / f local units wide. With S' for what is left
+    of S, the opacity is multiplied by the ratio of footprints, sqrt(det S / det(S' + dilation)).
+
+    Of several cameras the one that sees a Gaussian finest decides. Means over the cameras thin out
+    and fade what is near to some and far from others: on boruszyn_kap (24 views, two regimes) they
+    cost 0.9 dB, this rule nothing. What no camera sees stays as it is.
+
+    Args:
+        gaussians: Gaussians of another response.
+        cameras: One or more.
+        blur: px^2.
+        near: Near plane, local units.
+    """
+    means, scales = gaussians.means.double(), gaussians.scales.double()
+    pixels = finest_pixels(means, cameras, near)
+    seen = pixels.isfinite()
+    surplus = (FILE_DILATION - blur) * pixels.masked_fill(~seen, 0.0).square()[:, None]
+    left = torch.maximum(scales.square() - surplus, FLOOR * scales.square()).sqrt()
+    axes = rotation_matrices(gaussians.quats.double())
+    ratios = (~seen).to(means)
+    for camera in cameras:
+        rows = depths_in_view(columns_of(means), camera, near)[1].nonzero().squeeze(1)
+        u, v = _projected(axes[rows], means[rows], camera)
+        live = _determinant(u, v, scales[rows], 0.0)
+        drawn = _determinant(u, v, left[rows], FILE_DILATION)
+        ratios[rows] = torch.maximum(ratios[rows], (live / drawn).sqrt())
+    return replace(
+        gaussians,
+        scales=left.to(gaussians.scales),
+        opacities=(gaussians.opacities * ratios.to(gaussians.opacities)).clamp(0.0, 1.0),
+        response="plain",
+        dilation=None,
+    )
+
+
+def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixels right and down [N, 3] per local unit along each of the main axes [N, 3, 3]."""
+    pose = camera.world_to_camera.to(means)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)
+    row_u = camera.fx / z * (pose[0, :3] - x / z * pose[2, :3])
+    row_v = camera.fy / z * (pose[1, :3] - y / z * pose[2, :3])
+    return (row_u[:, None] @ axes)[:, 0], (row_v[:, None] @ axes)[:, 0]
+
+
+def _determinant(u: Tensor, v: Tensor, scales: Tensor, dilation: float) -> Tensor:
+    """[N] determinant of the 2-D covariance with `dilation` added to its diagonal, px^4."""
+    u, v = u * scales, v * scales
+    trace = u.square().sum(1) + v.square().sum(1)
+    det: Tensor = torch.linalg.cross(u, v).square().sum(1) + dilation * trace + dilation**2
+    return det

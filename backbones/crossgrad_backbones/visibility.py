@@ -1,0 +1,70 @@
+"""Which Gaussians cameras see, by their centres, and how finely."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.scene.types import Camera
+
+#: A centre counts as seen in the image and this share of its extent beyond each border.
+MARGIN = 0.15
+#: ... and if it is farther from the camera than this, local units: the rasterizers' default.
+NEAR = 1e-3
+
+
+def columns_of(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z [N] of means [N, 3], each contiguous, without a graph."""
+    x, y, z = means.detach().T.contiguous().unbind(0)
+    return x, y, z
+
+
+def depths_in_view(
+    columns: tuple[Tensor, Tensor, Tensor], camera: Camera, near: float
+) -> tuple[Tensor, Tensor]:
+    """Camera depth of each centre, and whether the camera sees it.
+
+    Args:
+        columns: x, y and z [N], local frame, of `columns_of`.
+        camera: The camera.
+        near: Centres must be farther than this depth, local units.
+
+    Returns:
+        Depths [N] and seen [N] bool: in front, and projected into the image enlarged by `MARGIN`
+        of its size on every side.
+    """
+    pose = camera.world_to_camera[:3]
+    # The border as a slope: |f x / z + c - size / 2| <= (0.5 + MARGIN) size, times z.
+    half_width, half_height = ((0.5 + MARGIN) * size for size in (camera.width, camera.height))
+    shift_x, shift_y = camera.cx - camera.width / 2, camera.cy - camera.height / 2
+    across = _affine(columns, (camera.fx * pose[0] + shift_x * pose[2]) / half_width)
+    down = _affine(columns, (camera.fy * pose[1] + shift_y * pose[2]) / half_height)
+    depths = _affine(columns, pose[2])
+    reached = torch.maximum(across.abs_(), down.abs_()).clamp_(min=near)
+    return depths, (reached <= depths) & (depths > near)
+
+
+def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
+    """[N] one coordinate of moved points.
+
+    Element by element: a matrix product may round a row differently at another place, and what is
+    derived from a primitive must not change when others come and go.
+    """
+    x, y, z = columns
+    a, b, c, d = row.tolist()
+    result: Tensor = (x * a).add_(y * b).add_(z * c).add_(d)
+    return result
+
+
+def finest_pixels(means: Tensor, cameras: Sequence[Camera], near: float) -> Tensor:
+    """[N] z / f of the camera that sees each of means [N, 3] finest, local units per pixel.
+
+    Infinite where no camera sees a mean.
+    """
+    columns = columns_of(means)
+    finest = torch.full_like(columns[0], torch.inf)
+    for camera in cameras:
+        depths, seen = depths_in_view(columns, camera, near)
+        pixels = depths.div_(camera.fx).masked_fill_(~seen, torch.inf)
+        torch.minimum(finest, pixels, out=finest)
+    return finest
