@@ -13,7 +13,10 @@ from crossgrad_core.training.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.training.start import first_state
 
 #: Options with which each densifier edits the small scene of the tests.
-OPTIONS = {"mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4}}
+OPTIONS = {
+    "mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4},
+    "revising": {"growth_budget": 0.1, "error_threshold": 0.01, "views": 3},
+}
 
 
 @pytest.mark.parametrize("name", OPTIONS)

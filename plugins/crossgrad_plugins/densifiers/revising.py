@@ -1,0 +1,93 @@
+"""Revising Densification: growth where the picture errs (Rota Bulò et al. 2024, 2404.06109)."""
+
+from dataclasses import replace
+from math import log
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import Edit, NoEdit, Rows, apply_to_parameters
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
+from crossgrad_plugins.densifiers.error_share import ErrorKind, largest_shares, spread_views
+
+#: Density control ends after 27,000 of 30,000 steps (published).
+LAST_EDIT_SHARE = 27 / 30
+#: Opacities are not lowered below this.
+LEAST_OPACITY = 1e-6
+#: Logits below this are those of opacities that halve to float32's rounding.
+_FAINT = -15.0
+
+
+class RevisingDensification(CloneSplit):
+    """Clones and splits the Gaussians that have the largest share in the error of some view.
+
+    The share is measured when an edit is due, with the current parameters, over views that are
+    spread over the training views. Clones and children share their opacity, and instead of
+    opacity resets all opacities are lowered a little at every edit.
+    """
+
+    error: ErrorKind = Field("ssim", description="error of a pixel: ssim (1 - SSIM) or l1")
+    error_threshold: float = Field(0.1, gt=0, description="share of the error to grow at, pixels")
+    growth_budget: float = Field(0.05, gt=0, le=1, description="most growth per edit, share")
+    views: int = Field(32, ge=1, description="training views that are measured per edit, at most")
+    opacity_decrease: float = Field(
+        0.001, ge=0, lt=1, description="taken off all opacities per edit; 0 resets them instead"
+    )
+
+    @override
+    def window(self, schedule: Schedule) -> Schedule:
+        until = round(LAST_EDIT_SHARE * schedule.lr_steps)
+        resets = schedule.reset_every if self.opacity_decrease == 0 else None
+        return replace(schedule, densify_until=until, reset_every=resets)
+
+    @override
+    def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
+        return state
+
+    @override
+    def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
+        views = spread_views(len(context.scene.train_views), self.views, context.rng)
+        share = largest_shares(context, views, self.error)
+        grows = share >= self.error_threshold
+        growth = Growth(clone=grows & small, split=grows & ~small, strength=share)
+        return growth.limited(int(self.growth_budget * share.shape[0]))[0]
+
+    @override
+    def grown_values(
+        self, context: DensifyContext, state: PluginState, plan: Plan
+    ) -> dict[str, Rows]:
+        copies = torch.bincount(plan.source, minlength=context.parameters["opacities"].shape[0])
+        rows = (copies > 1)[plan.source].nonzero().squeeze(1)
+        shared = halved_logits(context.parameters["opacities"].detach()[plan.source[rows]])
+        return {**super().grown_values(context, state, plan), "opacities": Rows(shared, rows)}
+
+    @override
+    def densify(
+        self, context: DensifyContext, state: PluginState
+    ) -> tuple[Edit | NoEdit, PluginState]:
+        edit, state = super().densify(context, state)
+        if self.opacity_decrease == 0 or isinstance(edit, NoEdit):
+            return edit, state
+        blocks = tuple(b for b in context.backbone.blocks() if "opacities" in b.tensors)
+        logits = apply_to_parameters(edit, blocks, context.parameters)["opacities"].detach()
+        lowered = Rows(lowered_logits(logits, self.opacity_decrease), keep_moments=True)
+        return replace(edit, values={**edit.values, "opacities": lowered}), state
+
+
+def halved_logits(logits: Tensor) -> Tensor:
+    """Logits [R] of o' = 1 - sqrt(1 - o): two such copies are together as opaque as one."""
+    transparency = logsigmoid(-logits) / 2  # log of sqrt(1 - o)
+    shared = torch.log(-torch.expm1(transparency)) - transparency
+    return torch.where(logits < _FAINT, logits - log(2.0), shared)
+
+
+def lowered_logits(logits: Tensor, decrease: float) -> Tensor:
+    """Logits [P] of opacities less `decrease`; nothing is raised to the least opacity."""
+    lowered = (torch.sigmoid(logits) - decrease).clamp(min=LEAST_OPACITY)
+    return torch.minimum(logits, torch.logit(lowered))
