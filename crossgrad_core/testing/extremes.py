@@ -95,8 +95,10 @@ def on_the_camera_plane(parameters: Parameters, camera: Camera) -> Extreme:
 
 
 def crowded_pixel(parameters: Parameters, camera: Camera, crowd: int) -> Extreme:
-    """A crowd of primitives, faint ones, are in one pixel of a picture of 4 x 4."""
+    """A crowd of Gaussians, faint ones, is in one pixel of a picture of 4 x 4."""
     count = parameters[positions(parameters)].shape[0]
+    if "offsets" in parameters:
+        crowd //= parameters["offsets"].shape[1]
     many = _rows(parameters, torch.arange(crowd) % count)
     name = positions(many)
     share = torch.arange(crowd, dtype=torch.float64)[:, None] / crowd
@@ -111,7 +113,7 @@ def crowded_pixel(parameters: Parameters, camera: Camera, crowd: int) -> Extreme
 
 
 def cases(crowd: int) -> dict[str, Case]:
-    """All extremes by name, with so many primitives in the crowded pixel."""
+    """All extremes by name, with so many Gaussians in the crowded pixel."""
     return {
         "one primitive": one_primitive,
         "nothing visible": all_behind,

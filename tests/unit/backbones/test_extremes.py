@@ -14,7 +14,7 @@ OURS = sorted(e.name for e in offers("backbones") if e.distribution == "crossgra
 IMAGE, GRADIENT = 2e-5, 2e-3
 
 
-def extreme(name, backbone, crowd=20_000):
+def extreme(name, backbone, crowd=5_000):
     return cases(crowd)[name](jittered(backbone), sample_camera())
 
 
