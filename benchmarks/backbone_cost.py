@@ -69,8 +69,9 @@ def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
     if gaussians.colors is not None:
         dc = ((gaussians.colors - 0.5) / SH_C0)[:, None, :]
         gaussians = replace(gaussians, colors=None, sh_dc=dc, sh_rest=None)
-    parameters = setup.backbone.adopt(replace(gaussians, response="plain", dilation=None))
     state = first_state(setup)
+    plain = replace(gaussians, response="plain", dilation=None)
+    parameters = setup.backbone.adopt(plain, setup.scene, state.rngs["create"])
     state.parameters = {name: t.detach().requires_grad_() for name, t in parameters.items()}
     state.step = START
     return state

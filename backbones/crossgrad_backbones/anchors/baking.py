@@ -100,7 +100,8 @@ def _looks(
     """Opacities [A, k], 0 where nothing is drawn, and scales, unit quaternions, colours."""
     positions = parameters["anchors"][seen.rows]
     features = parameters["features"][seen.rows]
-    raw = heads.raw(parameters, features, positions - camera.center.to(positions), code)
+    views = heads.views(positions - camera.center.to(positions))
+    raw = heads.raw(parameters, features, views, code)
     opacities = torch.tanh(raw.opacities).clamp(min=0.0)
     if seen.factor is not None:
         opacities *= seen.factor[:, None]

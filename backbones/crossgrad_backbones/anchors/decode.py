@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.anchors.activation import Seen, activated
+from crossgrad_backbones.anchors.fused_decode.data import View
+from crossgrad_backbones.anchors.fused_decode.function import gaussians_of
 from crossgrad_backbones.anchors.heads import Heads
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.scene.types import Camera
@@ -34,13 +36,46 @@ def decoded(
         are left out.
     """
     positions = parameters["anchors"]
-    eye = camera.center.to(positions)
-    raw = heads.raw(
-        parameters,
-        parameters["features"].index_select(0, seen.rows),
-        positions.index_select(0, seen.rows) - eye,
-        code,
-    )
-    gaussians = activated(raw, positions, parameters["offsets"], parameters["scales"], seen)
+    views = heads.views(positions.index_select(0, seen.rows) - camera.center.to(positions))
+    decode = _fused if _fusible(parameters) else _plain
+    gaussians = decode(heads, parameters, seen, views, code)
     mask = torch.zeros(positions.shape[0], dtype=torch.bool, device=positions.device)
     return replace(gaussians, decoded=mask.index_fill_(0, seen.rows, value=True))
+
+
+def _fusible(parameters: Mapping[str, Tensor]) -> bool:
+    """Whether the fused decoding can be used: float32 on the CPU, and anchors that stay."""
+    names = ("anchors", "offsets", "features", "scales")
+    tensors = [parameters[name] for name in names]
+    plain = all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)
+    return plain and not parameters["anchors"].requires_grad
+
+
+def _plain(
+    heads: Heads,
+    parameters: Mapping[str, Tensor],
+    seen: Seen,
+    views: Tensor,
+    code: Tensor | None,
+) -> Gaussians:
+    features = parameters["features"].index_select(0, seen.rows)
+    raw = heads.raw(parameters, features, views, code)
+    positions, offsets, scales = (parameters[name] for name in ("anchors", "offsets", "scales"))
+    return activated(raw, positions, offsets, scales, seen)
+
+
+def _fused(
+    heads: Heads,
+    parameters: Mapping[str, Tensor],
+    seen: Seen,
+    views: Tensor,
+    code: Tensor | None,
+) -> Gaussians:
+    features, rows = parameters["features"], seen.rows
+    if heads.banked:
+        features = heads.mixed(parameters, features.index_select(0, rows), views)
+        rows = torch.arange(len(rows))
+    view = View(parameters["anchors"], seen.rows, seen.factor, heads.inputs(views), rows)
+    layers = [heads.first_layers(parameters, code), *heads.second_layers(parameters)]
+    tensors = (features, parameters["offsets"], parameters["scales"])
+    return gaussians_of(view, *tensors, *(each for layer in layers for each in layer))

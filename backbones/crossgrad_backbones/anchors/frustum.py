@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,10 +10,9 @@ from crossgrad_core.rasterizer import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.scene.types import Camera
 
 #: Near plane and dilation (px^2) of the filter: the defaults of the rasterizers.
-NEAR = 1e-3
-DILATION = 0.3
+NEAR, DILATION = 1e-3, 0.3
 #: Standard deviations at which an opaque Gaussian falls below the alpha threshold.
-_REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
+REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
 #: Where the centre of the first pixel is, from the image's border.
 _HALF_PIXEL = 0.5
 
@@ -32,23 +32,53 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
     Source: Scaffold-GS, section 3.2 (view-frustum filtering).
     """
-    pose = camera.world_to_camera.to(positions)
-    x, y, z = torch.addmm(pose[:3, 3], positions, pose[:3, :3].T).unbind(1)
-    squares = torch.exp(2.0 * log_scales[:, :3])
-    inside = z > NEAR
-    rows = (
-        (x, camera.fx, camera.cx, camera.width, pose[0, :3]),
-        (y, camera.fy, camera.cy, camera.height, pose[1, :3]),
-    )
-    for along, focal, center, size, axis in rows:
-        slope = along / z
+    tensors = (positions, log_scales)
+    if all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors):
+        return _fused(positions, log_scales, camera)
+    return _plain(positions, log_scales, camera)
+
+
+def _axes(camera: Camera) -> list[tuple[float, ...]]:
+    """For x and y: focal length, centre, clamp of the Jacobian's slope, first and last place."""
+    sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    axes = []
+    for focal, center, size in sizes:
         margin = JACOBIAN_MARGIN * size / (2.0 * focal)
-        clamped = slope.clamp(-center / focal - margin, (size - center) / focal + margin)
-        # The row of the Jacobian in the world's axes, times z / focal.
-        row = torch.addcmul(axis, clamped[:, None], pose[2, :3], value=-1.0)
-        variance = (row.square_() * squares).sum(1) * (focal / z).square() + DILATION
-        extent = _REACH * variance.sqrt_()
+        slopes = (-center / focal - margin, (size - center) / focal + margin)
+        axes.append((focal, center, *slopes, _HALF_PIXEL, size - _HALF_PIXEL))
+    return axes
+
+
+def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
+    pose = camera.world_to_camera.to(positions)
+    *flat, depth = torch.addmm(pose[:3, 3], positions, pose[:3, :3].T).unbind(1)
+    squares = torch.exp(2.0 * log_scales[:, :3])
+    inside = depth > NEAR
+    for along, axis, (focal, center, least, most, first, last) in zip(
+        flat, pose, _axes(camera), strict=False
+    ):
+        slope = along / depth
+        # The row of the Jacobian in the world's axes, times depth / focal.
+        row = axis[:3] - slope.clamp(least, most)[:, None] * pose[2, :3]
+        variance = (row.square() * squares).sum(1) * (focal / depth).square() + DILATION
+        extent = REACH * variance.sqrt()
         place = focal * slope + center
-        first, last = _HALF_PIXEL, size - _HALF_PIXEL
         inside &= (place + extent >= first) & (place - extent <= last)
     return inside
+
+
+def _fused(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
+    from crossgrad_backbones.anchors.numba_kernels import frustum
+
+    inside = np.empty(len(positions), np.bool_)
+    frustum.in_frustum(
+        positions.detach().contiguous().numpy(),
+        log_scales.detach().contiguous().numpy(),
+        camera.world_to_camera[:3].float().numpy(),
+        np.array(_axes(camera), np.float32),
+        np.float32(NEAR),
+        np.float32(DILATION),
+        np.float32(REACH),
+        inside,
+    )
+    return torch.from_numpy(inside)

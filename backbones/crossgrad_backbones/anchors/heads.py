@@ -64,11 +64,56 @@ class Heads:
         bank = Network("mlp_bank", DIRECTION + 1, self.feature, len(BANK_STRIDES))
         return (*three, bank) if self.banked else three
 
+    def views(self, offset: Tensor) -> Tensor:
+        """[A, 4] direction and distance of anchors at `offset` [A, 3] from the camera."""
+        distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
+        # An anchor in the very centre of the camera has no direction.
+        direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
+        return torch.cat([direction, distance], 1)
+
+    def inputs(self, views: Tensor) -> Tensor:
+        """[A, 3 or 4] what of `views` the three networks take besides the feature."""
+        return views if any(self.far) else views[:, :DIRECTION]
+
+    def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
+        """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
+        first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
+        scores = linear(linear(views, first, first_bias).relu_(), second, second_bias)
+        shares = torch.softmax(scores, 1)
+        read = [features[:, ::stride].repeat(1, stride) for stride in BANK_STRIDES]
+        return shares[:, :1] * read[0] + shares[:, 1:2] * read[1] + shares[:, 2:] * read[2]
+
+    def first_layers(
+        self, parameters: Mapping[str, Tensor], code: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Weights [3 H, F + 3 or 4] and biases [3 H] of the first layers one after the other.
+
+        Args:
+            parameters: The parameters.
+            code: [C] appearance code, or None: the same for all anchors, so a part of the bias.
+        """
+        weights, biases = [], []
+        for network, far in zip(self.networks[:3], self.far, strict=True):
+            weight, bias, _, _ = network.layers(parameters)
+            if code is not None and network.name == "mlp_color":
+                bias = torch.addmv(bias, weight[:, -self.code :], code)
+                weight = weight[:, : -self.code]
+            if any(self.far) and not far:
+                weight = pad(weight, (0, 1))
+            weights.append(weight)
+            biases.append(bias)
+        return torch.cat(weights), torch.cat(biases)
+
+    def second_layers(self, parameters: Mapping[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of the second layers of opacity, covariance and colour."""
+        layers = [network.layers(parameters) for network in self.networks[:3]]
+        return [(weight, bias) for _, _, weight, bias in layers]
+
     def raw(
         self,
         parameters: Mapping[str, Tensor],
         features: Tensor,
-        offset: Tensor,
+        views: Tensor,
         code: Tensor | None = None,
     ) -> Raw:
         """Evaluates the networks.
@@ -76,51 +121,15 @@ class Heads:
         Args:
             parameters: The parameters, with the tensors of all networks.
             features: [A, F] of the anchors.
-            offset: [A, 3] from the camera to each anchor, local units.
+            views: [A, 4] from `views`.
             code: [C] appearance code; None without.
 
         Source: Scaffold-GS, section 3.2; methods of section 2.2.
         """
-        distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
-        # An anchor in the very centre of the camera has no direction.
-        direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
         if self.banked:
-            seen = torch.cat([direction, distance], 1)
-            features = _mixed(features, _evaluated(self.networks[-1], parameters, seen))
-        inputs = (features, direction, distance) if any(self.far) else (features, direction)
-        hidden = self._hidden(parameters, torch.cat(inputs, 1), code)
-        opacities, covariances, colors = (
-            linear(each, *network.layers(parameters)[2:])
-            for network, each in zip(self.networks[:3], hidden, strict=True)
-        )
-        return Raw(opacities, covariances, colors)
-
-    def _hidden(
-        self, parameters: Mapping[str, Tensor], inputs: Tensor, code: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        """[A, F] hidden layers of the three networks, from one product."""
-        weights, biases = [], []
-        for network, far in zip(self.networks[:3], self.far, strict=True):
-            weight, bias, _, _ = network.layers(parameters)
-            if code is not None and network.name == "mlp_color":
-                # The code is the same for all anchors: a part of the bias.
-                bias = torch.addmv(bias, weight[:, -self.code :], code)
-                weight = weight[:, : -self.code]
-            if any(self.far) and not far:
-                weight = pad(weight, (0, 1))
-            weights.append(weight)
-            biases.append(bias)
-        hidden = linear(inputs, torch.cat(weights), torch.cat(biases)).relu_()
-        return torch.split(hidden, self.feature, 1)
-
-
-def _evaluated(network: Network, parameters: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
-    first, first_bias, second, second_bias = network.layers(parameters)
-    return linear(linear(inputs, first, first_bias).relu_(), second, second_bias)
-
-
-def _mixed(features: Tensor, scores: Tensor) -> Tensor:
-    """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
-    shares = torch.softmax(scores, 1)
-    read = [features[:, ::stride].repeat(1, stride) for stride in BANK_STRIDES]
-    return shares[:, :1] * read[0] + shares[:, 1:2] * read[1] + shares[:, 2:] * read[2]
+            features = self.mixed(parameters, features, views)
+        inputs = torch.cat([features, self.inputs(views)], 1)
+        hidden = linear(inputs, *self.first_layers(parameters, code)).relu_()
+        parts = torch.split(hidden, self.feature, 1)
+        layers = self.second_layers(parameters)
+        return Raw(*(linear(part, *layer) for part, layer in zip(parts, layers, strict=True)))

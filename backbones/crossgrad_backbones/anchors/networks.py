@@ -11,6 +11,8 @@ from crossgrad_core.blocks import Block, BlockKind, LearningRate, Parameters
 
 #: Width of the direction from the camera to the anchor.
 DIRECTION = 3
+#: Places of the two linear layers; the ReLU between them is number 1.
+LAYERS = (0, 2)
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class Network:
 
     Attributes:
         name: Name of its block; its tensors are `name.0.weight` [hidden, inputs], `name.0.bias`,
-            `name.1.weight` [outputs, hidden] and `name.1.bias`.
+            `name.2.weight` [outputs, hidden] and `name.2.bias`.
         inputs: Width of the input.
         hidden: Width of the hidden layer.
         outputs: Width of the output.
@@ -33,7 +35,7 @@ class Network:
     @property
     def tensors(self) -> tuple[str, ...]:
         """Names of its tensors."""
-        return tuple(f"{self.name}.{n}.{kind}" for n in (0, 1) for kind in ("weight", "bias"))
+        return tuple(f"{self.name}.{n}.{kind}" for n in LAYERS for kind in ("weight", "bias"))
 
     def block(self, kind: BlockKind, lr: LearningRate) -> Block:
         """The block of all its tensors."""
@@ -42,9 +44,8 @@ class Network:
     def created(self, rng: np.random.Generator) -> Parameters:
         """First values as those of `torch.nn.Linear`: uniform in +-1 / sqrt(inputs of a layer)."""
         tensors: Parameters = {}
-        for layer, (width, out) in enumerate(
-            ((self.inputs, self.hidden), (self.hidden, self.outputs))
-        ):
+        widths = ((self.inputs, self.hidden), (self.hidden, self.outputs))
+        for layer, (width, out) in zip(LAYERS, widths, strict=True):
             bound = width**-0.5
             for kind, shape in (("weight", (out, width)), ("bias", (out,))):
                 drawn = rng.uniform(-bound, bound, shape).astype(np.float32)

@@ -1,0 +1,63 @@
+"""The frustum filter of the anchors (CPU, float32)."""
+
+import math
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_core.jit import parallel_kernel
+
+#: Anchors that one thread takes at a time.
+SHARE = 4096
+
+
+@parallel_kernel
+def in_frustum(
+    positions: NDArray[np.float32],
+    log_scales: NDArray[np.float32],
+    pose: NDArray[np.float32],
+    axes: NDArray[np.float32],
+    near: np.float32,
+    dilation: np.float32,
+    reach: np.float32,
+    inside: NDArray[np.bool_],
+) -> None:
+    """Which anchors pass; the formulas are those of the plain filter.
+
+    Args:
+        positions: [P, 3].
+        log_scales: [P, 3 or more].
+        pose: [3, 4] world to camera.
+        axes: [2, 6] for x and y: focal length, centre, least and largest slope of the Jacobian,
+            first and last place that counts (pixels).
+        near: Least depth.
+        dilation: Added to the variances, px^2.
+        reach: Extent of a footprint, standard deviations.
+        inside: [P] written.
+    """
+    count = len(positions)
+    for share in prange((count + SHARE - 1) // SHARE):
+        for p in range(share * SHARE, min(count, (share + 1) * SHARE)):
+            x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
+            depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+            passes = depth > near
+            for k in range(2):
+                if not passes:
+                    break
+                focal, center = axes[k, 0], axes[k, 1]
+                along = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
+                slope = along / depth
+                place = focal * slope + center
+                # What has its centre in the image needs no second look.
+                if axes[k, 4] <= place <= axes[k, 5]:
+                    continue
+                clamped = min(max(slope, axes[k, 2]), axes[k, 3])
+                variance = np.float32(0)
+                for c in range(3):
+                    row = (pose[k, c] - clamped * pose[2, c]) * math.exp(log_scales[p, c])
+                    variance += row * row
+                ratio = focal / depth
+                extent = reach * math.sqrt(variance * ratio * ratio + dilation)
+                passes = place + extent >= axes[k, 4] and place - extent <= axes[k, 5]
+            inside[p] = passes

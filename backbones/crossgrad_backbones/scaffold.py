@@ -1,0 +1,31 @@
+"""Scaffold-GS: neural Gaussians on a sparse grid of anchors (Lu et al. 2024)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_backbones.anchors.base import AnchorBackbone, Used
+from crossgrad_backbones.anchors.voxels import automatic_voxel_size, voxel_centers
+from crossgrad_core.blocks import Parameters
+from crossgrad_core.scene.types import Camera, Scene
+from crossgrad_core.schedule import Phase
+
+
+class Scaffold(AnchorBackbone):
+    """Anchors in the voxels that hold SfM points; a camera uses all that are in its frustum."""
+
+    voxel_size: float | None = Field(
+        None, gt=0, description="edge of a voxel, extents; None: the points' median distance"
+    )
+
+    @override
+    def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
+        size = self.voxel_size or automatic_voxel_size(scene.points)
+        return self.created(voxel_centers(scene.points, size), size, scene, rng)
+
+    @override
+    def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:
+        return None
