@@ -41,7 +41,7 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 def _axes(camera: Camera) -> list[tuple[float, ...]]:
     """For x and y: focal length, centre, clamp of the Jacobian's slope, first and last place."""
     sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    axes = []
+    axes: list[tuple[float, ...]] = []
     for focal, center, size in sizes:
         margin = JACOBIAN_MARGIN * size / (2.0 * focal)
         slopes = (-center / focal - margin, (size - center) / focal + margin)

@@ -29,7 +29,7 @@ def observed(context: DensifyContext, state: PluginState) -> PluginState:
 def _copies(context: DensifyContext, state: PluginState) -> dict[str, Tensor]:
     offsets = context.parameters["offsets"]
     anchors, slots = offsets.shape[:2]
-    shapes = {OPACITY: (anchors,), VIEWS: (anchors,)}
+    shapes: dict[str, tuple[int, ...]] = {OPACITY: (anchors,), VIEWS: (anchors,)}
     shapes |= {GRADIENT: (anchors, slots), RENDERS: (anchors, slots)}
     have = state.per_primitive
     return {

@@ -109,8 +109,8 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
     by_offsets = None if alone else torch.zeros_like(inputs.offsets)
     means, quats, scales, opacities, colors = _filled(given, kept)
     rows = array(inputs.view.rows)
-    arrays = (rows, kept.starts, kept.slot, kept.spreads, kept.shares, scales)
-    arrays = (*arrays, array(by_log_scales), array(back.raw))
+    shared = (rows, kept.starts, kept.slot, kept.spreads, kept.shares, scales)
+    arrays = (*shared, array(by_log_scales), array(back.raw))
     if by_offsets is None:
         fill = partial(_call, activation.scatter_scales, arrays)
     else:

@@ -59,7 +59,8 @@ def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
     weight, bias = inputs.first
     joined = torch.empty(len(inputs.view.rows), weight.shape[1])
     read = (inputs.features, inputs.view.feature_rows, inputs.view.views)
-    layers.join(*map(array, read), array(joined))
+    features, rows, views = map(array, read)
+    layers.join(features, rows, views, array(joined))
     return joined, torch.addmm(bias, joined, weight.T).relu_()
 
 
