@@ -56,15 +56,17 @@ def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
     return result
 
 
-def finest_pixels(means: Tensor, cameras: Sequence[Camera], near: float) -> Tensor:
+def finest_pixels(
+    means: Tensor, cameras: Sequence[Camera], near: float, focal: float | None = None
+) -> Tensor:
     """[N] z / f of the camera that sees each of means [N, 3] finest, local units per pixel.
 
-    Infinite where no camera sees a mean.
+    Infinite where no camera sees a mean. f is each camera's own fx, or `focal` for all of them.
     """
     columns = columns_of(means)
     finest = torch.full_like(columns[0], torch.inf)
     for camera in cameras:
         depths, seen = depths_in_view(columns, camera, near)
-        pixels = depths.div_(camera.fx).masked_fill_(~seen, torch.inf)
+        pixels = depths.div_(focal or camera.fx).masked_fill_(~seen, torch.inf)
         torch.minimum(finest, pixels, out=finest)
     return finest
