@@ -113,7 +113,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("backbone", ["analytic", "mip"])
+@pytest.mark.parametrize("backbone", ["analytic", "mip", "distance"])
 def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(backbone, scene, tmp_path):
     config = RunConfig(scene=str(scene), steps=150, backbone=ComponentChoice(name=backbone))
     setup = assemble(config, read_scene(config, scene)[0], "colmap")
