@@ -8,8 +8,9 @@ For K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of
 `ratio` is (time of the aggregation - time of the additions) / time of the additions, where the
 additions are `torch.add(g1, g2, out=)` and its like for the other views, measured in turn with the
 aggregation. The aggregation writes its results over the gradients of one view, which are restored
-between repeats. `arithmetic_us` is the operator's own arithmetic for six blocks. Times are the
-least of the repeats; a machine that does other work shows in `load`.
+between repeats. `accumulated_ratio` is the same for operators that need no separate gradients, with
+the views handed over one by one, as in training. `arithmetic_us` is the operator's own arithmetic
+for six blocks. Times are the least of the repeats; a machine that does other work shows in `load`.
 """
 
 import argparse
@@ -26,7 +27,8 @@ from torch import Tensor
 from crossgrad_core.aggregation import operator_context
 from crossgrad_core.blocks import Block, BlockKind, LearningRate
 from crossgrad_core.contexts import AggregateContext
-from crossgrad_core.dense_gradients import DenseViewGradients
+from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.operator import Operator
 from crossgrad_core.registry import build, entries
 from crossgrad_core.state import EMPTY_STATE
@@ -79,23 +81,34 @@ def _measured(
     for name, operator in operators.items():
         if not operator.views.admits(views):
             continue
-
-        def aggregation(chosen: Operator = operator) -> None:
-            chosen.aggregate(_context(gradients), EMPTY_STATE)
-
-        work: dict[str, Callable[[], object]] = {
-            "aggregation": aggregation,
-            ADDITIONS: lambda: _add(gradients, out),
-        }
+        work = _work(operator, gradients, out)
         times = _least(work, arguments.repeats, lambda: _restore(kept, gradients))
-        added = times["aggregation"] - times[ADDITIONS]
-        results[name] = {
-            f"ratio_k{views}": round(added / times[ADDITIONS], 3),
-            f"aggregation_ms_k{views}": round(1e3 * times["aggregation"], 3),
+        ratios = {
+            f"{key}_k{views}": round(time / times[ADDITIONS] - 1.0, 3)
+            for key, time in times.items()
+            if key != ADDITIONS
+        }
+        results[name] = ratios | {
+            f"aggregation_ms_k{views}": round(1e3 * times["ratio"], 3),
             f"additions_ms_k{views}": round(1e3 * times[ADDITIONS], 3),
             f"arithmetic_us_k{views}": _arithmetic(operator, views),
         }
     return results
+
+
+def _work(
+    operator: Operator, gradients: list[dict[str, Tensor]], out: dict[str, Tensor]
+) -> dict[str, Callable[[], object]]:
+    """What is timed, by the name of its figure."""
+    work: dict[str, Callable[[], object]] = {
+        "ratio": lambda: operator.aggregate(_context(_apart(gradients)), EMPTY_STATE),
+        ADDITIONS: lambda: _add(gradients, out),
+    }
+    if not operator.separate:
+        work["accumulated_ratio"] = lambda: operator.aggregate(
+            _context(_accumulated(gradients)), EMPTY_STATE
+        )
+    return work
 
 
 def _gradients(views: int, parameters: int) -> list[dict[str, Tensor]]:
@@ -140,15 +153,26 @@ def _least(
     return least
 
 
-def _context(gradients: list[dict[str, Tensor]]) -> AggregateContext:
-    views = len(gradients)
+def _apart(gradients: list[dict[str, Tensor]]) -> ViewGradients:
+    return DenseViewGradients(gradients, BLOCKS, overwrite=True)
+
+
+def _accumulated(gradients: list[dict[str, Tensor]]) -> ViewGradients:
+    total = AccumulatedGradients.empty(BLOCKS, len(gradients))
+    for view in gradients:
+        total.add(view)
+    return total
+
+
+def _context(gradients: ViewGradients) -> AggregateContext:
+    views = gradients.views
     return AggregateContext(
         step=1,
         schedule=cast("Any", None),
         scene=cast("Any", None),
         states={},
         rng=np.random.default_rng(0),
-        gradients=DenseViewGradients(gradients, BLOCKS, overwrite=True),
+        gradients=gradients,
         losses=np.ones(views),
         labels=tuple(("near", "far")[k % 2] for k in range(views)),
         distances=np.linspace(0.5, 2.0, views),
@@ -161,7 +185,7 @@ def _arithmetic(operator: Operator, views: int) -> float | None:
     """Microseconds of `transform` for six blocks; None for operators that work on elements."""
     if operator.elementwise:
         return None
-    context = _context(_gradients(views, 6_000))
+    context = _context(_apart(_gradients(views, 6_000)))
     gramians = context.gradients.gramians("tensor")
     given = operator_context(context, "tensor", context.gradients.present("tensor"))
     rng = np.random.default_rng(0)

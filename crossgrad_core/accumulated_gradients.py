@@ -9,6 +9,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.blocks import Block
+from crossgrad_core.gradient_passes.plain import plain_sums
 from crossgrad_core.gradient_passes.squares import column_gramians
 from crossgrad_core.gradients import Elementwise, ViewGradients
 from crossgrad_core.operator import Granularity
@@ -18,7 +19,8 @@ class AccumulatedGradients(ViewGradients):
     """The sum of K views' gradients in the order of the views; single views are not kept.
 
     Either given as a whole (one backward pass of a joint loss) or built view by view from `empty`
-    with `add`, which leaves a view out of the blocks in which it is not finite.
+    with `add`, which leaves a view out of the blocks in which it is not finite. The last view waits
+    for `total`, which adds and divides in one pass.
 
     Args:
         total: Tensor name -> sum; None or no entry where no view touches the tensor.
@@ -30,8 +32,10 @@ class AccumulatedGradients(ViewGradients):
         self, total: Mapping[str, Tensor | None], blocks: Sequence[Block], views: int
     ) -> None:
         self._blocks = tuple(blocks)
-        self._sum = {name: total.get(name) for block in blocks for name in block.tensors}
-        self._views = views
+        self._sum = {n: _contiguous(total.get(n)) for block in blocks for n in block.tensors}
+        self._last: dict[str, Tensor] = {}
+        self._divisor = 0
+        self._views = self._expected = views
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []
         if views:
@@ -40,19 +44,31 @@ class AccumulatedGradients(ViewGradients):
             self._forget(finite)
 
     @classmethod
-    def empty(cls, blocks: Sequence[Block]) -> Self:
-        """No view yet."""
-        return cls({}, blocks, 0)
+    def empty(cls, blocks: Sequence[Block], views: int) -> Self:
+        """No view yet, of `views` to come."""
+        gradients = cls({}, blocks, 0)
+        gradients._expected = views
+        return gradients
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Adds the gradients of one more view, and takes them over: they are written to."""
+        """Adds the gradients of one more view, and takes them over: they are written to.
+
+        Raises:
+            RuntimeError: All views that were to come are there.
+        """
+        if self._views == self._expected:
+            raise RuntimeError(f"one view more than the {self._expected} that were to come")
         finite, present = self._judged(view)
         self._views += 1
         self._finite.append(finite)
         self._present.append(present)
         for block, kept in zip(self._blocks, finite, strict=True):
             for name in block.tensors if kept else ():
-                self._sum[name] = _added(self._sum[name], view.get(name))
+                gradient = _contiguous(view.get(name))
+                if gradient is not None:
+                    self._last[name] = gradient
+        if self._views < self._expected:
+            self._fold(1)
 
     @property
     @override
@@ -65,8 +81,21 @@ class AccumulatedGradients(ViewGradients):
         return tuple(block.name for block in self._blocks)
 
     @override
-    def total(self) -> Mapping[str, Tensor | None]:
-        return self._sum
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        """See `ViewGradients.total`.
+
+        Raises:
+            RuntimeError: The sum was already divided by something else.
+        """
+        if self._divisor in {0, divisor}:
+            if not self._divisor:
+                self._fold(divisor)
+            self._divisor = divisor
+            return self._sum
+        if self._divisor != 1:
+            raise RuntimeError("the sum of the views' gradients was overwritten by their mean")
+        columns = [[gradient] for gradient in self._sum.values()]
+        return dict(zip(self._sum, plain_sums(columns, divisor, keep=True), strict=True))
 
     @override
     def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
@@ -108,6 +137,13 @@ class AccumulatedGradients(ViewGradients):
         finite = np.isfinite(norms)
         return finite, finite & (norms > 0)
 
+    def _fold(self, divisor: int) -> None:
+        """Adds the view that waits, and divides."""
+        columns = [[gradient, self._last.get(name)] for name, gradient in self._sum.items()]
+        sums = plain_sums(columns, divisor, keep=False)
+        self._sum = dict(zip(self._sum, sums, strict=True))
+        self._last = {}
+
     def _forget(self, finite: NDArray[np.bool_]) -> None:
         for block, kept in zip(self._blocks, finite, strict=True):
             if not kept:
@@ -123,12 +159,6 @@ class AccumulatedGradients(ViewGradients):
             "the views' gradients were accumulated and only their sum is known; an operator or "
             "plugin that looks at single views must say so with `separate = True`"
         )
-
-
-def _added(total: Tensor | None, gradient: Tensor | None) -> Tensor | None:
-    if gradient is None:
-        return total
-    return gradient.detach() if total is None else total.add_(gradient.detach())
 
 
 def _contiguous(gradient: Tensor | None) -> Tensor | None:

@@ -124,10 +124,10 @@ class DenseViewGradients(ViewGradients):
         return self._combine(weights[groups.of_tensor], finite)
 
     @override
-    def total(self) -> Mapping[str, Tensor | None]:
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
         finite = self.finite("tensor")
         of_tensor = self._groups("tensor").of_tensor
-        return self._combine(finite.astype(np.float64)[of_tensor], finite[of_tensor])
+        return self._combine(finite.astype(np.float64)[of_tensor], finite[of_tensor], divisor)
 
     @override
     def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
@@ -238,9 +238,9 @@ class DenseViewGradients(ViewGradients):
         return np.concatenate(parts)
 
     def _combine(
-        self, weights: NDArray[np.float64], finite: NDArray[np.bool_]
+        self, weights: NDArray[np.float64], finite: NDArray[np.bool_], divisor: int = 1
     ) -> dict[str, Tensor | None]:
-        """Weighted sums of all tensors; `weights` and `finite` are [T, K]."""
+        """Weighted sums of all tensors; `weights` and `finite` are [T, K]; plain sums divided."""
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
         used = weights != 0
         plain = ((weights == 1) | ~used).all(axis=1) & used.any(axis=1)
@@ -255,7 +255,7 @@ class DenseViewGradients(ViewGradients):
             if self._native[t]:
                 compiled.append(t)
             else:
-                generic.combine(chosen[t], weights[t, order[t]], bool(plain[t]), out)
+                generic.combine(chosen[t], weights[t, order[t]], bool(plain[t]), out, divisor)
         if compiled:
             outs = [results[self._tensors[t]] for t in compiled]
             native.combine(
@@ -263,6 +263,7 @@ class DenseViewGradients(ViewGradients):
                 np.take_along_axis(weights, order, axis=1)[compiled],
                 plain[compiled],
                 [out for out in outs if out is not None],
+                divisor,
             )
         self._spent = self._overwrite
         return results

@@ -59,8 +59,12 @@ class ViewGradients(ABC):
         """
 
     @abstractmethod
-    def total(self) -> Mapping[str, Tensor | None]:
-        """Tensor name -> plain sum in the order of the views (the bits of accumulation)."""
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        """Tensor name -> plain sum in the order of the views (the bits of accumulation).
+
+        Args:
+            divisor: What the sums are then divided by; K gives the mean without a further pass.
+        """
 
     @abstractmethod
     def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:

@@ -31,7 +31,13 @@ def largest(column: Column) -> Tensor:
     )
 
 
-def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tensor) -> None:
+def combine(
+    column: Column,
+    weights: NDArray[np.float64],
+    plain: bool,
+    out: Tensor,
+    divisor: float = 1.0,
+) -> None:
     """Writes the weighted sum of a column: in float64 and rounded once, in the order given.
 
     Args:
@@ -39,6 +45,7 @@ def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tens
         weights: [K].
         plain: Whether to add without weights in the type of the gradients instead.
         out: The result; may be one of the gradients.
+        divisor: What a plain sum is divided by.
     """
     used = [
         (w, g.reshape(-1)) for w, g in zip(weights.tolist(), column, strict=True) if g is not None
@@ -51,6 +58,8 @@ def combine(column: Column, weights: NDArray[np.float64], plain: bool, out: Tens
             total = used[0][1][piece].clone()
             for _, g in used[1:]:
                 total += g[piece]
+            if divisor != 1.0:
+                total /= divisor
         else:
             total = torch.zeros_like(flat[piece], dtype=torch.float64)
             for w, g in used:

@@ -46,6 +46,7 @@ def combine(
     weights: NDArray[np.float64],
     plain: NDArray[np.bool_],
     out: Sequence[Tensor],
+    divisor: float = 1.0,
 ) -> None:
     """Writes the weighted sum of each column in one pass over all of its gradients.
 
@@ -54,6 +55,7 @@ def combine(
         weights: [T, K].
         plain: [T], columns to add without weights in the order of the views, in float32.
         out: T results; each may be one of its column's gradients.
+        divisor: What plain sums are divided by, in float32.
     """
     from crossgrad_core.numba_kernels import dense
 
@@ -61,7 +63,7 @@ def combine(
     places = np.array([result.data_ptr() for result in out], np.int64)
     table = dense.chunk_table(sizes)
     kernel = dense.combine if _worth_waking(sizes) else dense.combine_serial
-    kernel(_addresses(columns), weights, plain, places, sizes, table)
+    kernel(_addresses(columns), weights, plain, float(divisor), places, sizes, table)
 
 
 def overlap(column: Column, first: int, second: int) -> bool:

@@ -190,22 +190,31 @@ def _weighted(
         narrow[i] = np.float32(wide[i])
 
 
+@njit(cache=True, error_model="numpy")
+def _divide(a: Rows, divisor: float) -> None:
+    d = np.float32(divisor)
+    for i in range(a.size):
+        a[i] /= d
+
+
 @njit(cache=True)
-def _plain(rows: Ints, count: int, start: int, narrow: Rows) -> None:
-    """Fills `narrow` with the rows added in order in float32: the bits of accumulation."""
+def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
+    """Fills `narrow` with the rows added in order in float32, the bits of accumulation, divided."""
     n = narrow.size
     a = row(rows[0], start, n)
     if count == 1:
         for i in range(n):
             narrow[i] = a[i]
-        return
-    b = row(rows[1], start, n)
-    for i in range(n):
-        narrow[i] = a[i] + b[i]
+    else:
+        b = row(rows[1], start, n)
+        for i in range(n):
+            narrow[i] = a[i] + b[i]
     for k in range(2, count):
         c = row(rows[k], start, n)
         for i in range(n):
             narrow[i] += c[i]
+    if divisor != 1.0:
+        _divide(narrow, divisor)
 
 
 @njit(cache=True)
@@ -214,15 +223,27 @@ def _weighted_into(a: Rows, u: float, b: Rows, v: float) -> None:
         a[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
 
 
-@njit(cache=True)
-def _plain_into(a: Rows, b: Rows) -> None:
-    for i in range(a.size):
-        a[i] += b[i]
+@njit(cache=True, error_model="numpy")
+def _plain_into(a: Rows, b: Rows, divisor: float) -> None:
+    if divisor == 1.0:
+        for i in range(a.size):
+            a[i] += b[i]
+    else:
+        d = np.float32(divisor)
+        for i in range(a.size):
+            a[i] = (a[i] + b[i]) / d
 
 
 @njit(cache=True)
 def _combine_pieces(
-    rows: Ints, weights: Floats, count: int, plain: bool, out: int, first: int, end: int
+    rows: Ints,
+    weights: Floats,
+    count: int,
+    plain: bool,
+    divisor: float,
+    out: int,
+    first: int,
+    end: int,
 ) -> None:
     """Results pass through a piece of fast memory, as they may overwrite one of the rows."""
     wide = np.empty(PIECE)
@@ -230,7 +251,7 @@ def _combine_pieces(
     for start in range(first, end, PIECE):
         length = min(PIECE, end - start)
         if plain:
-            _plain(rows, count, start, narrow[:length])
+            _plain(rows, count, divisor, start, narrow[:length])
         else:
             _weighted(rows, weights, count, start, wide[:length], narrow[:length])
         result = row(out, start, length)
@@ -240,7 +261,7 @@ def _combine_pieces(
 
 @njit(cache=True)
 def _combine_chunk(
-    addresses: Ints, weights: Floats, plain: bool, out: int, first: int, end: int
+    addresses: Ints, weights: Floats, plain: bool, divisor: float, out: int, first: int, end: int
 ) -> None:
     views = addresses.size
     rows = np.empty(views, np.int64)
@@ -260,16 +281,22 @@ def _combine_chunk(
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:
-            _plain_into(a, b)
+            _plain_into(a, b, divisor)
         else:
             _weighted_into(a, used[this], b, used[1 - this])
     else:
-        _combine_pieces(rows, used, count, plain, out, first, end)
+        _combine_pieces(rows, used, count, plain, divisor, out, first, end)
 
 
 @njit(cache=True, parallel=True)
 def combine(
-    addresses: Ints, weights: Floats, plain: Flags, out: Ints, sizes: Ints, table: Ints
+    addresses: Ints,
+    weights: Floats,
+    plain: Flags,
+    divisor: float,
+    out: Ints,
+    sizes: Ints,
+    table: Ints,
 ) -> None:
     """Writes the weighted sums of all tensors, in one pass over all views.
 
@@ -277,6 +304,7 @@ def combine(
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T] whether to add the rows in float32 in the order of the views instead.
+        divisor: What plain sums are divided by, in float32.
         out: [T] addresses of the results; one may be that of a view.
         sizes: [T].
         table: From `chunk_table`.
@@ -284,18 +312,24 @@ def combine(
     for c in prange(table.shape[0]):
         t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
-        _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
+        _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
 
 
 @njit(cache=True)
 def combine_serial(
-    addresses: Ints, weights: Floats, plain: Flags, out: Ints, sizes: Ints, table: Ints
+    addresses: Ints,
+    weights: Floats,
+    plain: Flags,
+    divisor: float,
+    out: Ints,
+    sizes: Ints,
+    table: Ints,
 ) -> None:
     """The same bits without the cost of waking up other cores."""
     for c in range(table.shape[0]):
         t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
-        _combine_chunk(addresses[t], weights[t], plain[t], out[t], first, end)
+        _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
 
 
 @njit(cache=True)

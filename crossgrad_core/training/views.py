@@ -58,7 +58,7 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     if setup.joint:
         return _render_jointly(setup, state, draw, regular)
     records, per_view = [], []
-    total = AccumulatedGradients.empty(setup.trained_blocks)
+    total = AccumulatedGradients.empty(setup.trained_blocks, len(draw.views))
     _clear(state.parameters)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot)

@@ -9,7 +9,7 @@ from typing_extensions import override
 from crossgrad_core.contexts import AggregateContext, Aggregated
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators.sum import Sum
+from crossgrad_operators.sum import divided_sum
 
 
 class Mean(Operator):
@@ -35,7 +35,4 @@ class Mean(Operator):
     def aggregate(
         self, context: AggregateContext, state: PluginState
     ) -> tuple[Aggregated, PluginState]:
-        total, state = Sum().aggregate(context, state)
-        views = context.gradients.views
-        gradients = {name: None if g is None else g / views for name, g in total.gradients.items()}
-        return Aggregated(gradients, total.counts), state
+        return divided_sum(context, context.gradients.views), state

@@ -34,10 +34,19 @@ class Sum(Operator):
     def aggregate(
         self, context: AggregateContext, state: PluginState
     ) -> tuple[Aggregated, PluginState]:
-        gradients = context.gradients
-        finite, present = gradients.finite("tensor"), gradients.present("tensor")
-        counts = {
-            "zero": int((finite & ~present).any(axis=1).sum()),
-            "dropped": int((~finite).any(axis=1).sum()),
-        }
-        return Aggregated(gradients.total(), counts), state
+        return divided_sum(context, 1), state
+
+
+def divided_sum(context: AggregateContext, divisor: int) -> Aggregated:
+    """The sum of the views' gradients over `divisor`, without Gramians.
+
+    Counts blocks in which some view's gradient is exactly zero or absent (`zero`) or was left out
+    because it is not finite (`dropped`).
+    """
+    gradients = context.gradients
+    finite, present = gradients.finite("tensor"), gradients.present("tensor")
+    counts = {
+        "zero": int((finite & ~present).any(axis=1).sum()),
+        "dropped": int((~finite).any(axis=1).sum()),
+    }
+    return Aggregated(gradients.total(divisor), counts)

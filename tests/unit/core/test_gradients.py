@@ -98,20 +98,29 @@ def test_rows_of_primitives(count, dtype):
     assert float((combined["mlp.0"].double() - exact).abs().max()) < 1e-5
 
 
+def copied(view):
+    return {name: None if g is None else g.clone() for name, g in view.items()}
+
+
+def accumulation(views):
+    gradients = AccumulatedGradients.empty(BLOCKS, len(views))
+    for view in views:
+        gradients.add(copied(view))
+    return gradients
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_accumulation_and_separate_gradients_give_the_same_bits(count, dtype):
     views = make_views(count, dtype)
     views[-1]["scales"] = None
-    accumulated = AccumulatedGradients.empty(BLOCKS)
     grown = dict.fromkeys(SHAPES)
     for view in views:
-        accumulated.add({n: None if g is None else g.clone() for n, g in view.items()})
         for name, g in view.items():
             if g is not None:
                 grown[name] = g.clone() if grown[name] is None else grown[name].add_(g)
     separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
-    together = aggregate(Sum(), accumulated)
+    together = aggregate(Sum(), accumulation(views))
     assert separate.counts == together.counts
     weights = np.ones((len(BLOCKS), count))
     weighted = DenseViewGradients(views, BLOCKS).combine(weights, "tensor")
@@ -133,10 +142,7 @@ def test_a_non_finite_view_is_dropped_alike_by_both_ways():
         "mlp.1": views[1]["mlp.1"] + views[2]["mlp.1"],
     }
     separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
-    accumulated = AccumulatedGradients.empty(BLOCKS)
-    for view in views:
-        accumulated.add({n: g.clone() for n, g in view.items()})
-    together = aggregate(Sum(), accumulated)
+    together = aggregate(Sum(), accumulation(views))
     for found in (separate, together):
         assert found.counts == {"zero": 0, "dropped": 2}
         for name, gradient in expected.items():
@@ -240,7 +246,8 @@ def test_one_core_and_all_cores_give_the_same_bits():
     results = [torch.empty(50_001), torch.empty(50_001)]
     for kernel, out in zip((dense.combine, dense.combine_serial), results, strict=True):
         places = np.array([out.data_ptr()])
-        kernel(addresses, np.array([[1.5, -2.0, 0.25]]), np.array([False]), places, sizes, table)
+        weights = np.array([[1.5, -2.0, 0.25]])
+        kernel(addresses, weights, np.array([False]), 1.0, places, sizes, table)
     assert torch.equal(*results)
 
 
@@ -315,9 +322,7 @@ def test_elementwise_sees_the_views_that_count():
     ],
 )
 def test_accumulated_gradients_do_not_pretend_to_know_single_views(look):
-    gradients = AccumulatedGradients.empty(BLOCKS)
-    for view in make_views(2):
-        gradients.add(view)
+    gradients = accumulation(make_views(2))
     assert gradients.views == 2
     assert gradients.names("tensor") == ("means", "scales", "opacities", "mlp")
     with pytest.raises(RuntimeError, match="separate = True"):
@@ -342,12 +347,46 @@ def test_operators_take_every_granularity(name, granularity):
         assert bool(torch.isfinite(gradient).all())
 
 
-def test_the_mean_divides_by_all_views():
+@pytest.mark.parametrize("absent", [0, 1, 2])
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_the_mean_is_the_sum_over_all_views_to_the_bit(count, dtype, absent):
+    """Divided once, after the sum; views without a gradient count."""
+    views = make_views(count, dtype)
+    views[min(absent, count - 1)]["means"] = None
+    views[0]["mlp.1"][0] = float("nan")
+    grown = aggregate(Sum(), DenseViewGradients(views, BLOCKS)).gradients
+    mean = build("operators", "mean", {})
+    for gradients in (
+        DenseViewGradients(views, BLOCKS),
+        DenseViewGradients(list(map(copied, views)), BLOCKS, overwrite=True),
+        accumulation(views),
+        AccumulatedGradients(copied(grown), BLOCKS, count),
+    ):
+        found = aggregate(mean, gradients).gradients
+        for name, total in grown.items():
+            assert (found[name] is None) == (total is None)
+            assert total is None or torch.equal(found[name], total / count), name
+
+
+def test_an_accumulated_sum_that_was_looked_at_survives_its_mean():
     views = make_views(3)
-    views[2]["means"] = None
-    found = aggregate(build("operators", "mean", {}), DenseViewGradients(views, BLOCKS))
-    expected = (views[0]["means"] + views[1]["means"]) / 3
-    assert torch.equal(found.gradients["means"], expected)
+    gradients = accumulation(views)
+    total = {name: gradient.clone() for name, gradient in gradients.total().items()}
+    mean = gradients.total(3)
+    for name, expected in total.items():
+        assert torch.equal(gradients.total()[name], expected)
+        assert torch.equal(mean[name], expected / 3)
+
+
+def test_an_accumulated_sum_is_gone_once_it_was_divided():
+    gradients = accumulation(make_views(2))
+    mean = gradients.total(2)
+    assert gradients.total(2) is mean
+    with pytest.raises(RuntimeError, match="overwritten by their mean"):
+        gradients.total()
+    with pytest.raises(RuntimeError, match="one view more than the 2"):
+        gradients.add(make_views(1)[0])
 
 
 def test_aggregation_is_what_operators_do_by_default():
