@@ -5,7 +5,7 @@ TEST_VENV ?= .venv-test
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test lint bench clean
+.PHONY: demo install test matrix lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -19,6 +19,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 test:  ## Build the wheel, install it into a fresh environment, run all tests against it
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh
+
+matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.md says how long)
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m matrix
 
 lint: install  ## ruff and mypy
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"

@@ -1,6 +1,6 @@
 """From a configuration to a Setup: load, fit to the scene, object, or say what was left out."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -107,6 +107,36 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.
     """
+    selection, notes = select(config, scene, reader)
+    components = selection.components
+    observers = {choice.name: _built("observers", choice) for choice in config.observers}
+    plugins = _plugins(components, observers)
+    manager = make_manager(plugins)
+    answers = manager.hook.crossgrad_objections(selection=selection)
+    _refuse(reasons_against(config, selection, answers))
+    groups = _groups(config, scene, components.get("grouping"), notes)
+    densifier = cast("Densifier", components["densifier"])
+    setup = Setup(
+        config=config,
+        scene=scene,
+        selection=selection,
+        densifier=densifier,
+        manager=manager,
+        plugins=plugins,
+        groups=groups,
+        schedule=schedule_of(config, densifier, config.steps or DEFAULT_STEPS),
+        device=choose_device(config.device),
+        notes=tuple(notes),
+    )
+    return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
+
+
+def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
+    """The components, loaded and fitted to the scene, and notes on what was chosen or left out.
+
+    Raises:
+        UserError: A name or option is wrong.
+    """
     _require_points(config, scene)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
@@ -143,25 +173,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     if grouping_choice is not None:
         components["grouping"] = _built("groupings", grouping_choice)
         names["grouping"] = grouping_choice.name
-    selection = Selection(components, names, views, device.type)
-    observers = {choice.name: _built("observers", choice) for choice in config.observers}
-    plugins = _plugins(components, observers)
-    manager = make_manager(plugins)
-    _object(config, selection, manager.hook.crossgrad_objections(selection=selection))
-    groups = _groups(config, scene, components.get("grouping"), notes)
-    setup = Setup(
-        config=config,
-        scene=scene,
-        selection=selection,
-        densifier=densifier,
-        manager=manager,
-        plugins=plugins,
-        groups=groups,
-        schedule=schedule_of(config, densifier, config.steps or DEFAULT_STEPS),
-        device=device,
-        notes=tuple(notes),
-    )
-    return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
+    return Selection(components, names, views, device.type), notes
 
 
 def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
@@ -260,7 +272,10 @@ def _plugins(
     return plugins
 
 
-def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -> None:
+def reasons_against(
+    config: RunConfig, selection: Selection, answers: Iterable[list[str]]
+) -> tuple[str, ...]:
+    """Why the selection cannot work: what its components object, and what the core does."""
     reasons = [reason for answer in answers for reason in answer]
     device, rasterizer = selection.device, selection.rasterizer
     if device not in rasterizer.devices:
@@ -277,10 +292,14 @@ def _object(config: RunConfig, selection: Selection, answers: list[list[str]]) -
             f"--backward joint makes one gradient of all views, but operator "
             f"{selection.names['operator']} needs them apart"
         )
+    return tuple(sorted(set(reasons)))
+
+
+def _refuse(reasons: tuple[str, ...]) -> None:
     if reasons:
         raise IncompatibleSelectionError(
             "these components cannot work together",
-            found="; ".join(sorted(set(reasons))),
+            found="; ".join(reasons),
             todo="choose another combination (crossgrad plugins show NAME tells what each needs)",
         )
 

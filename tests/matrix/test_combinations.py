@@ -1,90 +1,125 @@
-"""Every sampler x operator x backbone runs, or is refused with a reason that is written down."""
+"""Every combination runs, or is refused with a reason that is written down.
+
+The normal run trains a pairwise design: every two components that can work together meet in some
+case. `make matrix` trains all combinations.
+"""
 
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 
-from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import IncompatibleSelectionError
-from crossgrad_core.registry import offers
+from crossgrad_core.testing.combinations import (
+    SLOTS,
+    STEPS,
+    as_lines,
+    config_of,
+    every_combination,
+    from_lines,
+    refused,
+)
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.pairwise import pairs_of, pairwise
+from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
-REFUSALS = Path(__file__).with_name("refusals.txt")
-STEPS = 3
-#: Options without which a component has nothing to do.
-NEEDED = {"chain": {"links": [{"name": "symmetric"}, {"name": "mean"}]}}
+#: What operators count; everything else that a step counts is density control.
+AGGREGATION = {"zero", "disjoint", "dropped", "conflict"}
+
+WRITTEN = Path(__file__).with_name("refusals.txt").read_text().splitlines()
+REFUSED = from_lines(WRITTEN, every_combination())
+ADMITTED = [row for row in every_combination() if row not in REFUSED]
+DESIGN = pairwise(ADMITTED)
+DENSIFIERS = sorted({row[SLOTS.index("densifier")] for row in ADMITTED} - {"none"})
 
 
-def ours(slot):
-    """Our own names: an installed third-party plugin must not join our suite."""
-    return sorted(entry.name for entry in offers(slot) if entry.distribution == "crossgrad")
+def pytest_generate_tests(metafunc):
+    # Thousands of cases are not even collected where nobody asks for them.
+    if "member" in metafunc.fixturenames:
+        asked = metafunc.config.option.markexpr == "matrix"
+        metafunc.parametrize("member", ADMITTED if asked else ADMITTED[:1], ids=" x ".join)
 
 
-COMBINATIONS = list(product(ours("samplers"), ours("operators"), ours("backbones")))
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    # The scene is tiny, and the tests themselves run in parallel.
+    before = configure_threads()
+    configure_threads(1)
+    yield
+    configure_threads(before)
 
 
 @cache
-def scene():
-    return sample_scene()
-
-
-def choice(name):
-    return ComponentChoice.model_validate({"name": name, **NEEDED.get(name, {})})
-
-
-def assembled(sampler, operator, backbone):
-    config = RunConfig(
-        steps=200,
-        sampler=choice(sampler),
-        operator=choice(operator),
-        backbone=choice(backbone),
-    )
-    return assemble(config, scene(), "none")
+def setup_of(row):
+    return assemble(config_of(row), sample_scene(), "none")
 
 
 def trained(setup):
+    """Parameters before, after the first step and at the end, and the records."""
     state = first_state(setup)
-    before = {name: tensor.detach().clone() for name, tensor in state.parameters.items()}
-    records = [timed_step(setup, state) for _ in range(STEPS)]
-    return before, state.parameters, [loss for record in records for loss in record.losses]
+    stages = [copied(state.parameters)]
+    records = [timed_step(setup, state)]
+    stages.append(copied(state.parameters))
+    records += [timed_step(setup, state) for _ in range(STEPS - 1)]
+    return *stages, copied(state.parameters), records
 
 
-def refusals():
-    lines = REFUSALS.read_text().splitlines()
-    return dict(line.split(": ", 1) for line in lines if line)
+def copied(parameters):
+    return {name: tensor.detach().clone() for name, tensor in parameters.items()}
 
 
-def refused():
-    found = {}
-    for combination in COMBINATIONS:
-        try:
-            assembled(*combination)
-        except IncompatibleSelectionError as error:
-            found[" x ".join(combination)] = error.found
-    return found
-
-
-def test_exactly_the_written_combinations_are_refused_for_the_written_reason():
-    assert refused() == refusals()
-
-
-@pytest.mark.parametrize("combination", COMBINATIONS, ids=" x ".join)
-def test_combination_trains_and_repeats(combination):
-    if " x ".join(combination) in refusals():
-        with pytest.raises(IncompatibleSelectionError):
-            assembled(*combination)
-        return
-    setup = assembled(*combination)
-    before, after, losses = trained(setup)
-    assert all(loss == loss and abs(loss) < 10 for loss in losses)  # noqa: PLR0124
+def check(row):
+    setup = setup_of(row)
+    before, early, after, records = trained(setup)
+    losses = [loss for record in records for loss in record.losses]
+    assert all(0 <= loss < 10 for loss in losses)
     assert all(torch.isfinite(tensor).all() for tensor in after.values())
-    assert any(not torch.equal(before[name], after[name]) for name in before)
-    _, again, same_losses = trained(setup)
-    assert losses == same_losses
+    assert any(not torch.equal(before[name], early[name]) for name in before)
+    *_, again, repeated = trained(setup)
+    assert losses == [loss for record in repeated for loss in record.losses]
+    assert [record.counts for record in records] == [record.counts for record in repeated]
+    assert after.keys() == again.keys()
     assert all(torch.equal(after[name], again[name]) for name in after)
+
+
+def test_exactly_the_written_combinations_are_refused_for_the_written_reasons():
+    rows = every_combination()
+    found = as_lines(refused(rows), rows)
+    assert found == WRITTEN, "python -m crossgrad_core.testing.combinations writes them anew"
+
+
+@pytest.mark.parametrize("line", WRITTEN)
+def test_a_run_is_refused_for_the_written_reason(line):
+    row = next(iter(from_lines([line], every_combination())))
+    with pytest.raises(IncompatibleSelectionError) as refusal:
+        setup_of(row)
+    assert line.split(": ", 1)[1] in refusal.value.found
+
+
+def test_every_two_components_that_can_work_together_meet():
+    met = {pair for row in DESIGN for pair in pairs_of(row)}
+    assert met == {pair for row in ADMITTED for pair in pairs_of(row)}
+    names = {(slot, name) for row in every_combination() for slot, name in enumerate(row)}
+    assert names == {(slot, name) for row in DESIGN for slot, name in enumerate(row)}
+
+
+@pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
+def test_combination_trains_and_repeats(row):
+    check(row)
+
+
+@pytest.mark.parametrize("densifier", DENSIFIERS)
+def test_density_control_acts_within_these_few_steps(densifier):
+    row = next(row for row in DESIGN if row[SLOTS.index("densifier")] == densifier)
+    *_, records = trained(setup_of(row))
+    edits = [key for record in records for key, count in record.counts.items() if count]
+    assert set(edits) - AGGREGATION
+
+
+@pytest.mark.matrix
+def test_member_of_the_full_product_trains_and_repeats(member):
+    check(member)

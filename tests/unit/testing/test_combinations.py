@@ -1,0 +1,43 @@
+"""Refusals as lines: exactly the refusals, in few lines."""
+
+from itertools import product
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crossgrad_core.testing.combinations import as_lines, every_combination, from_lines, refused
+
+ROWS = list(product("abc", "de", "fgh", "ij"))
+REASONS = ("needs K = 2; K = 1 was asked for", "has no: tensors", "is late")
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(ROWS), st.sets(st.sampled_from(REASONS), min_size=1), max_size=len(ROWS)
+    )
+)
+def test_lines_say_neither_more_nor_less(refusals):
+    lines = as_lines(refusals, ROWS)
+    assert {row: set(reasons) for row, reasons in from_lines(lines, ROWS).items()} == refusals
+    assert lines == sorted(set(lines))
+
+
+def test_a_reason_of_two_components_is_one_line_for_all_others():
+    concerned = [row for row in ROWS if row[0] == "b" and row[3] == "i"]
+    found = as_lines(dict.fromkeys(concerned, ("does not fit",)), ROWS)
+    assert found == ["sampler=b densifier=i: does not fit"]
+    concerned = [row for row in ROWS if row[1] == "d"]
+    assert as_lines(dict.fromkeys(concerned, ("is off",)), ROWS) == ["operator=d: is off"]
+
+
+def test_a_reason_against_everything_names_nothing():
+    assert as_lines(dict.fromkeys(ROWS, ("is off",)), ROWS) == [": is off"]
+    assert set(from_lines([": is off"], ROWS)) == set(ROWS)
+
+
+def test_refusals_name_their_reasons_one_by_one():
+    row = ("epoch", "anchors", "vanilla", "adc")
+    assert row in every_combination()
+    (reasons,) = refused([row]).values()
+    assert len(reasons) == 2
+    assert not refused([("random", "sum", "vanilla", "adc")])
