@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept, Layer
-from crossgrad_backbones.anchors.fused_decode.forward import STRETCH, array, stretches
+from crossgrad_backbones.anchors.fused_decode.forward import PANEL, STRETCH, array, stretches
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
@@ -42,10 +42,10 @@ class _Back:
     hidden: Tensor
 
     @classmethod
-    def of(cls, inputs: Inputs, heads: tuple[int, ...]) -> "_Back":
+    def of(cls, inputs: Inputs, kept: Kept, heads: tuple[int, ...]) -> "_Back":
+        count = min(STRETCH, len(kept.hidden))
         outputs = sum(len(inputs.second[head][1]) for head in heads)
         width = inputs.second[0][0].shape[1]
-        count = min(STRETCH, len(inputs.view.rows))
         first = (torch.zeros_like(inputs.first[0]), torch.zeros_like(inputs.first[1]))
         second = (torch.zeros(outputs, width), torch.zeros(outputs))
         buffers = (torch.empty(count, outputs), torch.empty(count, len(heads) * width))
@@ -58,15 +58,18 @@ class _Back:
         mine = slice(begin, begin + self.hidden.shape[1])
         weight = inputs.first[0][mine, :feature]
         whole, buffer = array(kept.hidden), array(self.hidden)
+        anchors = len(kept.tanhs)
         for part in stretches(len(kept.hidden)):
-            count = part.stop - part.start
+            rows, count = part.stop - part.start, min(part.stop, anchors) - part.start
             fill(part.start, count)
-            hidden = self.hidden[:count]
-            self._second(inputs, kept.hidden[part, mine], self.raw[:count], hidden)
-            layers.rectify_back(part.start, count, begin, whole, buffer)
-            self.first[0][mine].addmm_(hidden.T, kept.joined[part])
-            self.first[1][mine].add_(hidden.sum(0))
-            self.features.index_copy_(0, inputs.view.feature_rows[part], hidden @ weight)
+            self.raw[count:rows] = 0.0
+            hidden = self.hidden[:rows]
+            self._second(inputs, kept.hidden[part, mine], self.raw[:rows], hidden)
+            layers.rectify_back(part.start, rows, begin, whole, buffer)
+            self.first[0][mine] += _product(hidden, kept.joined[part])
+            self.first[1][mine] += hidden.sum(0)
+            owners = inputs.view.feature_rows[part]
+            self.features.index_copy_(0, owners, hidden[:count] @ weight)
 
     def _second(self, inputs: Inputs, hidden: Tensor, raw: Tensor, out: Tensor) -> None:
         """Gradient [n, H of all heads] by the rectified layers, and by the second layers."""
@@ -75,7 +78,7 @@ class _Back:
             weight = inputs.second[head][0]
             outputs = slice(at, at + len(weight))
             columns = slice(place * width, (place + 1) * width)
-            self.second[0][outputs].addmm_(raw[:, outputs].T, hidden[:, columns])
+            self.second[0][outputs] += _product(raw[:, outputs], hidden[:, columns])
             torch.mm(raw[:, outputs], weight, out=out[:, columns])
             at = outputs.stop
         self.second[1].add_(raw.sum(0))
@@ -88,6 +91,17 @@ class _Back:
         for head, weight, bias in zip(self.heads, weights, biases, strict=True):
             found[2 * head : 2 * head + 2] = weight, bias
         return found
+
+
+def _product(left: Tensor, right: Tensor) -> Tensor:
+    """[a, b] left [n, a] transposed times right [n, b], n a multiple of `PANEL`.
+
+    Panel by panel: the libraries split one long sum over as many threads as there are, which would
+    let the bits depend on their number.
+    """
+    panels = (each.unflatten(0, (-1, PANEL)) for each in (left, right))
+    first, second = panels
+    return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
@@ -104,7 +118,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
         offsets and of the other two networks are None and cost nothing.
     """
     alone = all((each is not None) == (i == _SCALES) for i, each in enumerate(given))
-    back = _Back.of(inputs, (_COVARIANCE,) if alone else _HEADS)
+    back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)
     by_log_scales = torch.zeros_like(inputs.log_scales)
     by_offsets = None if alone else torch.zeros_like(inputs.offsets)
     means, quats, scales, opacities, colors = _filled(given, kept)

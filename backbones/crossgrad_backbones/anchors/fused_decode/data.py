@@ -64,8 +64,8 @@ class Kept:
     """What the way back needs besides the inputs; G Gaussians are drawn.
 
     Attributes:
-        joined: [A, F + V] inputs of the networks.
-        hidden: [A, 3 H] rectified hidden layers.
+        joined: [A or more, F + V] inputs of the networks, padded with rows of 0.
+        hidden: [A or more, 3 H] rectified hidden layers.
         tanhs: [A, k] opacities before the factor.
         spreads: [A, 6] exponentials of the log scales.
         starts: [A + 1] first Gaussian of each anchor.

@@ -12,6 +12,8 @@ from crossgrad_backbones.anchors.numba_kernels import activation, layers
 
 #: Anchors of a stretch; fixed, so that sums do not depend on the machine.
 STRETCH = 2048
+#: Hidden layers are padded to a multiple of so many rows; divides STRETCH.
+PANEL = 256
 
 
 def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
@@ -23,7 +25,7 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     joined, hidden = _hidden(inputs)
     weight, bias = inputs.second[0]
     width = weight.shape[1]
-    tanhs = torch.addmm(bias, hidden[:, :width], weight.T).tanh_()
+    tanhs = torch.addmm(bias, hidden[: len(inputs.view.rows), :width], weight.T).tanh_()
     opacities = tanhs if inputs.view.factor is None else tanhs * inputs.view.factor[:, None]
     spreads = torch.exp(inputs.log_scales.index_select(0, inputs.view.rows))
     starts = np.empty(len(tanhs) + 1, np.int64)
@@ -55,11 +57,14 @@ def array(tensor: Tensor) -> NDArray[Any]:
 
 
 def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
-    """Inputs [A, F + V] and rectified hidden layers [A, 3 H] of the networks."""
+    """Inputs and rectified hidden layers of the networks, padded: no inputs are 0."""
     weight, bias = inputs.first
-    joined = torch.empty(len(inputs.view.rows), weight.shape[1])
-    read = (inputs.features, inputs.view.feature_rows, inputs.view.views)
-    features, rows, views = map(array, read)
+    anchors = len(inputs.view.rows)
+    joined = torch.empty(anchors + -anchors % PANEL, weight.shape[1])
+    joined[anchors:] = 0.0
+    features, rows, views = map(
+        array, (inputs.features, inputs.view.feature_rows, inputs.view.views)
+    )
     layers.join(features, rows, views, array(joined))
     return joined, torch.addmm(bias, joined, weight.T).relu_()
 
@@ -68,7 +73,7 @@ def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> N
     """Runs the second layers of covariance and colour and writes what is drawn."""
     (_, (cov, cov_bias), (color, color_bias)) = inputs.second
     width = cov.shape[1]
-    for part in stretches(len(hidden)):
+    for part in stretches(len(inputs.view.rows)):
         covariances = torch.addmm(cov_bias, hidden[part, width : 2 * width], cov.T)
         colors = torch.addmm(color_bias, hidden[part, 2 * width :], color.T)
         activation.gather(part.start, array(covariances), array(colors), *arrays)
