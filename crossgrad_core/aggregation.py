@@ -34,8 +34,9 @@ def aggregate_by_gramians(
     weights = np.where(present, _added_rows(matrices), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
-    combined = gradients.combine(weights, granularity)
-    return Aggregated(combined, _counts(gradients, granularity, gramians, present)), state
+    # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
+    counts = _counts(gradients, granularity, gramians, present)
+    return Aggregated(gradients.combine(weights, granularity), counts), state
 
 
 def _added_rows(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -106,9 +106,11 @@ def test_the_fused_pass_is_the_plain_one(options, faded):
         have, want = getattr(mine, name).double(), getattr(plain, name)
         assert (have - want).norm() <= 1e-6 * want.norm()
     for each, exact in zip(gradients, wanted, strict=True):
-        for name, want in exact.items():
-            want = torch.zeros_like(parameters[name]) if want is None else want
-            have = torch.zeros_like(parameters[name]) if each[name] is None else each[name]
+        for name, tensor in parameters.items():
+            have, want = (
+                torch.zeros_like(tensor) if found.get(name) is None else found[name]
+                for found in (each, exact)
+            )
             assert (have.double() - want).norm() <= 1e-5 * want.norm(), name
 
 

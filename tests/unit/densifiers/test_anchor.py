@@ -56,7 +56,8 @@ def context(parameters, views=(), *, step=EDIT, room=10_000, rng=0):
     )
 
 
-def record(anchors, origin, slot, opacities, radii, gradients, decoded):
+def record(anchors, decoded, origin, slot, drawn):
+    opacities, radii, gradients = drawn
     number = len(origin)
     gaussians = Gaussians(
         torch.zeros(number, 3),
@@ -85,12 +86,14 @@ def drawn_records(anchors, views, seed=0):
         records.append(
             record(
                 anchors,
+                decoded,
                 [a for a, _ in pairs],
                 [j for _, j in pairs],
-                rng.uniform(0.01, 1.0, number).tolist(),
-                rng.integers(0, 3, number).tolist(),
-                rng.normal(0.0, 1e-5, (number, 2)).tolist(),
-                decoded,
+                (
+                    rng.uniform(0.01, 1.0, number).tolist(),
+                    rng.integers(0, 3, number).tolist(),
+                    rng.normal(0.0, 1e-5, (number, 2)).tolist(),
+                ),
             )
         )
     return records
@@ -297,7 +300,7 @@ def test_an_anchor_that_never_draws_is_removed():
     parameters = model()
     count = len(parameters["anchors"])
     state = PluginState()
-    view = record(count, [1], [0], [0.5], [1], [[0.0, 0.0]], {0, 1})
+    view = record(count, {0, 1}, [1], [0], ([0.5], [1], [[0.0, 0.0]]))
     for step in range(1510, EDIT + 1):
         edit, state = AnchorControl().densify(context(parameters, [view], step=step), state)
     assert edit.source.tolist() == list(range(1, count))
@@ -361,7 +364,7 @@ def test_sizes_are_capped_at_an_edit_without_losing_moments():
 def test_no_anchors_left_is_no_error():
     parameters = {n: t[:0] if t.dim() else t for n, t in model().items()}
     edit, state = AnchorControl().densify(
-        context(parameters, [record(0, [], [], [], [], [], set())]), PluginState()
+        context(parameters, [record(0, set(), [], [], ([], [], []))]), PluginState()
     )
     assert edit.source is None
     assert all(len(tensor) == 0 for tensor in state.per_primitive.values())

@@ -1,0 +1,263 @@
+"""Where anchors start, what they learn with, and what is baked of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_backbones.anchors.voxels import automatic_voxel_size, voxel_centers
+from crossgrad_backbones.scaffold import Scaffold
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contexts import RegularizeContext
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.spherical import SH_C0
+from crossgrad_core.testing.extremes import jittered
+from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
+from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
+
+SCENE = sample_scene()
+VIEWS = SCENE.train_views
+EVALUATION = sample_phase(training=False)
+
+
+def created(seed=0, **options):
+    return Scaffold(**options).create(SCENE, np.random.default_rng(seed))
+
+
+def test_every_occupied_voxel_has_one_anchor_in_its_middle():
+    voxel = 0.03
+    cells = {tuple(round(float(x) / voxel) for x in point) for point in SCENE.points}
+    anchors = created(voxel_size=voxel)["anchors"]
+    found = {tuple(round(float(x) / voxel) for x in anchor) for anchor in anchors}
+    assert len(anchors) == len(cells) < len(SCENE.points)
+    assert found == cells
+    middles = torch.tensor([[c * voxel for c in cell] for cell in sorted(cells)])
+    assert torch.allclose(anchors, middles, atol=1e-7)
+
+
+def test_the_automatic_voxel_is_the_median_distance_to_the_nearest_point():
+    points = SCENE.points
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    wanted = np.median(distances.min(axis=1))
+    assert automatic_voxel_size(points) == pytest.approx(wanted)
+    assert float(created()["voxel_size"]) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(
+    "points", [np.zeros((1, 3)), np.zeros((5, 3)), np.full((2, 3), 7e4)], ids=["one", "same", "far"]
+)
+def test_degenerate_clouds_have_anchors_too(points):
+    size = automatic_voxel_size(points)
+    assert size > 0
+    assert len(voxel_centers(points, size)) == 1
+
+
+def test_scales_are_the_distances_to_three_neighbours():
+    parameters = created()
+    anchors = parameters["anchors"].double().numpy()
+    distances = np.linalg.norm(anchors[:, None] - anchors[None], axis=2)
+    nearest = np.sort(distances, axis=1)[:, 1:4]
+    wanted = 0.5 * np.log(np.maximum((nearest**2).mean(axis=1), 1e-7))
+    scales = parameters["scales"].detach().numpy()
+    np.testing.assert_allclose(scales, np.repeat(wanted[:, None], 6, axis=1), rtol=1e-4)
+    assert not parameters["offsets"].any() and not parameters["features"].any()
+
+
+def test_networks_start_uniform_as_linear_layers_do():
+    parameters = created(feature=32, offsets=40)
+    for name, width in (("mlp_cov.0", 35), ("mlp_cov.2", 32)):
+        for kind in ("weight", "bias"):
+            values = parameters[f"{name}.{kind}"].detach().numpy()
+            assert np.abs(values).max() <= width**-0.5
+            if kind == "weight":
+                assert values.std() == pytest.approx((width * 3.0) ** -0.5, rel=0.05)
+    other = created(seed=1, feature=32, offsets=40)
+    assert not torch.equal(parameters["mlp_cov.0.weight"], other["mlp_cov.0.weight"])
+
+
+def test_published_learning_rates():
+    rates = {b.name: b.lr for b in Scaffold(feature_bank=True, appearance=4).blocks()}
+    table = {
+        "anchors": (0.0, 0.0),
+        "offsets": (0.01, 1e-4),
+        "features": (0.0075, 0.0075),
+        "scales": (0.007, 0.007),
+        "mlp_opacity": (0.002, 2e-5),
+        "mlp_cov": (0.004, 0.004),
+        "mlp_color": (0.008, 5e-5),
+        "mlp_bank": (0.01, 1e-5),
+        "appearance": (0.05, 5e-4),
+    }
+    for name, (first, last) in table.items():
+        assert (rates[name].at(0.0), rates[name].at(1.0)) == pytest.approx((first, last))
+
+
+def test_a_training_view_has_its_own_code_and_any_other_the_mean():
+    backbone = Scaffold(appearance=3)
+    parameters = backbone.create(SCENE, np.random.default_rng(0))
+
+    def colors(camera, phase):
+        return backbone.decode(parameters, camera, phase).colors.detach()
+
+    camera, training = VIEWS[2].camera, sample_phase()
+    own = colors(camera, training)
+    mean = colors(camera, EVALUATION)
+    assert not torch.allclose(own, mean)
+    stranger = replace(camera, world_to_camera=camera.world_to_camera.clone())
+    stranger.world_to_camera[0, 3] += 1e-9
+    assert torch.allclose(colors(stranger, training), mean, atol=1e-5)
+    with torch.no_grad():
+        parameters["appearance"][:] = parameters["appearance"][2].clone()
+    assert torch.allclose(colors(camera, EVALUATION), own, atol=1e-5)
+
+
+def regularized(backbone, gaussians):
+    context = RegularizeContext(
+        **step_fields(), parameters={}, backbone=backbone, gaussians=gaussians, view=VIEWS[0]
+    )
+    return backbone.crossgrad_regularize(context)
+
+
+def test_the_volume_is_regularized_per_view():
+    gaussians = Gaussians(
+        torch.zeros(2, 3),
+        torch.zeros(2, 4),
+        torch.tensor([[1.0, 2.0, 3.0], [0.5, 0.5, 4.0]]),
+        torch.zeros(2),
+    )
+    assert float(regularized(Scaffold(), gaussians).loss) == pytest.approx(0.01 * (6.0 + 1.0) / 2)
+    nothing = gaussians.mapped(lambda tensor: tensor[:0])
+    assert float(regularized(Scaffold(), nothing).loss) == 0.0
+    assert regularized(Scaffold(), None) is None
+    assert regularized(Scaffold(volume_weight=0.0), gaussians) is None
+
+
+def test_a_ply_gives_anchors_where_its_visible_gaussians_are():
+    means = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    gaussians = Gaussians(
+        means, torch.zeros(3, 4), torch.ones(3, 3), torch.tensor([0.5, 0.001, 0.9])
+    )
+    adopted = Scaffold(voxel_size=0.1).adopt(gaussians, SCENE, np.random.default_rng(0))
+    assert torch.allclose(adopted["anchors"], means[[0, 2]], atol=1e-6)
+
+
+def spread():
+    """A backbone whose anchors are partly out of sight, and its parameters."""
+    backbone = Scaffold(offsets=4)
+    parameters = {n: t.detach().clone() for n, t in jittered(backbone).items()}
+    parameters["anchors"] *= 6.0
+    return backbone, parameters
+
+
+@pytest.mark.parametrize("view", [0, 3, 7])
+def test_baked_for_one_camera_is_what_it_sees(view):
+    backbone, parameters = spread()
+    camera = VIEWS[view].camera
+    live = backbone.decode(parameters, camera, EVALUATION).detached()
+    baked = backbone.bake(parameters, EVALUATION, [camera])
+    # Those out of sight are in the file too, and stay out of sight.
+    assert len(baked) > (live.opacities >= 1 / 255).sum()
+    rasterizer, black = TorchRasterizer(), torch.zeros(3)
+    seen = rasterizer.render(live, camera, black).image
+    drawn = rasterizer.render(baked, camera, black).image
+    assert seen.max() > 0.05
+    assert (drawn - seen).abs().mean() < 2e-3
+    inside = live.decoded.sum()
+    assert 0 < inside < len(live.decoded)
+
+
+def looks(backbone, parameters, camera):
+    """(anchor, slot) -> opacity, mean, scales, unit quaternion, colour for a camera's anchors."""
+    found = backbone.decode(parameters, camera, EVALUATION)
+    quats = torch.nn.functional.normalize(found.quats)
+    table = {}
+    for i, key in enumerate(zip(found.origin.tolist(), found.slot.tolist(), strict=True)):
+        parts = (found.means, found.scales, quats, found.colors)
+        table[key] = (float(found.opacities[i]), *(part[i].double().numpy() for part in parts))
+    return found.decoded, table
+
+
+def averaged(tables, anchor, slot, views):
+    """What is baked for one slot: (mean, scales, quaternion, opacity, colour), None if faint."""
+    parts = [table[anchor, slot] for _, table in tables if (anchor, slot) in table]
+    total = sum(part[0] for part in parts)
+    if total / views < 1 / 255:
+        return None
+    scales, colors = (sum(part[0] * part[k] for part in parts) / total for k in (2, 4))
+    rotation = np.zeros(4)
+    for opacity, _, _, quat, _ in parts:
+        rotation += opacity * (quat if quat @ rotation >= 0 else -quat)
+    return parts[0][1], scales, rotation / np.linalg.norm(rotation), total / views, colors
+
+
+def test_baked_for_several_cameras_is_the_mean_of_those_that_see_an_anchor():
+    backbone, parameters = spread()
+    cameras = [view.camera for view in VIEWS]
+    tables = [looks(backbone, parameters, camera) for camera in cameras]
+    views = torch.stack([decoded for decoded, _ in tables]).sum(0)
+    assert views.min() > 0 and 0 < views.median() < len(cameras)
+    baked = backbone.bake(parameters, EVALUATION, cameras)
+    wanted = [
+        found
+        for anchor, count in enumerate(views.tolist())
+        for slot in range(backbone.offsets)
+        if (found := averaged(tables, anchor, slot, count)) is not None
+    ]
+    assert len(baked) == len(wanted) > 10
+    means, scales, quats, opacities, colors = (np.array(w) for w in zip(*wanted, strict=True))
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    np.testing.assert_allclose(baked.means, means, **close)
+    np.testing.assert_allclose(baked.scales, scales, **close)
+    np.testing.assert_allclose(baked.opacities, opacities, **close)
+    np.testing.assert_allclose(np.abs((baked.quats.double().numpy() * quats).sum(1)), 1.0, **close)
+    np.testing.assert_allclose(baked.sh_dc[:, 0] * SH_C0 + 0.5, colors, **close)
+
+
+def test_an_anchor_that_no_camera_sees_is_baked_as_all_would_see_it():
+    backbone, parameters = spread()
+    cameras = [view.camera for view in VIEWS[:2]]
+    behind = replace(
+        cameras[0],
+        world_to_camera=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
+        @ cameras[0].world_to_camera,
+    )
+    assert not backbone.decode(parameters, behind, EVALUATION).decoded.any()
+    baked = backbone.bake(parameters, EVALUATION, [behind])
+    wide = replace(cameras[0], width=4000, height=4000, cx=2000.0, cy=2000.0)
+    seen = backbone.decode(parameters, wide, EVALUATION)
+    assert seen.decoded.all()
+    drawn = seen.opacities >= 1 / 255
+    np.testing.assert_allclose(baked.means, seen.means[drawn].detach(), atol=1e-5)
+    np.testing.assert_allclose(baked.opacities, seen.opacities[drawn].detach(), atol=1e-5)
+
+
+def test_at_most_so_many_cameras_are_averaged():
+    from crossgrad_backbones.anchors.baking import evenly
+
+    cameras = [VIEWS[i % len(VIEWS)].camera for i in range(100)]
+    chosen = evenly(cameras, 32)
+    assert len(chosen) == 32 and chosen[0] is cameras[0] and chosen[16] is cameras[50]
+    assert evenly(cameras[:5], 32) == cameras[:5]
+
+
+@pytest.mark.parametrize("options", [{}, {"appearance": 2, "feature_bank": True}])
+def test_training_lowers_the_loss(options):
+    config = RunConfig(
+        steps=60,
+        backbone=ComponentChoice(name="scaffold", **options),
+        operator=ComponentChoice(name="pcgrad"),
+        sampler=ComponentChoice(name="random"),
+        densify_from=10,
+        densify_until=50,
+        densify_every=10,
+    )
+    setup = assemble(config, SCENE, "none")
+    state = first_state(setup)
+    losses = [sum(timed_step(setup, state).losses) for _ in range(60)]
+    assert sum(losses[-20:]) < 0.9 * sum(losses[:20])
+    assert all(t.isfinite().all() for t in state.parameters.values())
