@@ -8,11 +8,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from crossgrad_backbones.anchors.activation import Seen
+from crossgrad_backbones.anchors.directional import ColorFit
 from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.scene.types import Camera
-from crossgrad_core.spherical import SH_C0
 
 #: The average is taken over at most so many cameras.
 BAKED_CAMERAS = 32
@@ -24,37 +24,60 @@ def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How A anchors of k slots look to a camera.
+
+    Attributes:
+        opacities: [A, k], 0 where nothing is drawn.
+        covariances: [A, k, 7] scales and unit quaternion.
+        colors: [A, k, 3] RGB.
+        directions: [A, k, 3] unit vectors from the camera to the Gaussians' centres.
+    """
+
+    opacities: Tensor
+    covariances: Tensor
+    colors: Tensor
+    directions: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class _Sums:
     """Sums over cameras, for all P anchors and k slots.
 
     Attributes:
         cameras: [P, 1] cameras that counted.
         opacities: [P, k].
-        looks: [P, k, 10] scales, quaternion and colour, each times the opacity.
+        covariances: [P, k, 7], weighted with the opacities.
+        colors: Colours by direction, weighted likewise.
     """
 
     cameras: Tensor
     opacities: Tensor
-    looks: Tensor
+    covariances: Tensor
+    colors: ColorFit
 
     @classmethod
-    def zeros(cls, anchors: int, slots: int, like: Tensor) -> "_Sums":
+    def zeros(cls, offsets: Tensor) -> "_Sums":
+        """For offsets [P, k, 3]."""
+        shape = offsets.shape[:2]
         return cls(
-            like.new_zeros(anchors, 1),
-            like.new_zeros(anchors, slots),
-            like.new_zeros(anchors, slots, COVARIANCE + 3),
+            offsets.new_zeros(shape[0], 1),
+            offsets.new_zeros(shape),
+            offsets.new_zeros(*shape, COVARIANCE),
+            ColorFit.zeros(offsets),
         )
 
-    def add(self, rows: Tensor, opacities: Tensor, looks: Tensor) -> None:
+    def add(self, rows: Tensor, look: Look) -> None:
         """Adds what one camera sees of anchors `rows`."""
-        sums = self.looks[rows]
+        sums = self.covariances[rows]
         # A quaternion and its negative are the same rotation.
-        along = (sums[..., 3:7] * looks[..., 3:7]).sum(-1, keepdim=True)
-        looks[..., 3:7] *= torch.where(along < 0, -1.0, 1.0)
-        self.looks[rows] = sums + opacities[..., None] * looks
-        self.opacities[rows] += opacities
+        along = (sums[..., 3:] * look.covariances[..., 3:]).sum(-1, keepdim=True)
+        look.covariances[..., 3:] *= torch.where(along < 0, -1.0, 1.0)
+        self.covariances[rows] = sums + look.opacities[..., None] * look.covariances
+        self.opacities[rows] += look.opacities
         self.cameras[rows] += 1.0
+        self.colors.add(rows, look.opacities, look.directions, look.colors)
 
 
 @torch.no_grad()
@@ -66,9 +89,9 @@ def baked(
 ) -> Gaussians:
     """Plain Gaussians, for every anchor the mean over the cameras that see it.
 
-    Opacities are averaged with 0 for cameras that do not draw a Gaussian; scales, rotations and
-    colours are averaged with the opacities as weights. An anchor that no camera sees is taken as
-    all of them would see it.
+    Opacities are averaged with 0 for cameras that do not draw a Gaussian; scales and rotations are
+    averaged with the opacities as weights, and so are colours, up to the first band of spherical
+    harmonics. An anchor that no camera sees is taken as all of them would see it.
 
     Args:
         heads: The networks.
@@ -77,51 +100,55 @@ def baked(
         code: [C] appearance code, or None.
 
     Returns:
-        Gaussians with `sh_dc` that are drawn somewhere, anchor by anchor.
+        Gaussians of degree 1 that are drawn somewhere, anchor by anchor.
     """
-    offsets = parameters["offsets"]
-    anchors, slots = offsets.shape[:2]
-    sums = _Sums.zeros(anchors, slots, offsets)
+    sums = _Sums.zeros(parameters["offsets"])
     for camera, seen in views:
-        sums.add(seen.rows, *_looks(heads, parameters, camera, seen, code))
+        sums.add(seen.rows, _look(heads, parameters, camera, seen, code))
     unseen = Seen((sums.cameras[:, 0] == 0).nonzero().squeeze(1))
     for camera, _ in views if len(unseen.rows) else ():
-        sums.add(unseen.rows, *_looks(heads, parameters, camera, unseen, code))
+        sums.add(unseen.rows, _look(heads, parameters, camera, unseen, code))
     return _drawn(parameters, sums)
 
 
-def _looks(
+def _look(
     heads: Heads,
     parameters: Mapping[str, Tensor],
     camera: Camera,
     seen: Seen,
     code: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Opacities [A, k], 0 where nothing is drawn, and scales, unit quaternions, colours."""
-    positions = parameters["anchors"][seen.rows]
-    features = parameters["features"][seen.rows]
-    views = heads.views(positions - camera.center.to(positions))
-    raw = heads.raw(parameters, features, views, code)
+) -> Look:
+    anchors, offsets, features, log_scales = (
+        parameters[name][seen.rows] for name in ("anchors", "offsets", "features", "scales")
+    )
+    eye = camera.center.to(anchors)
+    raw = heads.raw(parameters, features, heads.views(anchors - eye), code)
     opacities = torch.tanh(raw.opacities).clamp(min=0.0)
     if seen.factor is not None:
         opacities *= seen.factor[:, None]
-    slots = heads.offsets
-    covariances = raw.covariances.view(-1, slots, COVARIANCE)
-    sizes = torch.exp(parameters["scales"][seen.rows, 3:])[:, None, :]
-    scales = sizes * torch.sigmoid(covariances[..., :3])
-    colors = torch.sigmoid(raw.colors.view(-1, slots, 3))
-    return opacities, torch.cat([scales, normalize(covariances[..., 3:], dim=-1), colors], -1)
+    covariances = raw.covariances.view(-1, heads.offsets, COVARIANCE)
+    stretch, size = torch.split(torch.exp(log_scales)[:, None, :], 3, -1)
+    scales = size * torch.sigmoid(covariances[..., :3])
+    return Look(
+        opacities,
+        torch.cat([scales, normalize(covariances[..., 3:], dim=-1)], -1),
+        torch.sigmoid(raw.colors.view(-1, heads.offsets, 3)),
+        normalize(anchors[:, None] + offsets * stretch - eye, dim=-1),
+    )
 
 
 def _drawn(parameters: Mapping[str, Tensor], sums: _Sums) -> Gaussians:
     opacities = sums.opacities / sums.cameras
     anchor, slot = (opacities >= ALPHA_THRESHOLD).nonzero().unbind(1)
-    looks = sums.looks[anchor, slot] / sums.opacities[anchor, slot][:, None]
+    covariances = sums.covariances[anchor, slot] / sums.opacities[anchor, slot][:, None]
     stretch = torch.exp(parameters["scales"][anchor, :3])
+    harmonics = sums.colors.solved(anchor, slot)
     return Gaussians(
         means=parameters["anchors"][anchor] + parameters["offsets"][anchor, slot] * stretch,
-        quats=normalize(looks[:, 3:7], dim=-1),
-        scales=looks[:, :3],
+        quats=normalize(covariances[:, 3:], dim=-1),
+        scales=covariances[:, :3],
         opacities=opacities[anchor, slot],
-        sh_dc=((looks[:, 7:] - 0.5) / SH_C0)[:, None, :],
+        sh_dc=harmonics[:, :1],
+        sh_rest=harmonics[:, 1:],
+        sh_degree=1,
     )

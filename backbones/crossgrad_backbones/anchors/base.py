@@ -3,12 +3,10 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
@@ -17,10 +15,9 @@ from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.baking import BAKED_CAMERAS, baked, evenly
 from crossgrad_backbones.anchors.decode import decoded
 from crossgrad_backbones.anchors.frustum import in_frustum
-from crossgrad_backbones.anchors.heads import Heads
+from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_backbones.anchors.volume import mean_volume
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.blocks import Parameters
 from crossgrad_core.contexts import RegularizeContext, Regularized
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.hooks import hookimpl
@@ -28,8 +25,6 @@ from crossgrad_core.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.scene.types import Camera, Scene
 from crossgrad_core.schedule import Phase
 from crossgrad_core.splats import nearest_neighbour_scales
-
-_FROZEN = LearningRate(0.0)
 
 
 @dataclass(frozen=True)
@@ -45,7 +40,7 @@ class Used:
     factor: Tensor | None = None
 
 
-class AnchorBackbone(Backbone):
+class AnchorBackbone(AnchorOptions):
     """Anchors with a feature each, which networks decode to k Gaussians per anchor and view.
 
     A backbone of this family says where its anchors start and which of them a camera uses.
@@ -56,66 +51,6 @@ class AnchorBackbone(Backbone):
     rotation and the opacity of an anchor, which the published code holds but never trains, are left
     out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
     """
-
-    default_densifier: ClassVar[str] = "anchor"
-
-    offsets: int = Field(10, ge=1, description="Gaussians per anchor")
-    feature: int = Field(32, ge=1, description="width of the feature and of the hidden layers")
-    opacity_distance: bool = Field(default=False, description="opacity depends on the distance")
-    cov_distance: bool = Field(default=False, description="covariance depends on the distance")
-    color_distance: bool = Field(default=False, description="colour depends on the distance")
-    feature_bank: bool = Field(default=False, description="mix the feature at three strides")
-    appearance: int = Field(0, ge=0, description="width of a code per training view; 0: none")
-    volume_weight: float = Field(0.01, ge=0, description="weight of the mean volume, extents cubed")
-    lr_offsets: float = Field(0.01, gt=0, description="initial, per scene extent")
-    lr_offsets_final: float = Field(1e-4, gt=0, description="final, per scene extent")
-    lr_features: float = Field(0.0075, ge=0, description="learning rate of the features")
-    lr_scales: float = Field(0.007, ge=0, description="learning rate of the log scales")
-    lr_opacity: float = Field(0.002, gt=0, description="initial, network of the opacity")
-    lr_opacity_final: float = Field(2e-5, gt=0, description="final, network of the opacity")
-    lr_cov: float = Field(0.004, ge=0, description="network of the covariance")
-    lr_color: float = Field(0.008, gt=0, description="initial, network of the colour")
-    lr_color_final: float = Field(5e-5, gt=0, description="final, network of the colour")
-    lr_bank: float = Field(0.01, gt=0, description="initial, feature bank")
-    lr_bank_final: float = Field(1e-5, gt=0, description="final, feature bank")
-    lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
-    lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
-
-    @property
-    def heads(self) -> Heads:
-        """The networks."""
-        far = (self.opacity_distance, self.cov_distance, self.color_distance)
-        return Heads(self.offsets, self.feature, far, self.appearance, self.feature_bank)
-
-    @override
-    def blocks(self) -> tuple[Block, ...]:
-        rates = {
-            "mlp_opacity": LearningRate(self.lr_opacity, self.lr_opacity_final),
-            "mlp_cov": LearningRate(self.lr_cov),
-            "mlp_color": LearningRate(self.lr_color, self.lr_color_final),
-            "mlp_bank": LearningRate(self.lr_bank, self.lr_bank_final),
-        }
-        kinds: dict[str, BlockKind] = {"mlp_cov": "geometry", "mlp_bank": "neutral"}
-        offsets = LearningRate(self.lr_offsets, self.lr_offsets_final)
-        return (
-            Block("anchors", ("anchors",), True, "geometry", _FROZEN),
-            Block("offsets", ("offsets",), True, "geometry", offsets),
-            Block("features", ("features",), True, "neutral", LearningRate(self.lr_features)),
-            Block("scales", ("scales",), True, "geometry", LearningRate(self.lr_scales)),
-            *(n.block(kinds.get(n.name, "appearance"), rates[n.name]) for n in self.heads.networks),
-            Block("voxel_size", ("voxel_size",), False, "geometry", _FROZEN),
-            *self._appearance_blocks(),
-        )
-
-    def _appearance_blocks(self) -> tuple[Block, ...]:
-        if not self.appearance:
-            return ()
-        rate = LearningRate(self.lr_appearance, self.lr_appearance_final)
-        codes, poses = appearance.CODES, appearance.POSES
-        return (
-            Block(codes, (codes,), False, "appearance", rate),
-            Block(poses, (poses,), False, "appearance", _FROZEN),
-        )
 
     def created(
         self,

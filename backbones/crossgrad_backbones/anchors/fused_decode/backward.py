@@ -99,8 +99,7 @@ def _product(left: Tensor, right: Tensor) -> Tensor:
     Panel by panel: the libraries split one long sum over as many threads as there are, which would
     let the bits depend on their number.
     """
-    panels = (each.unflatten(0, (-1, PANEL)) for each in (left, right))
-    first, second = panels
+    first, second = (torch.unflatten(each, 0, (-1, PANEL)) for each in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 

@@ -1,0 +1,77 @@
+"""Options of the backbones of anchors, and the blocks that follow from them."""
+
+from typing import ClassVar
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_backbones.anchors import appearance
+from crossgrad_backbones.anchors.heads import Heads
+from crossgrad_core.backbone import Backbone
+from crossgrad_core.blocks import Block, BlockKind, LearningRate
+
+_FROZEN = LearningRate(0.0)
+
+
+class AnchorOptions(Backbone):
+    """The published options of Scaffold-GS; methods of section 2.4 and 2.9."""
+
+    default_densifier: ClassVar[str] = "anchor"
+
+    offsets: int = Field(10, ge=1, description="Gaussians per anchor")
+    feature: int = Field(32, ge=1, description="width of the feature and of the hidden layers")
+    opacity_distance: bool = Field(default=False, description="opacity depends on the distance")
+    cov_distance: bool = Field(default=False, description="covariance depends on the distance")
+    color_distance: bool = Field(default=False, description="colour depends on the distance")
+    feature_bank: bool = Field(default=False, description="mix the feature at three strides")
+    appearance: int = Field(0, ge=0, description="width of a code per training view; 0: none")
+    volume_weight: float = Field(0.01, ge=0, description="weight of the mean volume, extents cubed")
+    lr_offsets: float = Field(0.01, gt=0, description="initial, per scene extent")
+    lr_offsets_final: float = Field(1e-4, gt=0, description="final, per scene extent")
+    lr_features: float = Field(0.0075, ge=0, description="learning rate of the features")
+    lr_scales: float = Field(0.007, ge=0, description="learning rate of the log scales")
+    lr_opacity: float = Field(0.002, gt=0, description="initial, network of the opacity")
+    lr_opacity_final: float = Field(2e-5, gt=0, description="final, network of the opacity")
+    lr_cov: float = Field(0.004, ge=0, description="network of the covariance")
+    lr_color: float = Field(0.008, gt=0, description="initial, network of the colour")
+    lr_color_final: float = Field(5e-5, gt=0, description="final, network of the colour")
+    lr_bank: float = Field(0.01, gt=0, description="initial, feature bank")
+    lr_bank_final: float = Field(1e-5, gt=0, description="final, feature bank")
+    lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
+    lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
+
+    @property
+    def heads(self) -> Heads:
+        """The networks."""
+        far = (self.opacity_distance, self.cov_distance, self.color_distance)
+        return Heads(self.offsets, self.feature, far, self.appearance, self.feature_bank)
+
+    @override
+    def blocks(self) -> tuple[Block, ...]:
+        rates = {
+            "mlp_opacity": LearningRate(self.lr_opacity, self.lr_opacity_final),
+            "mlp_cov": LearningRate(self.lr_cov),
+            "mlp_color": LearningRate(self.lr_color, self.lr_color_final),
+            "mlp_bank": LearningRate(self.lr_bank, self.lr_bank_final),
+        }
+        kinds: dict[str, BlockKind] = {"mlp_cov": "geometry", "mlp_bank": "neutral"}
+        offsets = LearningRate(self.lr_offsets, self.lr_offsets_final)
+        return (
+            Block("anchors", ("anchors",), True, "geometry", _FROZEN),
+            Block("offsets", ("offsets",), True, "geometry", offsets),
+            Block("features", ("features",), True, "neutral", LearningRate(self.lr_features)),
+            Block("scales", ("scales",), True, "geometry", LearningRate(self.lr_scales)),
+            *(n.block(kinds.get(n.name, "appearance"), rates[n.name]) for n in self.heads.networks),
+            Block("voxel_size", ("voxel_size",), False, "geometry", _FROZEN),
+            *self._appearance_blocks(),
+        )
+
+    def _appearance_blocks(self) -> tuple[Block, ...]:
+        if not self.appearance:
+            return ()
+        rate = LearningRate(self.lr_appearance, self.lr_appearance_final)
+        codes, poses = appearance.CODES, appearance.POSES
+        return (
+            Block(codes, (codes,), False, "appearance", rate),
+            Block(poses, (poses,), False, "appearance", _FROZEN),
+        )
