@@ -6,9 +6,10 @@ at offset (u, v) along the main axes of standard deviations sigma1 and sigma2 ge
 
     W(u, sigma) = F((|u| + 1/2) / sigma) - F((|u| - 1/2) / sigma).
 
-With x = -|u| / sigma, h = 1 / (2 sigma), c the cubic, and D = c(x + h) - c(x - h) in closed form,
-W = sigmoid(c(x + h)) sigmoid(-c(x - h)) (1 - exp(-D)): products only, so neither tails nor wide
-Gaussians cancel. The derivatives below keep to the same terms.
+With t = |u| / sigma, h = 1 / (2 sigma), c the cubic, and D = c(t + h) - c(t - h) in closed form,
+W = (1 - exp(-D)) / ((1 + U) (1 + L)) where U = exp(c(t - h)) and L = exp(-c(t + h)), so that
+exp(-D) = U L. Where D is small a series takes its place, so that wide Gaussians do not cancel. The
+derivatives below keep to the same terms.
 """
 
 import math
@@ -38,14 +39,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
     COSINE,
+    LEAST_ALPHA,
     LOG2_E,
-    OPACITY,
     REACH_1,
     REACH_2,
     SEGMENT,
-    SIGMA_1,
-    SIGMA_2,
     SINE,
+    SPARE,
     TILE_HEIGHT,
     U_PART,
     U_WHOLE,
@@ -56,7 +56,20 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 LINEAR, CUBIC = 1.6, 0.07
 #: Smallest standard deviation along a main axis, px.
 SIGMA_FLOOR = 1e-3
+#: Largest one: flat over any image, and the product of two still is a float32.
+SIGMA_CEILING = 1e18
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
+#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, F'(0) = LINEAR / 4; a test makes sure.
+TAIL = 0.9975
+
+# (1 - exp(-D)) / D on [0, 1/2] by rising power: least largest relative error (8e-8).
+_SERIES = (
+    0.999999922724565,
+    -0.4999924984754078,
+    0.1665481515263426,
+    -0.04100127889584338,
+    0.006771038068732109,
+)
 
 #: Row buffer: offset along both axes of the row's first pixel centre.
 ROW_U = 0
@@ -96,33 +109,32 @@ def _cubic(x: float) -> float:
 
 
 @device
-def _sigmoid(x: float) -> float:
-    return 1.0 / (1.0 + math.exp(-max(x, -700.0)))
-
-
-@device
 def window(offset: float, sigma: float) -> float:
     """Returns sqrt(2 pi) sigma W(offset, sigma), in double precision."""
-    x, h = -abs(offset) / sigma, 0.5 / sigma
-    difference = 2.0 * h * (LINEAR + CUBIC * (3.0 * x * x + h * h))
-    share = _sigmoid(_cubic(x + h)) * _sigmoid(-_cubic(x - h)) * -math.expm1(-difference)
+    t, h = abs(offset) / sigma, 0.5 / sigma
+    upper, lower = math.exp(min(_cubic(t - h), 700.0)), math.exp(-_cubic(t + h))
+    difference = 2.0 * h * (LINEAR + CUBIC * (3.0 * t * t + h * h))
+    share = -math.expm1(-difference) / ((1.0 + upper) * (1.0 + lower))
     return _ROOT_2_PI * sigma * share
 
 
 @device
-def window_reach(sigma: float, log_contrast: float) -> float:
-    """Returns an offset beyond which the window W is below exp(-log_contrast).
+def central_window(sigma: float) -> float:
+    """Returns `window` at offset 0."""
+    return _ROOT_2_PI * sigma * math.tanh(0.5 * _cubic(0.5 / sigma))
 
-    Beyond half a pixel W < sigmoid(-y) < exp(-y) with y the cubic of t = (offset - 1/2) / sigma;
-    y(t) = log_contrast has one real root.
+
+@device
+def squared_radius(opacity: float) -> float:
+    """Returns R^2 such that a pixel is touched only where d1^2 + d2^2 <= R^2.
+
+    d is how far beyond half a pixel the pixel centre is from the mean along an axis, in sigmas. As
+    a mean of F' over [t - h, t + h], sigma W is at most F'(0) exp(-TAIL d^2 / 2), so that alpha is
+    at most 2 pi F'(0)^2 exp(-TAIL (d1^2 + d2^2) / 2) times the opacity.
     """
-    p = LINEAR / (3.0 * CUBIC)
-    t = (
-        2.0
-        * math.sqrt(p)
-        * math.sinh(math.asinh(max(log_contrast, 0.0) / (2.0 * CUBIC * p * math.sqrt(p))) / 3.0)
-    )
-    return 0.5 + sigma * t
+    contrast = 2.0 * math.pi * (LINEAR / 4.0) ** 2 * opacity / LEAST_ALPHA
+    # The spare outweighs the rounding of everything that is compared with it.
+    return 2.0 / TAIL * math.log(max(contrast, 1.0)) + SPARE
 
 
 @device
@@ -170,96 +182,133 @@ def _number(value: float) -> Lanes:
 
 
 @device
-def _exp(power: Lanes, constants: NDArray[np.float32]) -> Lanes:
-    """Returns exp(power) for |power| < 69, and exp(+-69) beyond."""
-    limited = larger(smaller(power * _number(LOG2_E), _number(100.0)), _number(-100.0))
-    return exp2(limited, constants)
+def _power(x: Lanes) -> Lanes:
+    """Returns c(x) in units of log 2."""
+    return x * fma(_number(CUBIC * LOG2_E), x * x, _number(LINEAR * LOG2_E))
 
 
 @device
-def _one_minus_exp(power: Lanes, constants: NDArray[np.float32]) -> Lanes:
-    """Returns 1 - exp(-power) for power >= 0, right to a few roundings also where it is small."""
-    series = _number(-1.0 / 40320.0)
-    series = fma(series, power, _number(1.0 / 5040.0))
-    series = fma(series, power, _number(-1.0 / 720.0))
-    series = fma(series, power, _number(1.0 / 120.0))
-    series = fma(series, power, _number(-1.0 / 24.0))
-    series = fma(series, power, _number(1.0 / 6.0))
-    series = fma(series, power, _number(-0.5))
-    series = fma(series, power, _number(1.0))
-    beyond = _number(1.0) - _exp(_number(0.0) - power, constants)
-    return where(power <= _number(0.5), series * power, beyond)
+def _share(difference: Lanes, both: Lanes) -> Lanes:
+    """Returns 1 - exp(-D) given D >= 0 and exp(-D), right to a few roundings also for small D."""
+    series = _number(_SERIES[4])
+    series = fma(series, difference, _number(_SERIES[3]))
+    series = fma(series, difference, _number(_SERIES[2]))
+    series = fma(series, difference, _number(_SERIES[1]))
+    series = fma(series, difference, _number(_SERIES[0]))
+    return where(difference <= _number(0.5), series * difference, _number(1.0) - both)
 
 
 @device
-def _cubics(x: Lanes) -> Lanes:
-    return x * fma(_number(CUBIC), x * x, _number(LINEAR))
-
-
-@device
-def _slopes(x: Lanes) -> Lanes:
-    return fma(_number(3.0 * CUBIC), x * x, _number(LINEAR))
-
-
-@device
-def windows(
-    offset: Lanes, sigma: Lanes, inverse_sigma: Lanes, constants: NDArray[np.float32]
-) -> Lanes:
-    """Returns sqrt(2 pi) sigma W(offset, sigma)."""
-    x = _number(0.0) - magnitude(offset) * inverse_sigma
-    h = _number(0.5) * inverse_sigma
-    one = _number(1.0)
-    upper = _exp(_number(0.0) - _cubics(x + h), constants)
-    lower = _exp(_cubics(x - h), constants)
-    difference = (h + h) * fma(_number(CUBIC), fma(_number(3.0), x * x, h * h), _number(LINEAR))
-    share = _one_minus_exp(difference, constants) / ((one + upper) * (one + lower))
-    return _number(_ROOT_2_PI) * sigma * share
-
-
-@device
-def log_window_gradients(
+def _window_terms(
     offset: Lanes, inverse_sigma: Lanes, constants: NDArray[np.float32]
-) -> tuple[Lanes, Lanes]:
-    """Returns sigma times the derivatives of log(sigma W) by the offset and by sigma."""
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Returns U, L, 1 - exp(-D) and (1 + U) (1 + L); powers beyond 2**+-100 are cut there."""
     zero, one = _number(0.0), _number(1.0)
-    x = zero - magnitude(offset) * inverse_sigma
-    h = _number(0.5) * inverse_sigma
-    a, b = x - h, x + h
-    upper = _exp(zero - _cubics(b), constants)
-    lower = _exp(_cubics(a), constants)
-    spread = fma(_number(3.0), x * x, h * h)
-    difference = (h + h) * fma(_number(CUBIC), spread, _number(LINEAR))
-    share = _one_minus_exp(difference, constants)
-    # g = 1 / (exp(D) - 1); above, 1 - F(x + h); below, F(x - h): of which d(log W) consists.
-    g = (one - share) / share
-    above, below = _slopes(b) * (upper / (one + upper)), _slopes(a) * (lower / (one + lower))
-    by_x = fma(g, _number(12.0 * CUBIC) * x * h, above - below)
-    by_offset = where(offset < zero, by_x, zero - by_x)
-    by_sigma = one - g * fma(_number(4.0 * CUBIC) * h, spread, difference)
-    by_sigma = by_sigma - (b * above - a * below)
-    return by_offset, by_sigma
+    t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
+    least, most = _number(-100.0), _number(100.0)
+    upper = exp2(larger(smaller(_power(t - h), most), least), constants)
+    lower = exp2(larger(zero - _power(t + h), least), constants)
+    spread = fma(_number(3.0), t * t, h * h)
+    difference = inverse_sigma * fma(_number(CUBIC), spread, _number(LINEAR))
+    share = _share(difference, upper * lower)
+    return upper, lower, share, (one + upper) * (one + lower)
 
 
 @device
-def axis_offsets(
-    records: NDArray[np.float32],
-    record: int,
-    offsets: Lanes,
-    rows: NDArray[np.float32],
-    row: int,
-) -> tuple[Lanes, Lanes]:
-    """Returns the offsets along the main axes of pixels `offsets` right of the row's first."""
-    u = fma(broadcast(records, record + COSINE), offsets, broadcast(rows, row + ROW_U))
-    v = fnma(broadcast(records, record + SINE), offsets, broadcast(rows, row + ROW_V))
-    return u, v
+def near_enough(
+    u: Lanes, v: Lanes, inverse_1: Lanes, inverse_2: Lanes, squared: Lanes
+) -> np.uint64:
+    """Returns as bits which pixels may be touched (see `squared_radius`)."""
+    zero, half = _number(0.0), _number(0.5)
+    first = larger(magnitude(u) - half, zero) * inverse_1
+    second = larger(magnitude(v) - half, zero) * inverse_2
+    return bits(fma(second, second, first * first) <= squared)
 
 
 @device
 def coverages(
-    records: NDArray[np.float32], record: int, u: Lanes, v: Lanes, constants: NDArray[np.float32]
+    peak: Lanes,
+    u: Lanes,
+    v: Lanes,
+    inverse_1: Lanes,
+    inverse_2: Lanes,
+    constants: NDArray[np.float32],
 ) -> Lanes:
-    """Returns alpha before the cap at offsets (u, v) along the main axes."""
-    sigma_1, sigma_2 = broadcast(records, record + SIGMA_1), broadcast(records, record + SIGMA_2)
-    first = windows(u, sigma_1, _number(1.0) / sigma_1, constants)
-    second = windows(v, sigma_2, _number(1.0) / sigma_2, constants)
-    return broadcast(records, record + OPACITY) * first * second
+    """Returns alpha before the cap at offsets (u, v) along the main axes.
+
+    Args:
+        peak: 2 pi sigma1 sigma2 times the opacity.
+        u: Pixels; likewise `v`.
+        v: See `u`.
+        inverse_1: 1 / sigma1; likewise `inverse_2`.
+        inverse_2: See `inverse_1`.
+        constants: From `vector_constants`.
+    """
+    first = _window_terms(u, inverse_1, constants)
+    second = _window_terms(v, inverse_2, constants)
+    return peak * (first[2] * second[2]) * (_number(1.0) / (first[3] * second[3]))
+
+
+@device
+def _log_window_gradients(
+    offset: Lanes,
+    inverse_sigma: Lanes,
+    upper: Lanes,
+    lower: Lanes,
+    share: Lanes,
+    inverse_both: Lanes,
+) -> tuple[Lanes, Lanes]:
+    """Returns sigma times the derivatives of log(sigma W) by the offset and by sigma.
+
+    `inverse_both` is 1 / ((1 + U) (1 + L)); the others are as in `_window_terms`.
+    """
+    zero, one = _number(0.0), _number(1.0)
+    t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
+    p, q = t - h, t + h
+    spread = fma(_number(3.0), t * t, h * h)
+    difference = inverse_sigma * fma(_number(CUBIC), spread, _number(LINEAR))
+    slope, linear = _number(3.0 * CUBIC), _number(LINEAR)
+    # g = 1 / (exp(D) - 1); above, 1 - F; below, F: of which d(log W) consists.
+    g = (one - share) / share
+    above = fma(slope, p * p, linear) * (upper * (one + lower)) * inverse_both
+    below = fma(slope, q * q, linear) * (lower * (one + upper)) * inverse_both
+    by_t = fma(g, _number(12.0 * CUBIC) * t * h, below - above)
+    by_sigma = one - g * fma(_number(4.0 * CUBIC) * h, spread, difference)
+    by_sigma = by_sigma + (p * above - q * below)
+    return where(offset < zero, zero - by_t, by_t), by_sigma
+
+
+@device
+def coverage_gradients(
+    peak: Lanes,
+    u: Lanes,
+    v: Lanes,
+    inverse_1: Lanes,
+    inverse_2: Lanes,
+    constants: NDArray[np.float32],
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """Returns alpha as `coverages` does, and derivatives of its logarithm.
+
+    They are by u, v, sigma1 and sigma2, each times its sigma; anything where alpha is tiny.
+    """
+    upper_1, lower_1, share_1, both_1 = _window_terms(u, inverse_1, constants)
+    upper_2, lower_2, share_2, both_2 = _window_terms(v, inverse_2, constants)
+    inverse = _number(1.0) / (both_1 * both_2)
+    alpha = peak * (share_1 * share_2) * inverse
+    by_u, by_sigma_1 = _log_window_gradients(
+        u, inverse_1, upper_1, lower_1, share_1, both_2 * inverse
+    )
+    by_v, by_sigma_2 = _log_window_gradients(
+        v, inverse_2, upper_2, lower_2, share_2, both_1 * inverse
+    )
+    return alpha, by_u, by_v, by_sigma_1, by_sigma_2
+
+
+@device
+def axis_offsets(
+    cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
+) -> tuple[Lanes, Lanes]:
+    """Returns the offsets along the main axes of pixels `offsets` right of the row's first."""
+    u = fma(cosine, offsets, broadcast(rows, row + ROW_U))
+    v = fnma(sine, offsets, broadcast(rows, row + ROW_V))
+    return u, v

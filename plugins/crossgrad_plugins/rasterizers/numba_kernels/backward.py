@@ -32,9 +32,8 @@ from crossgrad_core.simd import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     axis_offsets,
-    coverages,
+    coverage_gradients,
     fill_axis_rows,
-    log_window_gradients,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
@@ -62,14 +61,15 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     DECAY,
     DEPTH,
     GREEN,
+    INVERSE_1,
+    INVERSE_2,
     PARTIAL,
+    PEAK,
     RECORD,
     RED,
     ROW_DECAY,
     SEGMENT,
     SEGMENTS,
-    SIGMA_1,
-    SIGMA_2,
     SINE,
     SLOPE,
     SUM_ABS_X,
@@ -151,8 +151,9 @@ def _gather(
     pull = broadcast(records, record + ROW_DECAY)
     lean = decay * broadcast(records, record + SLOPE)
     cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    inverse_1 = splat(np.float32(1.0)) / broadcast(records, record + SIGMA_1)
-    inverse_2 = splat(np.float32(1.0)) / broadcast(records, record + SIGMA_2)
+    inverse_1 = broadcast(records, record + INVERSE_1)
+    inverse_2 = broadcast(records, record + INVERSE_2)
+    peak = broadcast(records, record + PEAK)
     zero = splat(np.float32(0.0))
     sum_1 = sum_a = sum_b = sum_c = sum_d = sum_e = zero
     sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
@@ -169,8 +170,10 @@ def _gather(
             free = power <= load(constants, CAPPED)
             alpha = exp2(power, constants)
         else:
-            u, v = axis_offsets(records, record, offsets, rows, row)
-            alpha = coverages(records, record, u, v, constants)
+            u, v = axis_offsets(cosine, sine, offsets, rows, row)
+            alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
+                peak, u, v, inverse_1, inverse_2, constants
+            )
             touched = alpha >= load(constants, LEAST)
             free = touched & (alpha <= load(constants, LARGEST_ALPHA))
         alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
@@ -211,8 +214,6 @@ def _gather(
                 sum_abs_x = sum_abs_x + magnitude(sd)
                 sum_abs_y = sum_abs_y + magnitude(fnma(lean, sd, pull * sy))
         else:
-            by_u, by_sigma_1 = log_window_gradients(u, inverse_1, constants)
-            by_v, by_sigma_2 = log_window_gradients(v, inverse_2, constants)
             su = where(free, s * by_u * inverse_1, zero)
             sv = where(free, s * by_v * inverse_2, zero)
             sum_a = sum_a + su

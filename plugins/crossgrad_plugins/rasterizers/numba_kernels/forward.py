@@ -23,6 +23,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     axis_offsets,
     coverages,
     fill_axis_rows,
+    near_enough,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     LARGEST_ALPHA,
@@ -42,13 +43,19 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
+    COSINE,
     DECAY,
     DEPTH,
     GREEN,
+    INVERSE_1,
+    INVERSE_2,
+    PEAK,
+    RADIUS,
     RECORD,
     RED,
     SEGMENT,
     SEGMENTS,
+    SINE,
     TILE_HEIGHT,
     TILE_WIDTH,
 )
@@ -104,13 +111,23 @@ def _blend(
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
-) -> int:
-    """Blends one Gaussian into the reached segments; returns the number of pixels blended."""
+) -> tuple[int, np.uint64]:
+    """Blends one Gaussian into the reached segments.
+
+    Returns:
+        The number of pixels blended, and the segments without those found to be out of reach.
+    """
+    left = reached
     decay = broadcast(records, record + DECAY)
     red = broadcast(records, record + RED)
     green = broadcast(records, record + GREEN)
     blue = broadcast(records, record + BLUE)
     z = broadcast(records, record + DEPTH)
+    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
+    inverse_1 = broadcast(records, record + INVERSE_1)
+    inverse_2 = broadcast(records, record + INVERSE_2)
+    peak = broadcast(records, record + PEAK)
+    squared = broadcast(records, record + RADIUS)
     zero = splat(np.float32(0.0))
     pixels = 0
     while reached != np.uint64(0):
@@ -125,8 +142,11 @@ def _blend(
             touched = power >= load(constants, TOUCHED)
             alpha = exp2(power, constants)
         else:
-            u, v = axis_offsets(records, record, offsets, rows, row)
-            alpha = coverages(records, record, u, v, constants)
+            u, v = axis_offsets(cosine, sine, offsets, rows, row)
+            if near_enough(u, v, inverse_1, inverse_2, squared) == np.uint64(0):
+                left &= ~(np.uint64(1) << np.uint64(segment))
+                continue
+            alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
             touched = alpha >= load(constants, LEAST)
         # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
         alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
@@ -144,7 +164,7 @@ def _blend(
             store(state, spot, fma(weight, z, load(state, spot)))
         if counts is not None:
             pixels += count_bits(bits(touched & blended))
-    return pixels
+    return pixels, left
 
 
 @device
@@ -217,7 +237,7 @@ def _composite(
         for k in range(filled):
             record = np.intp(entries[batch[k], 0]) * RECORD
             reached = np.uint64(masks[batch[k]])
-            pixels = _blend(
+            pixels, masks[batch[k]] = _blend(
                 reached, records, record, rows, k * ROWS, state, constants, depth, counts, analytic
             )
             if counts is not None:

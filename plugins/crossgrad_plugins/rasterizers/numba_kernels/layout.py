@@ -35,9 +35,10 @@ DEPTH = 12
 
 #: A record of the analytic response has these instead of SLOPE to LOG_OPACITY.
 COSINE, SINE = 4, 5  # of the longer main axis
-SIGMA_1, SIGMA_2 = 6, 7  # standard deviations along the main axes, pixels
-OPACITY = 8
+INVERSE_1, INVERSE_2 = 6, 7  # 1 / standard deviation along each main axis, 1 / pixels
+PEAK = 8  # opacity times 2 pi times both standard deviations
 REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which nothing is touched, pixels
+RADIUS = 15  # squared, in sigmas beyond half a pixel, likewise for both axes together
 
 #: Sums over pixels that the backward pass leaves per drawn Gaussian and tile.
 PARTIAL = 16

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    SIGMA_CEILING,
     SIGMA_FLOOR,
+    central_window,
     main_axes,
+    squared_radius,
     window,
-    window_reach,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import get
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import clamped
@@ -17,16 +19,17 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COSINE,
     DECAY,
+    INVERSE_1,
+    INVERSE_2,
     LEAST_ALPHA,
     LOG2_E,
     LOG_OPACITY,
-    OPACITY,
+    PEAK,
+    RADIUS,
     REACH_1,
     REACH_2,
     RECORD,
     ROW_DECAY,
-    SIGMA_1,
-    SIGMA_2,
     SINE,
     SLOPE,
     TILE_HEIGHT,
@@ -222,14 +225,13 @@ def analytic_record(
     if not (det >= 0.0 and a + c + det < math.inf and abs(u) + abs(v) < _LARGEST):
         return 0
     cosine, sine, variance_1, variance_2 = main_axes(a, get(found, COVARIANCE, k), c, det)
-    sigma_1 = math.sqrt(max(variance_1, SIGMA_FLOOR * SIGMA_FLOOR))
-    sigma_2 = math.sqrt(max(variance_2, SIGMA_FLOOR * SIGMA_FLOOR))
-    peak_1, peak_2 = window(0.0, sigma_1), window(0.0, sigma_2)
-    if not opacity * peak_1 * peak_2 >= LEAST_ALPHA:
+    sigma_1 = clamped(math.sqrt(variance_1), SIGMA_FLOOR, SIGMA_CEILING)
+    sigma_2 = clamped(math.sqrt(variance_2), SIGMA_FLOOR, SIGMA_CEILING)
+    if not opacity * central_window(sigma_1) * central_window(sigma_2) >= LEAST_ALPHA:
         return 0
-    contrast = opacity * math.sqrt(2.0 * math.pi) / LEAST_ALPHA
-    reach_1 = window_reach(sigma_1, math.log(contrast * sigma_1 * peak_2))
-    reach_2 = window_reach(sigma_2, math.log(contrast * sigma_2 * peak_1))
+    squared = squared_radius(opacity)
+    reach_1 = 0.5 + sigma_1 * math.sqrt(squared)
+    reach_2 = 0.5 + sigma_2 * math.sqrt(squared)
     if not reach_1 + reach_2 < _LARGEST:
         return 0
     extent_x = abs(cosine) * reach_1 + abs(sine) * reach_2
@@ -251,7 +253,8 @@ def analytic_record(
         return 0
     at = j * RECORD
     records[at + COSINE], records[at + SINE] = cosine, sine
-    records[at + SIGMA_1], records[at + SIGMA_2] = sigma_1, sigma_2
+    records[at + INVERSE_1], records[at + INVERSE_2] = 1.0 / sigma_1, 1.0 / sigma_2
     records[at + REACH_1], records[at + REACH_2] = reach_1, reach_2
-    records[at + OPACITY] = opacity
+    records[at + RADIUS] = squared
+    records[at + PEAK] = 2.0 * math.pi * opacity * sigma_1 * sigma_2
     return _radius(math.sqrt(2.0 * math.log(opacity / LEAST_ALPHA) * max(a, c)))
