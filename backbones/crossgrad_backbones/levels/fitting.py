@@ -1,0 +1,67 @@
+"""How many levels of detail a scene needs, and how coarse the coarsest is."""
+
+from math import log, log2
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Finer lattices than this would be below the resolution of float32 positions.
+MOST_LEVELS = 16
+#: Limits of the initial points are moved away from 0 by this factor (Octree-GS).
+BOX_FACTOR = 1.1
+
+
+def distance_range(
+    points: NDArray[np.float64], centers: NDArray[np.float64], ratio: float
+) -> tuple[float, float]:
+    """The largest and the smallest usual distance between cameras and points (Octree-GS).
+
+    Of each camera the quantiles 1 - ratio and ratio of its distances to all points are taken; the
+    result are the same quantiles of these.
+
+    Args:
+        points: [P, 3], P >= 1.
+        centers: [C, 3] camera centres, C >= 1.
+        ratio: For instance 0.999.
+
+    Returns:
+        The standard distance D and the smallest distance d, both positive.
+    """
+    quantiles = (1.0 - ratio, ratio)
+    pooled = [np.quantile(np.linalg.norm(points - c, axis=1), quantiles) for c in centers]
+    smallest, largest = (float(value) for value in np.quantile(pooled, quantiles))
+    # All points in one place, and all cameras there too: any distance will do.
+    largest = largest if largest > 0.0 else 1.0
+    return largest, max(smallest, largest * 2.0**-MOST_LEVELS)
+
+
+def number_of_levels(largest: float, smallest: float, fork: int) -> int:
+    """round(log_fork(D / d)) + 1 (Octree-GS), at most `MOST_LEVELS`."""
+    return min(round(log(largest / smallest) / log(fork)) + 1, MOST_LEVELS)
+
+
+def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
+    """The corner's coordinate, the same for all axes, and the edge of the cube (Octree-GS).
+
+    1.1 times the smallest and the largest coordinate of all points and axes; where all coordinates
+    are equal the edge is 0.
+    """
+    low, high = BOX_FACTOR * float(points.min()), BOX_FACTOR * float(points.max())
+    return low, max(high - low, 0.0)
+
+
+def root_cell(edge: float, levels: int, base_layer: int, middle_cell: float) -> float:
+    """Edge of a cell of level 0: the cube's edge / 2^base_layer (Octree-GS).
+
+    Args:
+        edge: The cube's edge, local units.
+        levels: Number of levels.
+        base_layer: How often the cube is halved; -1 halves it until the cells of the level below
+            the middle one are about `middle_cell` large.
+        middle_cell: Local units.
+    """
+    if edge <= 0.0:
+        return middle_cell
+    if base_layer < 0:
+        base_layer = round(log2(edge / middle_cell)) - levels // 2 + 1
+    return edge * 2.0**-base_layer

@@ -1,0 +1,137 @@
+"""Fitting, planting and opening levels of detail against the published formulas."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
+from crossgrad_backbones.levels.fitting import (
+    MOST_LEVELS,
+    bounding_range,
+    distance_range,
+    number_of_levels,
+    root_cell,
+)
+from crossgrad_backbones.levels.planting import planted, visible_share
+from crossgrad_core.lattice import Lattice
+
+
+def quantile(values, q):
+    """Linear interpolation between order statistics, from the definition."""
+    values = sorted(values)
+    place = q * (len(values) - 1)
+    low = math.floor(place)
+    high = min(low + 1, len(values) - 1)
+    return values[low] + (place - low) * (values[high] - values[low])
+
+
+def test_distance_range_is_a_quantile_of_quantiles():
+    rng = np.random.default_rng(0)
+    points, centers = rng.normal(size=(300, 3)), rng.uniform(-5, 5, (9, 3))
+    pooled = []
+    for center in centers.tolist():
+        distances = [math.dist(point, center) for point in points.tolist()]
+        pooled += [quantile(distances, 0.01), quantile(distances, 0.99)]
+    largest, smallest = distance_range(points, centers, 0.99)
+    assert largest == pytest.approx(quantile(pooled, 0.99), rel=1e-12)
+    assert smallest == pytest.approx(quantile(pooled, 0.01), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "centers", "largest", "levels"),
+    [
+        ([[0, 0, 0]], [[0, 0, 3]], 3.0, 1),  # one distance
+        ([[0, 0, 0]], [[0, 0, 0]], 1.0, MOST_LEVELS),  # a camera on the only point
+        ([[0, 0, 0]], [[0, 0, 8], [0, 0, 1]], 8.0, 4),
+        ([[0, 0, 0], [0, 0, 1e-30]], [[0, 0, 0], [0, 5, 0]], 5.0, MOST_LEVELS),
+    ],
+)
+def test_number_of_levels_at_the_edges(points, centers, largest, levels):
+    found, smallest = distance_range(np.array(points, float), np.array(centers, float), 1.0)
+    assert found == pytest.approx(largest) and smallest > 0.0
+    assert number_of_levels(found, smallest, 2) == levels
+
+
+@pytest.mark.parametrize(
+    ("ratio", "fork", "levels"), [(1, 2, 1), (8, 2, 4), (11, 2, 4), (12, 2, 5), (27, 3, 4)]
+)
+def test_number_of_levels(ratio, fork, levels):
+    assert number_of_levels(5.0 * ratio, 5.0, fork) == levels
+
+
+def test_bounding_range_takes_all_axes_together():
+    points = np.array([[-2.0, 0.0, 1.0], [0.5, 3.0, -1.0]])
+    assert bounding_range(points) == pytest.approx((-2.2, 5.5))
+    assert bounding_range(np.ones((4, 3)))[1] == 0.0
+
+
+@pytest.mark.parametrize("edge", [0.3, 2.71, 16.77, 1e6])
+@pytest.mark.parametrize("levels", [1, 2, 4, 7])
+def test_automatic_root_cell_gives_the_level_below_the_middle_the_asked_size(edge, levels):
+    cell = root_cell(edge, levels, -1, 0.02)
+    halvings = math.log2(edge / cell)
+    assert halvings == pytest.approx(round(halvings), abs=1e-9)
+    below_the_middle = cell / 2.0 ** (levels // 2 - 1)
+    assert 0.02 / 2**0.5 <= below_the_middle * (1 + 1e-9)
+    assert below_the_middle <= 0.02 * 2**0.5 * (1 + 1e-9)
+
+
+def test_root_cell_of_a_given_layer_and_of_a_single_place():
+    assert root_cell(8.0, 5, 10, 0.02) == 8.0 / 1024
+    assert root_cell(0.0, 1, -1, 0.02) == root_cell(0.0, 1, 10, 0.02) == 0.02
+
+
+def lattice(levels, origin=0.0, share=0.0):
+    numbers = [origin] * 3 + [0.5, 2, levels, 4.0, 0.5, share]
+    return Lattice.of(torch.tensor(numbers, dtype=torch.float64))
+
+
+def test_planting_rounds_to_every_level_once():
+    points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
+    positions, levels = planted(points, lattice(4, origin=-1.1))
+    expected = {
+        (level, *(round((x + 1.1) / (0.5 / 2**level)) for x in point))
+        for level in range(4)
+        for point in points.tolist()
+    }
+    found = [
+        (level, *(round((x + 1.1) / (0.5 / 2**level)) for x in position))
+        for level, position in zip(levels.tolist(), positions.tolist(), strict=True)
+    ]
+    assert len(found) == len(expected) and set(found) == expected
+    assert levels.tolist() == sorted(levels.tolist())
+
+
+def test_one_point_gives_one_anchor_per_level():
+    positions, levels = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3))
+    assert levels.tolist() == [0, 1, 2]
+    assert positions[0].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_automatic_visible_share_is_the_mean():
+    shares = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
+    assert visible_share(shares, -1.0) == 0.5
+    assert visible_share(shares, 0.01) == 0.01
+
+
+def test_openings_are_a_decreasing_geometric_series_that_ends_on_time():
+    openings = opening_steps(10_000.0, 3, 1.5)
+    q = 1 / 1.5
+    first = 10_000 * (1 - q) / (1 - q**3)
+    assert openings == pytest.approx([first, first * (1 + q), first * (1 + q + q * q)])
+    assert openings[-1] == pytest.approx(10_000)
+
+
+@pytest.mark.parametrize(
+    ("step", "top"), [(0, 2), (4736, 2), (4737, 3), (7894, 3), (7895, 4), (9_999, 4), (10_000, 5)]
+)
+def test_levels_open_one_by_one(step, top):
+    assert allowed_top(step, (4736.84, 7894.74, 10_000.0), 2) == top
+
+
+def test_equal_terms_and_no_levels_at_all():
+    assert opening_steps(9.0, 3, 1.0) == pytest.approx((3.0, 6.0, 9.0))
+    assert opening_steps(9.0, 0, 1.5) == ()
+    assert allowed_top(0, (), 0) == 0
