@@ -1,6 +1,6 @@
 """Nested lattices: where the anchors of an octree stand and from how far each level is seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -41,6 +41,10 @@ class Lattice:
         scalars = (self.root_cell, self.fork, self.levels, self.distance, self.lead)
         return torch.cat([self.origin, torch.stack([*scalars, self.visible_share])]).double()
 
+    def weeding(self, visible_share: float) -> "Lattice":
+        """The same lattices with another threshold of weeding."""
+        return replace(self, visible_share=torch.full_like(self.visible_share, visible_share))
+
     @property
     def count(self) -> int:
         """Number of levels, on the host."""
@@ -50,10 +54,12 @@ class Lattice:
         """[A] float64, edge of a cell of each level [A], local units."""
         return self.root_cell * self.fork ** (-levels.double())
 
-    def sites(self, points: Tensor, levels: Tensor) -> Tensor:
-        """[A, 3] int64, the lattice site next to each point [A, 3] at its level [A]."""
-        cells = self.cells(levels)[:, None]
-        return torch.round((points.double() - self.origin) / cells).long()
+    def coordinates(self, points: Tensor, levels: Tensor) -> Tensor:
+        """[A, 3] float64, points [A, 3] in units of the cells of their levels [A], from the origin.
+
+        Rounded to whole numbers they are the site of the lattice next to each point.
+        """
+        return (points.double() - self.origin) / self.cells(levels)[:, None]
 
     def positions(self, sites: Tensor, levels: Tensor) -> Tensor:
         """[A, 3] float64, where sites [A, 3] of levels [A] are, local units."""
@@ -81,6 +87,15 @@ class Lattice:
         farthest = self.distance * self.fork ** (self.lead + extra.double() - levels.double())
         return (levels == 0) | (distances <= farthest.to(distances))
 
+    def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
+        """[A] in [0, 1], opacity factor of anchors where the boundary level fades in (Octree-GS).
+
+        The finest level that is seen has the fraction of L* + 1, so that nothing appears or
+        vanishes at once where the camera moves; coarser levels have 1, and level 0 always has.
+        """
+        factor = (self.detail(distances, extra) + 1.0 - levels.to(distances)).clamp(0.0, 1.0)
+        return torch.where(levels == 0, torch.ones_like(factor), factor)
+
     def shares(self, anchors: Tensor, levels: Tensor, cameras: Tensor) -> Tensor:
         """[A] float64, share of the cameras (centres [C, 3]) that see each anchor [A, 3]'s level.
 
@@ -99,21 +114,3 @@ class Lattice:
         cameras equally far away, nothing would be left otherwise.
         """
         return (shares > self.visible_share) | (shares >= 1.0)
-
-
-def unique_sites(sites: Tensor) -> tuple[Tensor, Tensor]:
-    """Which rows of sites [A, 3] are the same, without sorting triples.
-
-    Returns:
-        [A] number of each row's site, in the sites' lexicographic order, and [U] the first row of
-        each of the U sites.
-    """
-    number = torch.zeros_like(sites[:, 0])
-    for column in sites.unbind(1):
-        # Ranks instead of the coordinates themselves: a product of two of them cannot overflow.
-        values, rank = torch.unique(column, return_inverse=True)
-        number = torch.unique(number * len(values) + rank, return_inverse=True)[1]
-    count = int(number.max()) + 1 if number.numel() else 0
-    rows = torch.arange(len(number), device=sites.device)
-    first = torch.full((count,), len(number), dtype=torch.int64, device=sites.device)
-    return number, first.scatter_reduce(0, number, rows, "amin")

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from crossgrad_backbones.anchors.voxels import voxel_centers
 from crossgrad_core.lattice import Lattice
+from crossgrad_core.splats import nearest_neighbour_scales
 
 
 def planted(points: NDArray[np.float64], lattice: Lattice) -> tuple[Tensor, Tensor]:
@@ -27,6 +28,27 @@ def planted(points: NDArray[np.float64], lattice: Lattice) -> tuple[Tensor, Tens
     ]
     counts = torch.tensor([positions.shape[0] for positions in each])
     return torch.cat(each), levels.repeat_interleave(counts)
+
+
+def spacings(
+    positions: NDArray[np.float64], levels: NDArray[np.int64], count: int
+) -> NDArray[np.float64]:
+    """[A] initial scale of each anchor, from its neighbours of the same level, local units.
+
+    The published code takes neighbours of any level, so that coarse anchors start as small as the
+    fine ones around them; a camera that is far away sees coarse ones only, with gaps between them.
+
+    Args:
+        positions: [A, 3] local units.
+        levels: [A] their levels.
+        count: Number of levels.
+    """
+    scales = np.empty(positions.shape[0])
+    for level in range(count):
+        rows = levels == level
+        if rows.any():
+            scales[rows] = nearest_neighbour_scales(positions[rows])
+    return scales
 
 
 def visible_share(shares: Tensor, asked: float) -> float:

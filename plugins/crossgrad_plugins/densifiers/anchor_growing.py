@@ -1,7 +1,7 @@
 """Where anchors grow: from offsets with large gradients into free cells of three sizes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -26,6 +26,19 @@ class Level:
 
 
 @dataclass(frozen=True)
+class Urge:
+    """What the offsets of the present anchors ask for.
+
+    Attributes:
+        gradient: [P, k] mean gradient norm of each offset, NDC.
+        eligible: [P, k] bool, offsets that were seen often enough to be judged.
+    """
+
+    gradient: Tensor
+    eligible: Tensor
+
+
+@dataclass(frozen=True)
 class NewAnchors:
     """M anchors to be added.
 
@@ -35,6 +48,7 @@ class NewAnchors:
         features: [M, F].
         parents: [M] int64, an anchor whose offset asked for it.
         strength: [M] the largest gradient that asked for it.
+        further: Tensor name -> [M, ...], other tensors that are not those of the parents.
     """
 
     positions: Tensor
@@ -42,6 +56,7 @@ class NewAnchors:
     features: Tensor
     parents: Tensor
     strength: Tensor
+    further: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return int(self.positions.shape[0])
@@ -52,15 +67,25 @@ class NewAnchors:
         if left_out == 0:
             return self, 0
         ranked = torch.argsort(self.strength, descending=True, stable=True)
-        return self._at(ranked[:room].sort().values), left_out
+        return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """These, then others."""
-        pairs = {name: torch.cat([mine, getattr(more, name)]) for name, mine in vars(self).items()}
-        return replace(self, **pairs)
+        """These, then others, which have the same further tensors."""
+        mine, others = self._tensors(), more._tensors()
+        joined = [torch.cat(pair) for pair in zip(mine, others, strict=True)]
+        return self._with(joined)
 
-    def _at(self, rows: Tensor) -> "NewAnchors":
-        return replace(self, **{name: tensor[rows] for name, tensor in vars(self).items()})
+    def at(self, rows: Tensor) -> "NewAnchors":
+        """Those at `rows` [R]."""
+        return self._with([tensor[rows] for tensor in self._tensors()])
+
+    def _tensors(self) -> list[Tensor]:
+        own = (self.positions, self.cells, self.features, self.parents, self.strength)
+        return [*own, *self.further.values()]
+
+    def _with(self, tensors: list[Tensor]) -> "NewAnchors":
+        own = len(tensors) - len(self.further)
+        return NewAnchors(*tensors[:own], dict(zip(self.further, tensors[own:], strict=True)))
 
 
 def grown(
@@ -105,10 +130,7 @@ def _at_level(
     anchor, slot = (eligible & (gradient >= level.threshold)).nonzero().unbind(1)
     kept = torch.from_numpy(rng.random(len(anchor)) < level.keep).to(anchor.device)
     anchor, slot = anchor[kept], slot[kept]
-    stretch = torch.exp(parameters["scales"][anchor, :3])
-    cells = cells_of(
-        parameters["anchors"][anchor] + parameters["offsets"][anchor, slot] * stretch, level.cell
-    )
+    cells = cells_of(offset_means(parameters, anchor, slot), level.cell)
     reached = in_reach(cells)
     anchor, slot, cells = anchor[reached], slot[reached], cells[reached]
     first, place = free_cells(cells, cells_of(present, level.cell))
@@ -116,13 +138,19 @@ def _at_level(
     return NewAnchors(
         positions=(cells[first].double() * level.cell).to(present),
         cells=torch.full((len(first),), level.cell, dtype=torch.float64, device=present.device),
-        features=_largest(parameters["features"][anchor][wanted], place[wanted], len(first)),
+        features=largest(parameters["features"][anchor][wanted], place[wanted], len(first)),
         parents=anchor[first],
-        strength=_largest(gradient[anchor, slot][wanted, None], place[wanted], len(first))[:, 0],
+        strength=largest(gradient[anchor, slot][wanted, None], place[wanted], len(first))[:, 0],
     )
 
 
-def _largest(rows: Tensor, group: Tensor, groups: int) -> Tensor:
+def offset_means(parameters: Mapping[str, Tensor], anchor: Tensor, slot: Tensor) -> Tensor:
+    """[N, 3] means of the Gaussians `slot` [N] of anchors `anchor` [N]."""
+    stretch = torch.exp(parameters["scales"][anchor, :3])
+    return parameters["anchors"][anchor] + parameters["offsets"][anchor, slot] * stretch
+
+
+def largest(rows: Tensor, group: Tensor, groups: int) -> Tensor:
     """[groups, F] elementwise largest of the rows [N, F] of each group; none is empty."""
     largest = rows.new_full((groups, rows.shape[1]), -torch.inf)
     return largest.scatter_reduce_(0, group[:, None].expand_as(rows), rows, "amax")

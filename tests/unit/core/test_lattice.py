@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.lattice import Lattice, unique_sites
+from crossgrad_core.lattice import Lattice
 
 ROUNDING = {"floor": (0.0, math.floor), "round": (0.5, round), "ceil": (1.0, math.ceil)}
 
@@ -37,12 +37,13 @@ def test_sites_are_the_nearest_and_positions_lead_back():
     rng = np.random.default_rng(0)
     points, levels = cloud(rng)
     grid = lattice()
-    sites = grid.sites(points, levels)
+    sites = grid.coordinates(points, levels).round().long()
     for point, level, site in zip(points.tolist(), levels.tolist(), sites.tolist(), strict=True):
         cell = 0.5 / 2**level
         assert site == [round((x + 1.1) / cell) for x in point]
     positions = grid.positions(sites, levels)
-    assert torch.equal(grid.sites(positions.float(), levels), sites)
+    again = grid.coordinates(positions.float(), levels)
+    assert torch.equal(again.round().long(), sites)
     assert float((positions - points).abs().max()) <= 0.25
 
 
@@ -107,13 +108,3 @@ def test_shares_without_cameras_are_0():
     anchors, levels = torch.zeros(2, 3), torch.tensor([0, 1])
     assert lattice().shares(anchors, levels, torch.zeros(0, 3)).tolist() == [0.0, 0.0]
 
-
-@pytest.mark.parametrize("count", [0, 1, 2, 300])
-def test_unique_sites_are_those_of_a_dictionary(count):
-    rng = np.random.default_rng(count)
-    sites = torch.from_numpy(rng.integers(-3, 3, (count, 3)) * 10**12)
-    number, first = unique_sites(sites)
-    rows = [tuple(row) for row in sites.tolist()]
-    ordered = sorted(set(rows))
-    assert [ordered[n] for n in number.tolist()] == rows
-    assert [rows.index(site) for site in ordered] == first.tolist()

@@ -1,0 +1,136 @@
+"""Octree-GS: neural Gaussians on anchors of several levels of detail (Ren et al. 2024)."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_backbones.anchors.base import AnchorBackbone, Used
+from crossgrad_backbones.levels import fitting
+from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
+from crossgrad_backbones.levels.planting import planted, spacings, visible_share
+from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.lattice import Lattice
+from crossgrad_core.scene.types import Camera, Scene
+from crossgrad_core.schedule import Phase
+
+Rounding = Literal["round", "floor", "ceil", "progressive"]
+
+#: How many levels beyond L* are used (see `Lattice.lead`).
+_LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
+#: Share of a run that is over when the last level opens: 10,000 of 40,000 steps.
+COARSE_SHARE = 0.25
+
+
+class Octree(AnchorBackbone):
+    """Anchors on nested lattices; the nearer a camera, the finer the levels that it uses of them.
+
+    What differs from Scaffold-GS is where anchors start, and which of them a camera uses: those
+    whose level is at most L* = log_fork(D / distance) + extra level, rounded, where D is about the
+    largest distance of a camera from a point. In the first quarter of a run fine levels open one
+    after the other.
+
+    Further blocks, all frozen: levels [P] int64; extra_levels [P]; lattice [9] float64 (see
+    `Lattice`). Learning rates decay over the run as those of Scaffold-GS do. Source: Octree-GS
+    (Ren et al. 2024); methods of section 6.
+    """
+
+    default_densifier: ClassVar[str] = "octree"
+
+    fork: int = Field(2, ge=2, le=8, description="cells of the next level along an edge")
+    dist_ratio: float = Field(
+        0.999, gt=0.5, le=1, description="quantile of distances that counts as the largest"
+    )
+    base_layer: int = Field(
+        -1, ge=-1, le=40, description="halvings of the scene's cube to the root cell; -1: automatic"
+    )
+    middle_cell: float = Field(
+        0.02, gt=0, description="cell below the middle level where base_layer is -1, extents"
+    )
+    init_level: int = Field(
+        -1, ge=-1, description="finest level trained at first; -1: the middle one"
+    )
+    visible_threshold: float = Field(
+        0.01, ge=-1, lt=1, description="share of cameras that must see an anchor; -1: the mean"
+    )
+    rounding: Rounding = Field("round", description="how L* becomes a level")
+    progressive: bool = Field(default=True, description="open the fine levels one after the other")
+    coarse_factor: float = Field(1.5, ge=1, description="each opening comes faster by this factor")
+
+    @override
+    def blocks(self) -> tuple[Block, ...]:
+        frozen = LearningRate(0.0)
+        return (
+            *super().blocks(),
+            Block("levels", ("levels",), True, "geometry", frozen),
+            Block("extra_levels", ("extra_levels",), True, "geometry", frozen),
+            Block("lattice", ("lattice",), False, "geometry", frozen),
+        )
+
+    @override
+    def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
+        centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
+        lattice = self._lattice(scene.points, centers)
+        positions, levels = planted(scene.points, lattice)
+        shares = lattice.shares(positions, levels, torch.from_numpy(centers))
+        lattice = lattice.weeding(visible_share(shares, self.visible_threshold))
+        lasting = lattice.lasting(shares)
+        positions, levels = positions[lasting], levels[lasting]
+        finest = float(lattice.cells(lattice.levels - 1))
+        made = self.created(positions.numpy(), finest, scene, rng)
+        spacing = spacings(positions.numpy(), levels.numpy(), lattice.count)
+        scales = torch.from_numpy(np.log(spacing)).float()[:, None].repeat(1, 6)
+        return {
+            **made,
+            "scales": scales.requires_grad_(made["scales"].requires_grad),
+            "levels": levels,
+            "extra_levels": torch.zeros(len(levels)),
+            "lattice": lattice.packed(),
+        }
+
+    def _lattice(self, points: NDArray[np.float64], centers: NDArray[np.float64]) -> Lattice:
+        largest, smallest = fitting.distance_range(points, centers, self.dist_ratio)
+        levels = fitting.number_of_levels(largest, smallest, self.fork)
+        corner, edge = fitting.bounding_range(points)
+        cell = fitting.root_cell(edge, levels, self.base_layer, self.middle_cell)
+        scalars = (cell, self.fork, levels, largest, _LEADS[self.rounding], 0.0)
+        return Lattice.of(torch.tensor([corner, corner, corner, *scalars], dtype=torch.float64))
+
+    @override
+    def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used:
+        lattice = Lattice.of(parameters["lattice"])
+        levels, extra = parameters["levels"], parameters["extra_levels"]
+        distances = lattice.distances(parameters["anchors"].detach(), levels, camera.center)
+        mask = lattice.seen(distances, levels, extra)
+        top = self._top(parameters, phase)
+        if top is not None:
+            mask &= levels <= top
+        if self.rounding != "progressive":
+            return Used(mask)
+        return Used(mask, lattice.faded(distances, levels, extra))
+
+    def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
+        """The finest level that is open; None where all are."""
+        span = COARSE_SHARE * phase.schedule.total
+        if not (self.progressive and phase.training and phase.step < span):
+            return None
+        last = Lattice.of(parameters["lattice"]).count - 1
+        initial = (last + 1) // 2 if self.init_level < 0 else self.init_level
+        openings = opening_steps(span, max(0, last - initial), self.coarse_factor)
+        return allowed_top(phase.step, openings, initial)
+
+    @override
+    def bake(
+        self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
+    ) -> Gaussians:
+        """As of its family, without the anchors whose level none of the cameras uses."""
+        used = torch.stack([self.used(parameters, c, phase).mask for c in cameras]).any(0)
+        names = {name for block in self.blocks() if block.per_primitive for name in block.tensors}
+        rows = {n: t[used] if n in names else t for n, t in parameters.items()}
+        return super().bake(rows, phase, cameras)
