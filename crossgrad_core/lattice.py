@@ -71,7 +71,9 @@ class Lattice:
         Source: Octree-GS, methods of section 6.
         """
         halves = (0.5 * self.cells(levels)).to(anchors)
-        return torch.linalg.vector_norm(anchors - camera.to(anchors) + halves[:, None], dim=1)
+        offsets: Tensor = anchors - camera.to(anchors) + halves[:, None]
+        distances: Tensor = torch.linalg.vector_norm(offsets, dim=1)
+        return distances
 
     def detail(self, distances: Tensor, extra: Tensor) -> Tensor:
         """[A] L* = log_fork(D / distance) + extra level; infinite at distance 0."""

@@ -54,8 +54,9 @@ class AnchorDensifier(Densifier):
 
     def changed(self, parameters: Parameters, urge: Urge) -> Mapping[str, Tensor]:
         """New rows of tensors [P, ...] of the present anchors; by default the capped scales."""
-        stretch, size = parameters["scales"].split(3, 1)
-        return {"scales": torch.cat([stretch, size.clamp(max=self.largest_log_scale)], 1)}
+        scales = parameters["scales"]
+        capped = scales[:, 3:].clamp(max=self.largest_log_scale)
+        return {"scales": torch.cat([scales[:, :3], capped], 1)}
 
     @override
     def densify(

@@ -71,21 +71,25 @@ class NewAnchors:
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
         """These, then others, which have the same further tensors."""
-        mine, others = self._tensors(), more._tensors()
-        joined = [torch.cat(pair) for pair in zip(mine, others, strict=True)]
-        return self._with(joined)
+        return NewAnchors(
+            torch.cat([self.positions, more.positions]),
+            torch.cat([self.cells, more.cells]),
+            torch.cat([self.features, more.features]),
+            torch.cat([self.parents, more.parents]),
+            torch.cat([self.strength, more.strength]),
+            {name: torch.cat([own, more.further[name]]) for name, own in self.further.items()},
+        )
 
     def at(self, rows: Tensor) -> "NewAnchors":
         """Those at `rows` [R]."""
-        return self._with([tensor[rows] for tensor in self._tensors()])
-
-    def _tensors(self) -> list[Tensor]:
-        own = (self.positions, self.cells, self.features, self.parents, self.strength)
-        return [*own, *self.further.values()]
-
-    def _with(self, tensors: list[Tensor]) -> "NewAnchors":
-        own = len(tensors) - len(self.further)
-        return NewAnchors(*tensors[:own], dict(zip(self.further, tensors[own:], strict=True)))
+        return NewAnchors(
+            self.positions[rows],
+            self.cells[rows],
+            self.features[rows],
+            self.parents[rows],
+            self.strength[rows],
+            {name: own[rows] for name, own in self.further.items()},
+        )
 
 
 def grown(

@@ -74,7 +74,7 @@ def test_automatic_root_cell_gives_the_level_below_the_middle_the_asked_size(edg
     halvings = math.log2(edge / cell)
     assert halvings == pytest.approx(round(halvings), abs=1e-9)
     below_the_middle = cell / 2.0 ** (levels // 2 - 1)
-    assert 0.02 / 2**0.5 <= below_the_middle * (1 + 1e-9)
+    assert below_the_middle * (1 + 1e-9) >= 0.02 / 2**0.5
     assert below_the_middle <= 0.02 * 2**0.5 * (1 + 1e-9)
 
 

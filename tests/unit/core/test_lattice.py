@@ -107,4 +107,3 @@ def test_weeding_drops_what_few_see_and_never_what_all_see():
 def test_shares_without_cameras_are_0():
     anchors, levels = torch.zeros(2, 3), torch.tensor([0, 1])
     assert lattice().shares(anchors, levels, torch.zeros(0, 3)).tolist() == [0.0, 0.0]
-
