@@ -70,15 +70,16 @@ class Lattice:
 
         Source: Octree-GS, methods of section 6.
         """
-        halves = (0.5 * self.cells(levels)).to(anchors)
-        offsets: Tensor = anchors - camera.to(anchors) + halves[:, None]
-        distances: Tensor = torch.linalg.vector_norm(offsets, dim=1)
-        return distances
+        halves = 0.5 * self.root_cell * self._forks(-levels.to(anchors))
+        squares = torch.zeros_like(halves)
+        for along, center in zip(anchors.unbind(1), camera.to(anchors).unbind(), strict=True):
+            squares += (along + halves - center).square()
+        return squares.sqrt()
 
     def detail(self, distances: Tensor, extra: Tensor) -> Tensor:
         """[A] L* = log_fork(D / distance) + extra level; infinite at distance 0."""
         octaves = torch.log2(self.distance.to(distances) / distances)
-        return octaves / torch.log2(self.fork).to(distances) + extra
+        return octaves / torch.log2(self.fork) + extra
 
     def seen(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
         """[A] bool, whether anchors of levels [A] are drawn at distances [A] from a camera.
@@ -86,8 +87,12 @@ class Lattice:
         An anchor is drawn where its level is at most L* + lead; level 0 always is. A distance that
         is exactly between two levels belongs to the finer one.
         """
-        farthest = self.distance * self.fork ** (self.lead + extra.double() - levels.double())
-        return (levels == 0) | (distances <= farthest.to(distances))
+        farthest = self.distance * self._forks(self.lead + extra - levels.to(extra))
+        return (levels == 0) | (distances <= farthest)
+
+    def _forks(self, exponents: Tensor) -> Tensor:
+        """fork^exponents, in the type of the exponents: a step computes it for every anchor."""
+        return torch.exp2(torch.log2(self.fork) * exponents)
 
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
         """[A] in [0, 1], opacity factor of anchors where the boundary level fades in (Octree-GS).
