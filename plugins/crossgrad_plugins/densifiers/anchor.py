@@ -10,7 +10,8 @@ from crossgrad_core.blocks import Parameters
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.schedule import Schedule
 from crossgrad_plugins.densifiers.anchor_base import AnchorDensifier
-from crossgrad_plugins.densifiers.anchor_growing import Level, NewAnchors, Urge, grown
+from crossgrad_plugins.densifiers.anchor_growing import Level, grown
+from crossgrad_plugins.densifiers.new_anchors import NewAnchors, Urge
 
 
 class AnchorControl(AnchorDensifier):

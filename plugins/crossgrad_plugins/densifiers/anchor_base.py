@@ -15,7 +15,6 @@ from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows
-from crossgrad_plugins.densifiers.anchor_growing import NewAnchors, Urge
 from crossgrad_plugins.densifiers.anchor_statistics import (
     GRADIENT,
     OPACITY,
@@ -23,6 +22,7 @@ from crossgrad_plugins.densifiers.anchor_statistics import (
     VIEWS,
     observed,
 )
+from crossgrad_plugins.densifiers.new_anchors import NewAnchors, Urge
 from crossgrad_plugins.densifiers.screen_statistics import mean
 
 

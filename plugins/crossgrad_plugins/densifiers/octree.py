@@ -14,7 +14,7 @@ from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.schedule import Schedule
 from crossgrad_plugins.densifiers.anchor_base import AnchorDensifier
-from crossgrad_plugins.densifiers.anchor_growing import NewAnchors, Urge
+from crossgrad_plugins.densifiers.new_anchors import NewAnchors, Urge
 from crossgrad_plugins.densifiers.octree_growing import Thresholds, grown, seen_from_farther
 
 #: The published schedule is one of 40,000 steps: anchors grow after 1500 and before 25,000 of them.

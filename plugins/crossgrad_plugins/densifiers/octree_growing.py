@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.lattice import Lattice
-from crossgrad_plugins.densifiers.anchor_growing import NewAnchors, Urge, largest, offset_means
 from crossgrad_plugins.densifiers.cells import cells_of, free_cells, in_reach
+from crossgrad_plugins.densifiers.new_anchors import NewAnchors, Urge, largest, offset_means
 
 
 @dataclass(frozen=True)

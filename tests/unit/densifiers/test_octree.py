@@ -16,7 +16,7 @@ from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.topology import Edit, apply_to_parameters, gather_indices
-from crossgrad_plugins.densifiers.anchor_growing import Urge
+from crossgrad_plugins.densifiers.new_anchors import Urge
 from crossgrad_plugins.densifiers.octree import OctreeControl
 from crossgrad_plugins.densifiers.octree_growing import Thresholds, grown, seen_from_farther
 
