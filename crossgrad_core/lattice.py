@@ -10,7 +10,7 @@ from torch import Tensor
 class Lattice:
     """Cubic lattices, one per level, each `fork` times finer than the one before (Octree-GS).
 
-    All fields are float64 tensors, so that none has to travel to the host where a step uses them.
+    All fields are float64 tensors, so that a step need not wait for a device to read them.
 
     Attributes:
         origin: [3] corner of the lattices, local units.

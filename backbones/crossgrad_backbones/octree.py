@@ -15,6 +15,7 @@ from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.planting import planted, spacings, visible_share
 from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.errors import UserError
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.scene.types import Camera, Scene
@@ -75,6 +76,14 @@ class Octree(AnchorBackbone):
 
     @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
+        if len(scene.points) == 0:
+            raise UserError(
+                "an octree has no point to start from",
+                where="--init",
+                expected="points, or Gaussians that can be seen",
+                found="none",
+                todo="use --init random",
+            )
         centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
         lattice = self._lattice(scene.points, centers)
         positions, levels = planted(scene.points, lattice)

@@ -14,7 +14,7 @@ from crossgrad_backbones.levels.fitting import (
     number_of_levels,
     root_cell,
 )
-from crossgrad_backbones.levels.planting import planted, visible_share
+from crossgrad_backbones.levels.planting import planted, spacings, visible_share
 from crossgrad_core.lattice import Lattice
 
 
@@ -108,6 +108,17 @@ def test_one_point_gives_one_anchor_per_level():
     positions, levels = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3))
     assert levels.tolist() == [0, 1, 2]
     assert positions[0].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_initial_scales_come_from_neighbours_of_the_same_level():
+    rng = np.random.default_rng(4)
+    positions, levels = rng.uniform(-1, 1, (40, 3)), rng.integers(0, 3, 40)
+    levels[levels == 2] = 3
+    found = spacings(positions, levels, 4)
+    for i in range(40):
+        same = [j for j in range(40) if levels[j] == levels[i] and j != i]
+        nearest = sorted(math.dist(positions[i], positions[j]) ** 2 for j in same)[:3]
+        assert found[i] == pytest.approx(math.sqrt(sum(nearest) / 3))
 
 
 def test_automatic_visible_share_is_the_mean():

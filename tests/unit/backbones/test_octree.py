@@ -8,11 +8,15 @@ import pytest
 import torch
 
 from crossgrad_backbones.octree import Octree
+from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.config import RunConfig
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.photometric import photometric_loss
 from crossgrad_core.schedule import Phase, Schedule
-from crossgrad_core.testing.fixtures import sample_phase, sample_scene
+from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.training.assemble import assemble
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 WHOLE = {
@@ -233,3 +237,25 @@ def test_a_tensor_of_the_run_says_all_that_decoding_needs():
     assert float(fields.fork) == 2 and float(fields.lead) == 0.5
     assert float(fields.visible_share) == 0.01
     assert not any(parameters[name].requires_grad for name in ("levels", "extra_levels", "lattice"))
+
+
+def test_no_visible_gaussian_to_start_from_is_told():
+    scene = sample_scene()
+    faint = Vanilla().bake(
+        Vanilla().create(scene, np.random.default_rng(0)), EVALUATION, [sample_camera()]
+    )
+    rng = np.random.default_rng(0)
+    started = Octree().adopt(faint, scene, rng)
+    assert len(started["anchors"]) > 0
+    faint = replace(faint, opacities=torch.full_like(faint.opacities, 1e-3))
+    with pytest.raises(UserError, match="no point to start from"):
+        Octree().adopt(faint, scene, rng)
+
+
+def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_round():
+    config = {"backbone": {"name": "octree"}, "densifier": {"name": "anchor"}, "steps": 200}
+    assemble(RunConfig.model_validate(config), sample_scene(), "none")
+    for other in ("scaffold", "vanilla"):
+        config = {"backbone": {"name": other}, "densifier": {"name": "octree"}, "steps": 200}
+        with pytest.raises(IncompatibleSelectionError, match="lattice"):
+            assemble(RunConfig.model_validate(config), sample_scene(), "none")
