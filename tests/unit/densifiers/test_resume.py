@@ -14,9 +14,12 @@ from crossgrad_core.training.start import first_state
 
 #: Options with which each densifier edits the small scene of the tests.
 OPTIONS = {
+    "anchor": {"grow_renders": 0, "prune_views": 0, "coarsest": 1},
     "mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4},
     "revising": {"growth_budget": 0.1, "error_threshold": 0.01, "views": 3},
 }
+#: Backbones that they need, with anchors whose neighbouring cells are free.
+BACKBONES = {"anchor": {"name": "scaffold", "voxel_size": 1e-5}}
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -28,6 +31,7 @@ def test_a_checkpoint_changes_nothing(tmp_path, name, stop):
         densify_until=9,
         densify_every=2,
         densifier=ComponentChoice(name=name, **OPTIONS[name]),
+        backbone=ComponentChoice(**BACKBONES.get(name, {"name": "vanilla"})),
     )
     setup = assemble(config, sample_scene(), "none")
     whole = first_state(setup)
