@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.diagnostics.grouped import GroupedGramian, Groups
 from crossgrad_core.diagnostics.interval import UNKNOWN, Interval
+from crossgrad_core.diagnostics.inversion import inverted
 from crossgrad_core.diagnostics.pivots import StudentisedGap
 from crossgrad_core.diagnostics.resampling import Resamples
 from crossgrad_core.diagnostics.variance import split_of
@@ -44,7 +45,9 @@ def split_intervals(
     studentised on the logarithmic scale. sigma_b^2 is quadratic in the distance theta of the group
     means, so its noise depends on theta: the interval holds every theta that the estimate, with the
     standard error that belongs to *that* theta, does not reject; the bootstrap is moved to theta
-    for the critical values. The ends are never negative, whereas the estimate may be.
+    for the critical values. The ratio's interval is made the same way from theta - ratio sigma_w^2;
+    the more of its noise comes from sigma_w^2, the more of its error falls on its upper end. The
+    ends are never negative, whereas the estimate may be.
 
     Unknown (NaN) with fewer than four views in a group, or without any variance.
 
@@ -58,10 +61,9 @@ def split_intervals(
     if max(groups.unseen) <= 0.0:
         return _points(parts.scale * within, parts.scale * between)
     problem = StudentisedGap.of(parts, groups, Resamples.of(parts, groups, resamples, rng))
-    tails = ((1.0 - level) / 2.0, (1.0 + level) / 2.0)
     unit = groups.shares[0] * groups.shares[1]
-    gap = problem.inverted(problem.gap_pivot, tails)
-    ratio = problem.inverted(problem.ratio_pivot, tails)
+    gap = inverted(problem.gap_pivot, problem.start, level)
+    ratio = inverted(problem.ratio_pivot, problem.start, level)
     return SplitIntervals(
         within=problem.within(_leaning_tails(level)).times(parts.scale),
         between=gap.times(unit * parts.scale),

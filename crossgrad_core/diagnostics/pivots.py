@@ -1,8 +1,6 @@
 """Studentised estimates of the gap between group means and of the variance within groups."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from math import sqrt
 
 import numpy as np
@@ -10,12 +8,14 @@ from numpy.typing import NDArray
 
 from crossgrad_core.diagnostics.grouped import GroupedGramian, Groups
 from crossgrad_core.diagnostics.interval import Interval
+from crossgrad_core.diagnostics.inversion import Pivot
 from crossgrad_core.diagnostics.resampling import Resamples
 
-_DOUBLINGS = 60
-_BISECTIONS = 24
-
-_Pivot = Callable[[float], tuple[float, NDArray[np.float64]]]
+#: How much of the error of the ratio's interval is moved from its lower to its upper end at most,
+#: and the share of sigma_w^2 in the variance from which on all of that is moved. Too few long
+#: gradients in the sample make sigma_w^2 too small and the ratio too large.
+_MOVED = 0.4
+_WITHIN_RULES = 1.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class StudentisedGap:
     """One block's resamples with what is known of the noise.
 
     Attributes:
-        draws: The resamples, row 0 the sample itself.
+        draws: The resamples, row 0 the sample itself; shifts as along the true gap.
         estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
         floor: Variance of the estimate at theta = 0.
@@ -43,11 +43,12 @@ class StudentisedGap:
         # The scale of a resample's noise goes with the square of its spread.
         relative = (draws.spread[1:] / draws.spread[0]) ** 2
         floors = relative * (float(noise.var()) / float(relative.mean()))
+        floor = _variance_without_gap(parts, groups)
         return cls(
-            draws=draws,
+            draws=draws.along_gap(_along_the_true_gap(draws, parts.gap, floor)),
             estimate=parts.gap + float(draws.noise[0]),
             plain_gap=parts.gap,
-            floor=_variance_without_gap(parts, groups),
+            floor=floor,
             floors=floors,
         )
 
@@ -64,60 +65,57 @@ class StudentisedGap:
             float(values[0] * np.exp(-low * errors[0])),
         )
 
-    def gap_pivot(self, gap: float) -> tuple[float, NDArray[np.float64]]:
+    def gap_pivot(self, gap: float) -> Pivot:
         """The studentised estimate if `gap` is the true one, and its resamples."""
         draws, root = self.draws, sqrt(gap)
         variance = 4.0 * gap * draws.shift_variance
         numerators = 2.0 * root * draws.shift[1:] + (draws.noise[1:] - draws.noise[0])
         observed = _studentised(self.estimate - gap, float(variance[0]) + self.floor)
-        return observed, numerators / np.sqrt(_positive(variance[1:] + self.floors))
+        return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
 
-    def ratio_pivot(self, ratio: float) -> tuple[float, NDArray[np.float64]]:
+    def ratio_pivot(self, ratio: float) -> Pivot:
         """The studentised estimate of gap - ratio * sigma_w^2 if the true ratio is `ratio`."""
         draws = self.draws
         gap = ratio * float(draws.within[0])
         root = sqrt(gap)
-        variance = (
-            4.0 * gap * draws.shift_variance
-            + ratio**2 * draws.within_variance
-            - 4.0 * ratio * root * draws.covariance
-        )
+        of_gap = 4.0 * gap * draws.shift_variance
+        of_within = ratio**2 * draws.within_variance
+        variance = of_gap + of_within - 4.0 * ratio * root * draws.covariance
         numerators = (
             gap
             + 2.0 * root * draws.shift[1:]
             + (draws.noise[1:] - draws.noise[0])
             - ratio * draws.within[1:]
         )
-        observed = _studentised(self.estimate - gap, float(variance[0]) + self.floor)
-        return observed, numerators / np.sqrt(_positive(variance[1:] + self.floors))
+        whole = float(of_gap[0]) + self.floor + float(of_within[0])
+        moved = min(1.0, float(of_within[0]) / (_WITHIN_RULES * whole)) if whole > 0.0 else 0.0
+        return Pivot(
+            observed=_studentised(self.estimate - gap, float(variance[0]) + self.floor),
+            resampled=numerators / np.sqrt(_positive(variance[1:] + self.floors)),
+            lower_share=0.5 - _MOVED * moved,
+        )
 
-    def inverted(self, pivot: _Pivot, tails: tuple[float, float]) -> Interval:
-        """The values >= 0 that the pivot does not reject."""
-
-        def above(tail: float, value: float) -> bool:
-            observed, resampled = pivot(value)
-            return observed > float(np.quantile(resampled, tail))
-
-        start = max(self.estimate, self.plain_gap, sqrt(self.floor))
-        high, low = (_crossing(partial(above, tail), start) for tail in tails)
-        return Interval(low, high)
+    @property
+    def start(self) -> float:
+        """Where to start looking for the upper end of an interval; positive."""
+        return max(self.estimate, self.plain_gap, sqrt(self.floor))
 
 
-def _crossing(above: Callable[[float], bool], start: float) -> float:
-    """Where `above` turns from true to false on [0, inf); infinite where it does not."""
-    if not above(0.0):
-        return 0.0
-    low, high = 0.0, start
-    for _ in range(_DOUBLINGS):
-        if not above(high):
-            break
-        low, high = high, 2.0 * high
-    else:
-        return float("inf")
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2.0
-        low, high = (middle, high) if above(middle) else (low, middle)
-    return (low + high) / 2.0
+def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
+    """The variance of the shift along the true gap, relative to that along the sample's.
+
+    The sample's gap d is the true one plus noise, and noise points where gradients vary most. Its
+    part in d' Sigma d is tr(Sigma^2), half the `floor`, and its part in |d|^2 is tr(Sigma), Sigma
+    the covariance of the difference of the means. Half of both is taken off, less where the whole
+    gap could be noise: what is left is itself uncertain with a dozen views. Where few directions
+    dominate, 95 % intervals of sigma_b^2 hold the truth in up to 99.5 % if nothing is taken off,
+    and in 84 to 97 % if all is.
+    """
+    noise, along = float(draws.spread[0]), float(draws.shift_variance[0]) * gap
+    if noise <= 0.0 or along <= 0.0:
+        return 1.0
+    taken = 0.5 * min(1.0, gap / (2.0 * noise))
+    return max(along - taken * floor / 2.0, 0.0) / (gap - taken * noise) * (gap / along)
 
 
 def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:

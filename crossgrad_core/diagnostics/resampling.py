@@ -1,6 +1,6 @@
 """Resampled figures of a grouped Gramian: cameras drawn anew, no camera paired with itself."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -99,6 +99,15 @@ class Resamples:
     shift_variance: _Array
     covariance: _Array
     spread: _Array
+
+    def along_gap(self, factor: float) -> "Resamples":
+        """The same with the variance of the shift times a factor."""
+        return replace(
+            self,
+            shift=self.shift * factor**0.5,
+            shift_variance=self.shift_variance * factor,
+            covariance=self.covariance * factor**0.5,
+        )
 
     @classmethod
     def of(
