@@ -19,7 +19,7 @@ class Densifier(Component):
 
     Attributes:
         needs: Screen statistics beyond the radii and the mean gradient that it needs
-            (`pixels`, `abs_gradient`).
+            (`pixels`, `abs_gradient`, `directions`); given while `schedule.collects(step)`.
         blocks: Names of the parameter tensors that it needs a backbone to have.
     """
 

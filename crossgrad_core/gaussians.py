@@ -75,12 +75,22 @@ class Screen:
         pixels: [N] int32, pixels in which the Gaussian was blended; None unless asked for.
         mean_gradient: [N, 2] gradient of the loss by the projected mean, per pixel unit.
         abs_gradient: [N, 2] the same with absolute values summed over pixels; None unless asked.
+        directions: [N, 6, 5] the pixels' gradients by the projected mean, in bins along the longest
+            axis; None unless asked. The axis is that of the largest scale (the first of equals)
+            on the image plane: a pixel whose centre is d from the projected mean is at
+            t = d . a / |a|^2, with a the projection of one standard deviation, undilated, and at
+            t = 0 where a is shorter than 1e-6 px. Bins end before -2, -1, 0, 1, 2 and never. Of
+            the pixels of a bin whose gradient is not 0 there are the sum of the directions (x
+            and y; unit vectors of the gradient in NDC units, that is times width and height),
+            the sums of |x| and |y| of the gradient itself (per pixel unit; over all bins they
+            are `abs_gradient`), and their number.
     """
 
     radii: Tensor
     pixels: Tensor | None = None
     mean_gradient: Tensor | None = None
     abs_gradient: Tensor | None = None
+    directions: Tensor | None = None
 
 
 @dataclass(frozen=True)

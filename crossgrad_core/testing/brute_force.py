@@ -35,6 +35,8 @@ class Trace:
         depth: [H, W] sum of weight times camera depth.
         raw: [N, H, W] alpha before the cap and the threshold.
         blended: [N, H, W] bool.
+        colors: [N, 3] as drawn.
+        depths: [N] camera depths of the centres.
         extents: [N] half-extent of each footprint, pixels.
         pixel_gaps: [H, W] of what is compared per pixel: alpha, cap and stop.
         gaussian_gaps: [N] of what is compared per Gaussian: near plane, opacity, order, clamps of
@@ -46,6 +48,8 @@ class Trace:
     depth: Array
     raw: Array
     blended: NDArray[np.bool_]
+    colors: Array
+    depths: Array
     extents: Array
     pixel_gaps: Array
     gaussian_gaps: Array
@@ -78,7 +82,7 @@ def trace(
         near: Near plane, local units.
         dilation: Used where the Gaussians bring none.
     """
-    scene = _Scene(gaussians, camera, near, dilation)
+    scene = Splatter(gaussians, camera, near, dilation)
     number, size = len(gaussians), (camera.height, camera.width)
     image, alpha, depth = np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
     raw, blended = np.zeros((number, *size)), np.zeros((number, *size), bool)
@@ -99,11 +103,19 @@ def trace(
         alpha += weight
         depth += weight * scene.local[i, 2]
         transmittance = np.where(stopped, transmittance, behind)
-    return Trace(*(image, alpha, depth, raw, blended), scene.extents(), gaps, scene.gaps())
+    brought = (scene.colors.clip(0.0), scene.local[:, 2], scene.extents())
+    return Trace(*(image, alpha, depth, raw, blended), *brought, gaps, scene.gaps())
 
 
-class _Scene:
-    """World to pixels, for one Gaussian at a time."""
+class Splatter:
+    """World to pixels, for one Gaussian at a time.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: The camera.
+        near: Near plane, local units.
+        dilation: Used where the Gaussians bring none.
+    """
 
     def __init__(self, gaussians: Gaussians, camera: Camera, near: float, dilation: float) -> None:
         self.camera = camera
@@ -127,15 +139,26 @@ class _Scene:
         x, y = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
         self.centers = np.stack(np.meshgrid(x, y), -1)  # [H, W, 2]
 
-    def covariance(self, i: int) -> Array:
-        """[2, 2] of Gaussian i in pixels, without dilation."""
+    def jacobian(self, i: int) -> Array:
+        """[2, 3] of the projection at Gaussian i, world to pixels."""
         x, y, z = self.local[i]
         sx, sy = np.clip([x / z, y / z], self.low, self.high)
         fx, fy = self.focals
-        jacobian = np.array([[fx / z, 0, -fx * sx / z], [0, fy / z, -fy * sy / z]])
-        axes = _rotation(self.quats[i])
-        world = axes @ np.diag(self.scales[i] ** 2) @ axes.T
-        return np.asarray(jacobian @ self.rotation @ world @ self.rotation.T @ jacobian.T)
+        local = np.array([[fx / z, 0, -fx * sx / z], [0, fy / z, -fy * sy / z]])
+        return np.asarray(local @ self.rotation)
+
+    def axes(self, i: int) -> Array:
+        """[3, 3] the axes of Gaussian i as columns, one standard deviation long, world."""
+        return np.asarray(_rotation(self.quats[i]) @ np.diag(self.scales[i]))
+
+    def mean(self, i: int) -> Array:
+        """[2] projected mean of Gaussian i, pixels."""
+        return np.asarray(self.focals * self.local[i, :2] / self.local[i, 2] + self.principal)
+
+    def covariance(self, i: int) -> Array:
+        """[2, 2] of Gaussian i in pixels, without dilation."""
+        jacobian, axes = self.jacobian(i), self.axes(i)
+        return np.asarray(jacobian @ axes @ axes.T @ jacobian.T)
 
     def mip_factor(self, covariance: Array) -> float:
         """Factor of the opacity: 1 unless the response is antialiased."""
@@ -154,9 +177,7 @@ class _Scene:
             return nothing
         if not np.any(self.quats[i]):
             return nothing
-        offset = self.centers - (
-            self.focals * self.local[i, :2] / self.local[i, 2] + self.principal
-        )
+        offset = self.centers - self.mean(i)
         covariance = self.covariance(i)
         if self.response == "analytic":
             return np.asarray(self.opacities[i] * _window_integral(offset, covariance))

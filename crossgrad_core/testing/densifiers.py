@@ -137,7 +137,20 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
         pixels=(radii * radii) if "pixels" in needs else None,
         mean_gradient=gradient,
         abs_gradient=2.0 * gradient.abs() if "abs_gradient" in needs else None,
+        directions=_directions(radii, gradient, rng) if "directions" in needs else None,
     )
+
+
+def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Tensor:
+    """Up to four pixels in each bin; their gradients' sizes add up to twice `gradient`."""
+    shape = (radii.shape[0], 6, 4)
+    angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()
+    there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - every other one
+    there *= (radii > 0)[:, None, None]
+    units = torch.stack([angles.cos(), angles.sin(), there], -1) * there[..., None]
+    sums = units.sum(2)
+    absolute = gradient.abs()[:, None, :].expand(-1, 6, -1) / 3.0
+    return torch.cat([sums[..., :2], absolute, sums[..., 2:]], -1)
 
 
 def _backbone_for(densifier: Densifier) -> Backbone:

@@ -6,7 +6,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from crossgrad_core.gaussians import Gaussians, Render
+from crossgrad_core.gaussians import Gaussians, Render, Screen
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.registry import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
@@ -152,9 +152,27 @@ def statistics_are_filled(make: Make[Rasterizer]) -> None:
             require(
                 short.max() <= _ROUNDING * scale, "screen.abs_gradient is below |mean_gradient|"
             )
+    if "directions" in rasterizer.provides:
+        _directions_are_of_pixels(screen)
     if "pixels" in rasterizer.provides and screen.pixels is not None:
         require((screen.pixels[~visible] == 0).all(), "an invisible Gaussian has pixels")
         require((screen.pixels[visible] > 0).any(), "no visible Gaussian has pixels")
+
+
+def _directions_are_of_pixels(screen: Screen) -> None:
+    found, absolute = screen.directions, screen.abs_gradient
+    shape = None if found is None else tuple(found.shape)
+    wanted = (screen.radii.shape[0], 6, 5)
+    require(shape == wanted, f"screen.directions has shape {shape}, expected {wanted}")
+    if found is None:
+        return
+    length, count = found[..., :2].norm(dim=-1), found[..., 4]
+    require((length <= count * (1 + _ROUNDING)).all(), "screen.directions are not of unit length")
+    require((count == count.round()).all() and count.any(), "screen.directions counts no pixels")
+    if absolute is not None:
+        short = (found[..., 2:4].sum(1) - absolute).abs().max()
+        same = short <= _ROUNDING * absolute.max()
+        require(same, "the bins of screen.directions do not add up to screen.abs_gradient")
 
 
 def same_input_same_bits(make: Make[Rasterizer]) -> None:

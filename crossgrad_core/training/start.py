@@ -75,8 +75,11 @@ def warm_up(setup: Setup) -> float:
     """Compiles every kernel that the run will need, on a throw-away state; seconds it took."""
     start = perf_counter()
     setup = unwatched(setup)
-    degrees = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
-    for step in degrees:
+    steps = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
+    if setup.densifier.needs:
+        # Once density control is over, its statistics are left out: other kernels.
+        steps.append(setup.schedule.densify_until)
+    for step in steps:
         if step < setup.schedule.total:
             state = first_state(setup)
             state.step = step

@@ -98,7 +98,9 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn
     gaussians = setup.backbone.decode(
         state.parameters, view.camera, setup.phase(state.step, training=True)
     )
-    render = setup.rasterizer.render(gaussians, view.camera, background, setup.densifier.needs)
+    # Nobody reads the optional statistics once density control is over, and some cost much.
+    wanted = setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
+    render = setup.rasterizer.render(gaussians, view.camera, background, wanted)
     loss = photometric_loss(render.image, target, mask, setup.config.ssim_weight)
     state.counters.views += 1
     value = float(loss.detach())

@@ -26,7 +26,9 @@ _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest"
 class NumbaRasterizer(Rasterizer):
     """Draws float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
 
-    provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+    provides: ClassVar[frozenset[str]] = frozenset(
+        {"depth", "pixels", "abs_gradient", "directions"}
+    )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
 
     @override
@@ -70,6 +72,7 @@ class _Call:
         self.options = options
         self.screen = screen
         self.absolute = "abs_gradient" in outputs
+        self.directions = "directions" in outputs
         self.frame: Frame | None = None
 
 
@@ -131,10 +134,19 @@ class _Draw(torch.autograd.Function):
         if frame is None:
             raise RuntimeError("the forward pass did not run")
         v = np.zeros_like(frame.image) if v_image is None else _array(v_image)
-        found = backward(frame, v, _optional(v_alpha), _optional(v_depth), absolute=call.absolute)
+        found = backward(
+            frame,
+            v,
+            _optional(v_alpha),
+            _optional(v_depth),
+            absolute=call.absolute,
+            directions=call.directions,
+        )
         call.screen.mean_gradient = torch.from_numpy(found.centres)
         if found.absolute is not None:
             call.screen.abs_gradient = torch.from_numpy(found.absolute)
+        if found.directions is not None:
+            call.screen.directions = torch.from_numpy(found.directions)
         colors = found.colors if frame.gaussians.colors is not None else None
         rest = found.rest if found.rest is not None and found.rest.shape[1] else None
         arrays = (found.means, found.quats, found.scales, found.opacities, colors, found.dc, rest)

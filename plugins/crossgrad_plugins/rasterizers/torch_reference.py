@@ -10,7 +10,12 @@ from typing_extensions import override
 from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD, Rasterizer
 from crossgrad_core.scene.types import Camera
-from crossgrad_plugins.rasterizers.reference.compositing import composite_tiles, splat_table
+from crossgrad_plugins.rasterizers.reference.compositing import (
+    Drawing,
+    composite_tiles,
+    splat_table,
+)
+from crossgrad_plugins.rasterizers.reference.directions import longest_axes
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import Projection, project
 from crossgrad_plugins.rasterizers.reference.responses import Shape, shape
@@ -24,7 +29,9 @@ class TorchRasterizer(Rasterizer):
     It is the oracle that the fast rasterizers are tested against: short rather than quick.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient"})
+    provides: ClassVar[frozenset[str]] = frozenset(
+        {"depth", "pixels", "abs_gradient", "directions"}
+    )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
 
@@ -44,11 +51,14 @@ class TorchRasterizer(Rasterizer):
         projection, shapes, colors = self._splats(drawn, camera)
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))
         table = splat_table(projection.means, projection.depths, colors, shapes)
-        recorder = Recorder(screen, index, len(gaussians), "abs_gradient" in outputs)
+        axes = None
+        if "directions" in outputs:
+            axes = longest_axes(projection.factors.detach(), drawn.scales.detach())
+        recorder = Recorder(screen, index, len(gaussians), "abs_gradient" in outputs, axes)
         table, probe = recorded(table, recorder)
-        lists = tile_lists(boxes, size)
+        drawing = Drawing(size, gaussians.response, self.max_alpha, probe.shape[1])
         channels, touched, blended = composite_tiles(
-            torch.cat([probe, table], -1), lists, size, gaussians.response, self.max_alpha
+            torch.cat([probe, table], -1), tile_lists(boxes, size), drawing
         )
         radii = shapes.radii.detach().ceil().clamp(min=1)
         screen.radii[index] = torch.where(touched, radii, 0.0).int()

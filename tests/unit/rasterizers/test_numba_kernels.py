@@ -336,7 +336,7 @@ def basis_values(directions, k):
 
 
 def same_bits(first, second):
-    for name in (*PARAMETERS, "centres", "absolute"):
+    for name in (*PARAMETERS, "centres", "absolute", "directions"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), name)
 
 
@@ -349,7 +349,7 @@ def test_bits_depend_neither_on_the_number_of_threads_nor_on_the_run(threads):
 
     def run():
         frame = drawn(gaussians, camera(*size), **EVERYTHING)
-        return frame, backward(frame, v_image, absolute=True)
+        return frame, backward(frame, v_image, absolute=True, directions=True)
 
     before = numba.get_num_threads()
     frame, gradients = run()

@@ -154,6 +154,7 @@ class GaussianGradients:
         rest: [N, B - 1, 3], None without harmonics.
         centres: [N, 2] by the projected mean, per pixel.
         absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
+        directions: [N, 6, 5] of `crossgrad_core.gaussians.Screen`, None unless asked for.
     """
 
     means: Float32
@@ -165,3 +166,4 @@ class GaussianGradients:
     rest: Float32 | None
     centres: Float32
     absolute: Float32 | None
+    directions: Float32 | None

@@ -79,51 +79,19 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
+    DEPTHS,
+    PASSED,
+    REST,
+    STATE,
+    V_BLUE,
+    V_GREEN,
+    V_RED,
+    start_tile,
+)
 
 #: Entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
-
-# State of a segment: transmittance (negative once finished), S, gradient of the three channels.
-# The gradients of the depths of all segments follow the states of all segments.
-_T, _REST, _RED, _GREEN, _BLUE = 0, LANES, 2 * LANES, 3 * LANES, 4 * LANES
-_STATE = 5 * LANES
-_DEPTHS = SEGMENTS * _STATE
-
-
-@device
-def _start(
-    state: NDArray[np.float32],
-    top: int,
-    left: int,
-    image: NDArray[np.float32],
-    alpha: NDArray[np.float32],
-    depth: NDArray[np.float32] | None,
-    v_image: NDArray[np.float32],
-    v_alpha: NDArray[np.float32] | None,
-    v_depth: NDArray[np.float32] | None,
-) -> None:
-    """Fills the state of a tile."""
-    state[:] = np.float32(0.0)
-    for segment in range(SEGMENTS):
-        for x in range(SEGMENT):
-            state[segment * _STATE + _T + x] = np.float32(-1.0)
-    for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
-        for x in range(min(TILE_WIDTH, image.shape[1] - left)):
-            segment = (x // SEGMENT) * TILE_HEIGHT + y
-            at = segment * _STATE + x % SEGMENT
-            i, j = top + y, left + x
-            red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
-            rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
-            if v_alpha is not None:
-                rest -= v_alpha[i, j] * (np.float32(1.0) - alpha[i, j])
-            if depth is not None and v_depth is not None:
-                rest += v_depth[i, j] * depth[i, j]
-                state[_DEPTHS + segment * LANES + x % SEGMENT] = v_depth[i, j]
-            state[at + _T] = np.float32(1.0)
-            state[at + _REST] = rest
-            state[at + _RED] = red
-            state[at + _GREEN] = green
-            state[at + _BLUE] = blue
 
 
 @device
@@ -161,7 +129,7 @@ def _gather(
         segment = lowest_bit(reached)
         reached &= reached - np.uint64(1)
         row = base + (segment & (TILE_HEIGHT - 1))
-        at = segment * _STATE
+        at = segment * STATE
         offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
         if analytic is None:
             dx = offsets - broadcast(rows, row + ROW_CENTRE)
@@ -177,26 +145,26 @@ def _gather(
             touched = alpha >= load(constants, LEAST)
             free = touched & (alpha <= load(constants, LARGEST_ALPHA))
         alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-        before = load(state, at + _T)
+        before = load(state, at + PASSED)
         weight = alpha * before
         after = before - weight
         blended = after >= load(constants, STOPPED)
-        store(state, at + _T, where(blended, after, load(constants, FINISHED)))
+        store(state, at + PASSED, where(blended, after, load(constants, FINISHED)))
         weight = where(blended, weight, zero)
-        v_red = load(state, at + _RED)
-        v_green = load(state, at + _GREEN)
-        v_blue = load(state, at + _BLUE)
+        v_red = load(state, at + V_RED)
+        v_green = load(state, at + V_GREEN)
+        v_blue = load(state, at + V_BLUE)
         sum_red = fma(weight, v_red, sum_red)
         sum_green = fma(weight, v_green, sum_green)
         sum_blue = fma(weight, v_blue, sum_blue)
         toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
-            v_z = load(state, _DEPTHS + segment * LANES)
+            v_z = load(state, DEPTHS + segment * LANES)
             sum_depth = fma(weight, v_z, sum_depth)
             toned = fma(v_z, z, toned)
         own = weight * toned
-        rest = load(state, at + _REST) - own
-        store(state, at + _REST, rest)
+        rest = load(state, at + REST) - own
+        store(state, at + REST, rest)
         # alpha * dL/d(alpha), the gradient of the exponent and of the log of the opacity
         s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
         s = where(blended & free, s, zero)
@@ -257,10 +225,10 @@ def _backward(
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
-    state = np.empty(_DEPTHS + SEGMENTS * LANES, np.float32)
+    state = np.empty(DEPTHS + SEGMENTS * LANES, np.float32)
     rows = np.empty(BATCH * ROWS, np.float32)
     batch = np.empty(BATCH, np.int64)
-    _start(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
+    start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
     entry, stop = starts[tile], starts[tile + 1]
     while entry < stop:
         filled = 0

@@ -26,6 +26,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import (
     start_tiles,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import vector_constants
+from crossgrad_plugins.rasterizers.numba_kernels.directions import (
+    BINS,
+    FIELDS,
+    SUMS,
+    bin_directions,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import pinhole
 from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
 from crossgrad_plugins.rasterizers.numba_kernels.jobs import share
@@ -36,6 +42,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.longest_axes import add_directions, longest_axes
 from crossgrad_plugins.rasterizers.numba_kernels.projection import project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
@@ -90,6 +97,7 @@ def backward(
     v_depth: Float32 | None = None,
     *,
     absolute: bool = False,
+    directions: bool = False,
 ) -> GaussianGradients:
     """Returns the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
 
@@ -99,6 +107,7 @@ def backward(
         v_alpha: [H, W] or None.
         v_depth: [H, W] or None.
         absolute: Whether to compute the absolute gradients of the projected means.
+        directions: Whether to bin the directions of the pixels' gradients.
     """
     gaussians, options, projected, lists = (
         frame.gaussians,
@@ -138,6 +147,7 @@ def backward(
         rest=None if gaussians.rest is None else np.zeros_like(gaussians.rest),
         centres=np.zeros((count, 2), np.float32),
         absolute=np.zeros((count, 2), np.float32) if absolute else None,
+        directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
     )
     share(
         unproject,
@@ -179,6 +189,59 @@ def backward(
             gradients.means,
         )
     return gradients
+
+
+def _directions(
+    frame: Frame,
+    v_image: Float32,
+    v_alpha: Float32 | None,
+    v_depth: Float32 | None,
+    written: NDArray[np.uint8],
+) -> Float32:
+    """Returns the directions of the pixels' gradients [N, BINS, FIELDS], in a pass of their own."""
+    gaussians, projected, lists = frame.gaussians, frame.projected, frame.lists
+    analytic = _analytic(frame.options)
+    axes = np.empty(2 * gaussians.means.shape[0], np.float32)
+    share(
+        longest_axes,
+        projected.camera,
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        projected.drawn,
+        projected.owners,
+        axes,
+    )
+    found = np.empty(lists.slots * SUMS, np.float32)
+    share(
+        bin_directions,
+        lists.starts,
+        lists.entries,
+        frame.masks,
+        projected.records,
+        axes,
+        vector_constants(frame.options.max_alpha),
+        frame.image,
+        frame.alpha,
+        frame.depth if v_depth is not None else None,
+        np.ascontiguousarray(v_image, np.float32),
+        None if v_alpha is None else np.ascontiguousarray(v_alpha, np.float32),
+        None if v_depth is None else np.ascontiguousarray(v_depth, np.float32),
+        analytic,
+        found,
+    )
+    directions = np.zeros((gaussians.means.shape[0], BINS, FIELDS), np.float32)
+    share(
+        add_directions,
+        analytic is not None,
+        projected.drawn,
+        projected.owners,
+        lists.shelves,
+        written,
+        found,
+        directions,
+    )
+    return directions
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:

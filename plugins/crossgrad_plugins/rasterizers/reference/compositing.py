@@ -1,5 +1,7 @@
 """Front-to-back compositing, tile by tile, as dense [pixels, Gaussians] tensors."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding
@@ -19,6 +21,23 @@ CHANNELS = 5
 REMEMBERED_ENTRIES = 2**21
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """What all tiles of an image share.
+
+    Attributes:
+        size: Width and height of the image, pixels.
+        response: How a Gaussian fills a pixel.
+        max_alpha: Cap of alpha; what is capped has no gradient.
+        probed: Number R of the probe's columns.
+    """
+
+    size: tuple[int, int]
+    response: Response
+    max_alpha: float
+    probed: int
+
+
 def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) -> Tensor:
     """[N, 7 + S] one row per Gaussian, as `composite` reads it."""
     columns = (means, shapes.opacities[:, None], colors, depths[:, None], shapes.parameters)
@@ -26,16 +45,14 @@ def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) ->
 
 
 def composite_tiles(
-    table: Tensor, lists: TileLists, size: tuple[int, int], response: Response, max_alpha: float
+    table: Tensor, lists: TileLists, drawing: Drawing
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Blends all tiles of an image.
 
     Args:
-        table: [V, 9 + S] the probe's two columns and those of `splat_table`, front to back.
+        table: [V, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
         lists: The rows of each tile.
-        size: Width and height of the image, pixels.
-        response: How a Gaussian fills a pixel.
-        max_alpha: Cap of alpha.
+        drawing: What all tiles share.
 
     Returns:
         `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as of `composite`.
@@ -44,8 +61,8 @@ def composite_tiles(
     tiles = torch.split(embedding(lists.rows, table), lists.sizes)
     again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
     images, touched, blended = [], [], []
-    for rows, centers in zip(tiles, _tile_centers(size, table), strict=True):
-        arguments = (rows, centers.flatten(0, 1), response, max_alpha)
+    for rows, centers in zip(tiles, _tile_centers(drawing.size, table), strict=True):
+        arguments = (rows, centers.flatten(0, 1), drawing)
         if again:
             result = checkpoint(composite, *arguments, use_reentrant=False)
         else:
@@ -53,7 +70,7 @@ def composite_tiles(
         images.append(result[0].view(*centers.shape[:2], CHANNELS))
         touched.append(result[1])
         blended.append(result[2])
-    across = -(-size[0] // TILE)
+    across = -(-drawing.size[0] // TILE)
     bands = [torch.cat(images[i : i + across], 1) for i in range(0, len(images), across)]
     counts = torch.stack([torch.cat(touched).long(), torch.cat(blended)], -1)
     totals = counts.new_zeros(len(table), 2).index_add_(0, lists.rows, counts)
@@ -67,26 +84,24 @@ def _tile_centers(size: tuple[int, int], like: Tensor) -> list[Tensor]:
     return [tile for band in torch.split(grid, TILE) for tile in torch.split(band, TILE, 1)]
 
 
-def composite(
-    table: Tensor, centers: Tensor, response: Response, max_alpha: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
     """Blends the Gaussians of one tile over its pixels.
 
     Args:
-        table: [G, 9 + S] the probe's two columns and those of `splat_table`, front to back.
+        table: [G, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
         centers: [P, 2] pixel centres.
-        response: How a Gaussian fills a pixel.
-        max_alpha: Cap of alpha; what is capped has no gradient.
+        drawing: What all tiles share.
 
     Returns:
         `channels` [P, 5]: RGB, depth and accumulated opacity, without background; `touched` [G]
         bool: whether the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
         number of pixels in which it was blended.
     """
-    columns = [2, 2, 1, 4, table.shape[1] - 9]
+    columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, colors_depths, parameters = torch.split(table, columns, -1)
-    dx, dy = offsets(means, probe, centers)
-    alpha = (opacities.T * coverage(dx, dy, parameters, response)).clamp(max=max_alpha)
+    dx, dy = offsets(means, probe, centers, drawing.size)
+    alpha = opacities.T * coverage(dx, dy, parameters, drawing.response)
+    alpha = alpha.clamp(max=drawing.max_alpha)
     touching = alpha >= ALPHA_THRESHOLD
     alpha = torch.where(touching, alpha, 0.0)
     after = (1 - alpha).cumprod(-1)  # transmittance behind each Gaussian, if nothing stops

@@ -20,6 +20,7 @@ class Projection:
         xy: See `xx`.
         yy: See `xx`.
         det: [N] determinant of the 2-D covariance, px^4; never negative.
+        factors: [N, 2, 3] projections of the three axes, one standard deviation long, pixels.
     """
 
     means: Tensor
@@ -28,6 +29,7 @@ class Projection:
     xy: Tensor
     yy: Tensor
     det: Tensor
+    factors: Tensor
 
 
 def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projection:
@@ -62,7 +64,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     # Cauchy-Binet: a sum of squares, where xx * yy - xy^2 would cancel for needles.
     det = torch.linalg.cross(first, second).square().sum(-1)
     xx, xy, yy = first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1)
-    return Projection(torch.stack([u, v], -1), z, xx, xy, yy, det)
+    return Projection(torch.stack([u, v], -1), z, xx, xy, yy, det, factor)
 
 
 def rotations(quats: Tensor) -> Tensor:

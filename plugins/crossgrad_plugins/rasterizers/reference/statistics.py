@@ -1,4 +1,4 @@
-"""Gradients of the projected means, signed and absolute, read off the backward pass."""
+"""Gradients of the projected means, signed, absolute and binned, read off the backward pass."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +8,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.gaussians import Screen
+from crossgrad_plugins.rasterizers.reference.directions import BINS, FIELDS, binned_directions
 
 
 @dataclass(frozen=True)
@@ -19,46 +20,63 @@ class Recorder:
         index: [V] int64, the Gaussian of each drawn row.
         count: Number N of all Gaussians.
         absolute: Whether absolute gradients were asked for.
+        axes: [V, 2] longest axes, where directions were asked for; else None.
     """
 
     screen: Screen
     index: Tensor
     count: int
     absolute: bool
+    axes: Tensor | None = None
 
-    def record(self, signed: Tensor, absolute: Tensor) -> None:
-        """Takes the gradients [V, 2] of the drawn rows."""
+    def record(self, signed: Tensor, sums: Tensor) -> None:
+        """Takes the gradients [V, 2] of the drawn rows and the sums that came to their probes."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
-            self.screen.abs_gradient = self._scattered(absolute)
+            self.screen.abs_gradient = self._scattered(sums[:, :2])
+        if self.axes is not None:
+            binned = self._scattered(sums[:, 4:])
+            self.screen.directions = binned.view(self.count, BINS, FIELDS)
+
+    def probe(self, like: Tensor) -> Tensor:
+        """[V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero for each sum of a bin."""
+        zeros = like.new_zeros(len(like), 2)
+        if self.axes is None:
+            return zeros
+        return torch.cat([zeros, self.axes, like.new_zeros(len(like), BINS * FIELDS)], -1)
 
     def _scattered(self, rows: Tensor) -> Tensor:
-        full = rows.new_zeros(self.count, 2)
+        full = rows.new_zeros(self.count, rows.shape[1])
         full[self.index] = rows
         return full
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """The same table [V, C], noted on the way back, and a probe [V, 2].
+    """The same table [V, C], noted on the way back, and a probe [V, R].
 
-    The first two columns are projected means. The probe is zeros that reach the pixels as means do;
-    its gradient is the sum of the absolute values of the pixels' gradients (see `offsets`).
+    The first two columns are projected means. The probe reaches the pixels as means do and changes
+    nothing there; what comes back to it as its gradient are sums over pixels (see `offsets`).
     """
     result: tuple[Tensor, Tensor] = _Recorded.apply(table, recorder)  # type: ignore[no-untyped-call]
     return result
 
 
-def offsets(means: Tensor, probe: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def offsets(
+    means: Tensor, probe: Tensor, pixels: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
     """Mean minus pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
 
-    Backward sums the pixels' gradients for the means, and their absolute values for the probe.
+    Backward sums the pixels' gradients for the means; for the probe's first two columns it sums
+    their absolute values, and for the columns after the axes, where there are any, what
+    `binned_directions` finds.
 
     Args:
         means: [G, 2] pixels.
-        probe: [G, 2] from `recorded`.
+        probe: [G, R] from `recorded`.
         pixels: [P, 2] pixel centres.
+        size: Width and height of the image, pixels.
     """
-    result: tuple[Tensor, Tensor] = _Offsets.apply(means, probe, pixels)  # type: ignore[no-untyped-call]
+    result: tuple[Tensor, Tensor] = _Offsets.apply(means, probe, pixels, size)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -67,7 +85,7 @@ class _Recorded(torch.autograd.Function):
     @override
     def forward(ctx: Any, table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
         ctx.recorder = recorder
-        return table.view_as(table), table.new_zeros(len(table), 2)
+        return table.view_as(table), recorder.probe(table)
 
     @staticmethod
     @override
@@ -80,13 +98,24 @@ class _Recorded(torch.autograd.Function):
 class _Offsets(torch.autograd.Function):
     @staticmethod
     @override
-    def forward(ctx: Any, means: Tensor, probe: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, means: Tensor, probe: Tensor, pixels: Tensor, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
         dx, dy = (means.T[:, None, :] - pixels.T[:, :, None]).unbind(0)
+        ctx.save_for_backward(means, probe, pixels)
+        ctx.size = size
         return dx.contiguous(), dy.contiguous()
 
     @staticmethod
     @override
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        signed = torch.stack([g.sum(0) for g in gradients], -1)
-        absolute = torch.stack([g.abs().sum(0) for g in gradients], -1)
-        return signed, absolute, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        means, probe, pixels = ctx.saved_tensors
+        both = torch.stack(gradients)  # [2, P, G]
+        signed, absolute = both.sum(1).T, both.abs().sum(1).T
+        if probe.shape[1] == absolute.shape[1]:
+            return signed, absolute, None, None
+        axes = probe[:, 2:4]
+        away = pixels.T[:, :, None] - means.T[:, None, :]
+        binned = binned_directions(both, away, axes, ctx.size).flatten(1)
+        sums = torch.cat([absolute, torch.zeros_like(axes), binned], -1)
+        return signed, sums, None, None

@@ -1,0 +1,103 @@
+"""DC4GS: splits where the directions of a Gaussian's gradients disagree, and where they part."""
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+from typing_extensions import override
+
+from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.splats import rotation_matrices
+from crossgrad_core.state import PluginState
+from crossgrad_core.topology import Rows
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
+from crossgrad_plugins.densifiers.direction_scores import (
+    PLANES,
+    inconsistency,
+    ndc_directions,
+    plane_scores,
+)
+from crossgrad_plugins.densifiers.screen_statistics import add, mean, ndc_gradient, sums, visible
+from crossgrad_plugins.densifiers.split_position import split_positions
+
+
+class DirectionalConsistency(CloneSplit):
+    """Clones by the mean gradient, splits by (1 - R) ga where the directions part.
+
+    R is the length of the mean direction of the pixels' gradients and ga the norm of their absolute
+    values, per view; (1 - R) ga is averaged over the renders in which the Gaussian was visible.
+    The children of a split lie side by side on the longest axis, cut where both sides are most
+    consistent.
+    """
+
+    needs = frozenset({"directions"})
+
+    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to clone at")
+    split_threshold: float = Field(4e-4, gt=0, description="mean (1 - R) ga, NDC, to split at")
+
+    @override
+    def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
+        totals = sums(context, state, ("gradient", "inconsistency", "renders"))
+        zeros = totals["renders"].new_zeros(totals["renders"].shape[0], PLANES)
+        totals["planes"] = state.per_primitive.get("planes", zeros).clone()
+        for record in context.views:
+            seen, bins = visible(record), ndc_directions(record)
+            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
+            add(record, totals["gradient"], norms * seen)
+            add(record, totals["inconsistency"], inconsistency(bins.sum(dim=0)))
+            add(record, totals["planes"], plane_scores(bins).T)
+            add(record, totals["renders"], seen)
+        return PluginState(per_primitive=totals)
+
+    @override
+    def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
+        gradient = mean(state.per_primitive, "gradient", "renders")
+        parting = mean(state.per_primitive, "inconsistency", "renders")
+        clone = (gradient >= self.grad_threshold) & small
+        split = (parting >= self.split_threshold) & ~small
+        # In units of the thresholds clones and splits compare where room is short.
+        urge = torch.where(small, gradient / self.grad_threshold, parting / self.split_threshold)
+        return Growth(clone=clone, split=split, strength=urge)
+
+    @override
+    def grown_values(
+        self, context: DensifyContext, state: PluginState, plan: Plan
+    ) -> dict[str, Rows]:
+        rows = plan.child.nonzero().squeeze(1)
+        # The first children of all parents come before the second ones.
+        parents = plan.source[rows[: len(rows) // 2]]
+        position = split_positions(state.per_primitive["planes"][parents])
+        children = [
+            _child(context, parents, position, right=False),
+            _child(context, parents, position, right=True),
+        ]
+        return {
+            name: Rows(torch.cat([child[name] for child in children]), rows)
+            for name in ("means", "scales", "opacities")
+        }
+
+
+def _child(
+    context: DensifyContext, parents: Tensor, position: Tensor, *, right: bool
+) -> dict[str, Tensor]:
+    """New values of the left or right children of some parents [S], cut at `position` [S].
+
+    The longest axis is six standard deviations long. The left child has the first share p of it,
+    and that share of the opacity: its middle is 3 (1 - p) deviations left of the parent's.
+    """
+    edited = ("means", "scales", "quats", "opacities")
+    old = {name: context.parameters[name].detach()[parents] for name in edited}
+    share = 1.0 - position if right else position
+    place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)
+    longest = old["scales"].argmax(dim=1)
+    each = torch.arange(len(parents), device=parents.device)
+    axis = rotation_matrices(old["quats"])[each, :, longest]
+    width = torch.exp(old["scales"][each, longest])
+    scales = old["scales"].clone()
+    scales[each, longest] += torch.log(share)
+    opacity = logsigmoid(old["opacities"]) + torch.log(share)
+    return {
+        "means": old["means"] + axis * (place * width)[:, None],
+        "scales": scales,
+        "opacities": opacity - torch.log(-torch.expm1(opacity)),
+    }

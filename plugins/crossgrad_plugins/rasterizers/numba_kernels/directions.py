@@ -1,0 +1,247 @@
+"""Directions of the pixels' gradients, binned along each Gaussian's longest axis.
+
+A pass of its own after the backward pass, for those who ask for it: it draws the tiles again with
+the same operations as `backward`, hence with the same gradients, and sums per entry and bin what
+`crossgrad_core.gaussians.Screen.directions` describes.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.simd import (
+    LANES,
+    Lanes,
+    Mask,
+    broadcast,
+    fma,
+    larger,
+    load,
+    lowest_bit,
+    magnitude,
+    prefetch,
+    splat,
+    square_root,
+    store,
+    sums,
+    where,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import fill_axis_rows
+from crossgrad_plugins.rasterizers.numba_kernels.constants import OFFSETS
+from crossgrad_plugins.rasterizers.numba_kernels.footprint import ROWS, fill_rows
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    RECORD,
+    SEGMENT,
+    SEGMENTS,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    U_PART,
+    U_WHOLE,
+    V_PART,
+    V_WHOLE,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.pixel_gradients import mean_gradients
+from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import DEPTHS, start_tile
+
+BINS, FIELDS = 6, 5
+#: Sums per entry: those of the bins, and two that are not used.
+SUMS = 4 * LANES
+#: Entries ahead for whose records memory is asked.
+_AHEAD = 8
+_SMALL, _UP = np.float32(2.0**-60), np.float32(2.0**90)
+_LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
+
+
+@device
+def _add(binned: NDArray[np.float32], number: int, inside: Mask, value: Lanes) -> None:
+    """Adds the values inside a bin to sum `number`."""
+    at = number * LANES
+    store(binned, at, load(binned, at) + where(inside, value, splat(np.float32(0.0))))
+
+
+@device
+def _bin(place: float) -> int:
+    """Returns the bin of a place along the axis."""
+    return np.intp(min(max(np.floor(place), np.float32(-3.0)), np.float32(2.0))) + 3
+
+
+@device
+def _spread(
+    gx: Lanes,
+    gy: Lanes,
+    along: Lanes,
+    width: np.float32,
+    height: np.float32,
+    places: NDArray[np.float32],
+    binned: NDArray[np.float32],
+) -> None:
+    """Adds the gradients of eight pixels to the sums of the bins that hold them.
+
+    Args:
+        gx: Gradients by the projected mean, px^-1; likewise `gy`.
+        gy: See `gx`.
+        along: Places along the axis, standard deviations.
+        width: Of the image, pixels; likewise `height`. A direction is that in NDC units.
+        height: See `width`.
+        places: [LANES] room for `along`.
+        binned: [BINS * FIELDS * LANES].
+    """
+    one = splat(np.float32(1.0))
+    hx, hy = gx * splat(width), gy * splat(height)
+    largest = larger(magnitude(hx), magnitude(hy))
+    moved = splat(np.float32(0.0)) < largest
+    # Powers of two that keep the squares within float32, whatever the gradients.
+    scale = where(largest < splat(_SMALL), splat(_UP), one)
+    scale = where(splat(_LARGE) < largest, splat(_DOWN), scale)
+    hx, hy = hx * scale, hy * scale
+    inverse = one / square_root(fma(hx, hx, hy * hy))
+    hx, hy, gx, gy = hx * inverse, hy * inverse, magnitude(gx), magnitude(gy)
+    # Places rise or fall along a row of pixels, so the first and the last one bound the bins.
+    store(places, 0, along)
+    first, last = _bin(places[0]), _bin(places[LANES - 1])
+    for number in range(min(first, last), max(first, last) + 1):
+        low = splat(np.float32(number - 3 if number > 0 else -np.inf))
+        high = splat(np.float32(number - 2 if number < BINS - 1 else np.inf))
+        inside = moved & (along >= low) & (along < high)
+        _add(binned, number * FIELDS, inside, hx)
+        _add(binned, number * FIELDS + 1, inside, hy)
+        _add(binned, number * FIELDS + 2, inside, gx)
+        _add(binned, number * FIELDS + 3, inside, gy)
+        _add(binned, number * FIELDS + 4, inside, one)
+
+
+@device
+def _entry(
+    reached: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    axes: NDArray[np.float32],
+    axis: int,
+    top: int,
+    left: int,
+    rows: NDArray[np.float32],
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    image: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
+    places: NDArray[np.float32],
+    binned: NDArray[np.float32],
+    found: NDArray[np.float32],
+    at: int,
+) -> None:
+    """Writes the sums of one Gaussian over the reached segments of a tile to found[at:]."""
+    half = splat(np.float32(0.5))
+    axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
+    # Pixel centres are at whole numbers here, as in `fill_rows`.
+    u = (broadcast(records, record + U_WHOLE) - splat(np.float32(left))) + (
+        broadcast(records, record + U_PART) - half
+    )
+    v = (broadcast(records, record + V_WHOLE) - splat(np.float32(top))) + (
+        broadcast(records, record + V_PART) - half
+    )
+    binned[:] = np.float32(0.0)
+    width, height = np.float32(image.shape[1]), np.float32(image.shape[0])
+    while reached != np.uint64(0):
+        segment = lowest_bit(reached)
+        reached &= reached - np.uint64(1)
+        gx, gy = mean_gradients(
+            segment, records, record, rows, 0, state, constants, v_depth, analytic
+        )
+        dx = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT) - u
+        dy = splat(np.float32(segment & (TILE_HEIGHT - 1))) - v
+        _spread(gx, gy, fma(axis_x, dx, axis_y * dy), width, height, places, binned)
+    for group in range(SUMS // LANES):
+        first = group * LANES * LANES
+        eight = sums(
+            load(binned, first),
+            load(binned, first + LANES),
+            load(binned, first + 2 * LANES),
+            load(binned, first + 3 * LANES),
+            load(binned, first + 4 * LANES),
+            load(binned, first + 5 * LANES),
+            load(binned, first + 6 * LANES),
+            load(binned, first + 7 * LANES),
+        )
+        store(found, at + group * LANES, eight)
+
+
+@kernel
+def bin_directions(
+    jobs: Jobs,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    masks: NDArray[np.uint64],
+    records: NDArray[np.float32],
+    axes: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
+    found: NDArray[np.float32],
+) -> None:
+    """Sums the directions of every entry with a mask over its tile's pixels.
+
+    Args:
+        jobs: From `share`.
+        starts: As in `differentiate`, like all up to `analytic` but `axes`.
+        entries: [E, 2].
+        masks: [E].
+        records: Records of the drawn Gaussians, flat.
+        axes: [2 N] flat, per record, from `longest_axes`.
+        constants: From `vector_constants`.
+        image: [H, W, 3].
+        alpha: [H, W].
+        depth: [H, W] or None.
+        v_image: [H, W, 3].
+        v_alpha: [H, W] or None.
+        v_depth: [H, W] or None.
+        analytic: Any vector says that the response is analytic.
+        found: [slots * SUMS] written for slots of entries with a mask.
+    """
+    columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
+    state = np.empty(DEPTHS + SEGMENTS * LANES, np.float32)
+    rows = np.empty(ROWS, np.float32)
+    places = np.empty(LANES, np.float32)
+    binned = np.empty(SUMS * LANES, np.float32)
+    tile = take(jobs)
+    while tile < starts.shape[0] - 1:
+        top = (tile // columns) * TILE_HEIGHT
+        left = (tile % columns) * TILE_WIDTH
+        start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
+        for entry in range(starts[tile], starts[tile + 1]):
+            if masks[entry] == np.uint64(0):
+                continue
+            ahead = min(entry + _AHEAD, starts[tile + 1] - 1)
+            prefetch(records, np.intp(entries[ahead, 0]) * RECORD)
+            number = np.intp(entries[entry, 0])
+            record = number * RECORD
+            if analytic is None:
+                fill_rows(records, record, np.float32(left), np.float32(top), rows, 0)
+            else:
+                fill_axis_rows(records, record, np.float32(left), np.float32(top), rows, 0)
+            _entry(
+                np.uint64(masks[entry]),
+                records,
+                record,
+                axes,
+                2 * number,
+                top,
+                left,
+                rows,
+                state,
+                constants,
+                image,
+                v_depth,
+                analytic,
+                places,
+                binned,
+                found,
+                np.intp(entries[entry, 1]) * SUMS,
+            )
+        tile = take(jobs)

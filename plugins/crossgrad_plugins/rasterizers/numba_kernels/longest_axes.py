@@ -1,0 +1,130 @@
+"""The longest axis of each drawn Gaussian as the camera sees it, and sums along it."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
+from crossgrad_plugins.rasterizers.numba_kernels.directions import BINS, FIELDS, SUMS
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
+    Pinhole,
+    clamped,
+    dot,
+    in_registers,
+    jacobian_rows,
+    rotation,
+    to_camera,
+    unit_quaternion,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
+from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
+
+#: An axis that the camera sees shorter than this (pixels) is seen end on and has no direction.
+SHORTEST = 1e-6
+#: The gradients of plain records were left in this unit.
+_PLAIN_UNIT = 2.0 * math.log(2.0)
+
+
+@device
+def _axis(
+    camera: Pinhole,
+    mean: NDArray[np.float32],
+    quat: NDArray[np.float32],
+    scale: NDArray[np.float32],
+) -> tuple[float, float]:
+    """Returns a / |a|^2 with a the projection of the longest axis (one standard deviation), px."""
+    pose = in_registers(camera.pose)
+    x, y, z = to_camera(pose, (np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])))
+    unit, _ = unit_quaternion(
+        (np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3]))
+    )
+    slope_x = clamped(x / z, camera.left, camera.right)
+    slope_y = clamped(y / z, camera.top, camera.bottom)
+    row_x, row_y = jacobian_rows(camera, pose, 1.0 / z, slope_x, slope_y)
+    column_x, column_y, column_z = rotation(unit)
+    longest, column = np.float64(scale[0]), column_x
+    if scale[1] > longest:
+        longest, column = np.float64(scale[1]), column_y
+    if scale[2] > longest:
+        longest, column = np.float64(scale[2]), column_z
+    across, down = dot(row_x, column) * longest, dot(row_y, column) * longest
+    square = across * across + down * down
+    if square <= SHORTEST * SHORTEST:
+        return 0.0, 0.0
+    return across / square, down / square
+
+
+@kernel
+def longest_axes(
+    jobs: Jobs,
+    camera: Pinhole,
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    drawn: NDArray[np.int64],
+    owners: NDArray[np.int32],
+    axes: NDArray[np.float32],
+) -> None:
+    """Projects the longest axis of every record.
+
+    Args:
+        jobs: From `share`.
+        camera: The camera.
+        means: [N, 3].
+        quats: [N, 4].
+        scales: [N, 3].
+        drawn: [chunks] from `project`.
+        owners: [N] from `project`.
+        axes: [2 N] flat, written per record: a / |a|^2 with a the projected axis, one standard
+            deviation long, in pixels; 0 where it is seen end on.
+    """
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            i = np.intp(owners[j])
+            axes[2 * j], axes[2 * j + 1] = _axis(camera, means[i], quats[i], scales[i])
+        chunk = take(jobs)
+
+
+@kernel
+def add_directions(
+    jobs: Jobs,
+    analytic: bool,
+    drawn: NDArray[np.int64],
+    owners: NDArray[np.int32],
+    shelves: NDArray[np.int32],
+    written: NDArray[np.uint8],
+    found: NDArray[np.float32],
+    directions: NDArray[np.float32],
+) -> None:
+    """Adds up each Gaussian's slots in their order.
+
+    Args:
+        jobs: From `share`.
+        analytic: Whether the response is analytic.
+        drawn: [chunks] from `project`.
+        owners: [N] from `project`.
+        shelves: [N, SHELF] from binning.
+        written: [slots] from `differentiate`.
+        found: [slots * SUMS] from `bin_directions`.
+        directions: [N, BINS, FIELDS] written for Gaussians with gradients, zero before.
+    """
+    unit = 1.0 if analytic else _PLAIN_UNIT
+    total = np.empty(SUMS, np.float32)
+    chunk = take(jobs)
+    while chunk < drawn.shape[0]:
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            total[:] = np.float32(0.0)
+            first = np.intp(shelves[j, FIRST_SLOT])
+            for slot in range(first, first + shelves[j, SLOTS]):
+                if written[slot]:
+                    for k in range(SUMS):
+                        total[k] += found[slot * SUMS + k]
+            i = np.intp(owners[j])
+            for number in range(BINS):
+                for field in range(FIELDS):
+                    value = np.float64(total[number * FIELDS + field])
+                    directions[i, number, field] = value * unit if field in (2, 3) else value
+        chunk = take(jobs)

@@ -1,0 +1,149 @@
+"""Gradients of single pixels by the projected mean of a Gaussian.
+
+The operations are those of `backward` in its order, hence with its bits; only what the sums of
+other gradients need is left out.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.simd import (
+    LANES,
+    Lanes,
+    Mask,
+    broadcast,
+    fma,
+    fnma,
+    load,
+    smaller,
+    splat,
+    store,
+    where,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    axis_offsets,
+    coverage_gradients,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.constants import (
+    CAPPED,
+    FINISHED,
+    LARGEST_ALPHA,
+    LEAST,
+    OFFSETS,
+    ONE,
+    STOPPED,
+    TOUCHED,
+    exp2,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
+    ROW_CENTRE,
+    ROW_DY,
+    ROW_EXPONENT,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    BLUE,
+    COSINE,
+    DECAY,
+    DEPTH,
+    GREEN,
+    INVERSE_1,
+    INVERSE_2,
+    PEAK,
+    RED,
+    ROW_DECAY,
+    SEGMENT,
+    SINE,
+    SLOPE,
+    TILE_HEIGHT,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
+    DEPTHS,
+    PASSED,
+    REST,
+    STATE,
+    V_BLUE,
+    V_GREEN,
+    V_RED,
+)
+
+
+@device
+def _exponent_gradient(
+    segment: int,
+    records: NDArray[np.float32],
+    record: int,
+    alpha: Lanes,
+    free: Mask,
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+) -> Lanes:
+    """Blends a segment; returns the loss' gradient by the logarithm of alpha."""
+    at = segment * STATE
+    zero = splat(np.float32(0.0))
+    before = load(state, at + PASSED)
+    weight = alpha * before
+    after = before - weight
+    blended = after >= load(constants, STOPPED)
+    store(state, at + PASSED, where(blended, after, load(constants, FINISHED)))
+    weight = where(blended, weight, zero)
+    toned = load(state, at + V_RED) * broadcast(records, record + RED)
+    toned = fma(load(state, at + V_GREEN), broadcast(records, record + GREEN), toned)
+    toned = fma(load(state, at + V_BLUE), broadcast(records, record + BLUE), toned)
+    if v_depth is not None:
+        v_z = load(state, DEPTHS + segment * LANES)
+        toned = fma(v_z, broadcast(records, record + DEPTH), toned)
+    own = weight * toned
+    rest = load(state, at + REST) - own
+    store(state, at + REST, rest)
+    s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
+    return where(blended & free, s, zero)
+
+
+@device
+def mean_gradients(
+    segment: int,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    base: int,
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+    analytic: NDArray[np.float32] | None,
+) -> tuple[Lanes, Lanes]:
+    """Blends a segment; returns its pixels' gradients by the projected mean (x and y).
+
+    Those of plain records are in units of 2 log 2 px^-1, the others in px^-1.
+    """
+    row = base + (segment & (TILE_HEIGHT - 1))
+    offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+    zero = splat(np.float32(0.0))
+    if analytic is None:
+        decay = broadcast(records, record + DECAY)
+        dx = offsets - broadcast(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+        touched = power >= load(constants, TOUCHED)
+        free = power <= load(constants, CAPPED)
+        alpha = exp2(power, constants)
+    else:
+        cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
+        inverse_1 = broadcast(records, record + INVERSE_1)
+        inverse_2 = broadcast(records, record + INVERSE_2)
+        peak = broadcast(records, record + PEAK)
+        u, v = axis_offsets(cosine, sine, offsets, rows, row)
+        alpha, by_u, by_v, _, _ = coverage_gradients(peak, u, v, inverse_1, inverse_2, constants)
+        touched = alpha >= load(constants, LEAST)
+        free = touched & (alpha <= load(constants, LARGEST_ALPHA))
+    alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
+    s = _exponent_gradient(segment, records, record, alpha, free, state, constants, v_depth)
+    if analytic is None:
+        sd = s * dx
+        lean = decay * broadcast(records, record + SLOPE)
+        pull = broadcast(records, record + ROW_DECAY)
+        sy = s * broadcast(rows, row + ROW_DY)
+        return decay * sd, fnma(lean, sd, pull * sy)
+    su = where(free, s * by_u * inverse_1, zero)
+    sv = where(free, s * by_v * inverse_2, zero)
+    return fnma(cosine, su, sine * sv), zero - fma(cosine, sv, sine * su)

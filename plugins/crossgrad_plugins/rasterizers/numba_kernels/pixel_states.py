@@ -1,0 +1,56 @@
+"""What the backward passes keep of each pixel of a tile, in segments of eight."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.simd import LANES
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    SEGMENT,
+    SEGMENTS,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+
+#: State of a segment: transmittance (negative once finished), the part S of the loss' linear form
+#: still to come (see `backward`), gradient of the three channels.
+PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, LANES, 2 * LANES, 3 * LANES, 4 * LANES
+STATE = 5 * LANES
+#: The gradients of the depths of all segments follow the states of all segments.
+DEPTHS = SEGMENTS * STATE
+
+
+@device
+def start_tile(
+    state: NDArray[np.float32],
+    top: int,
+    left: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the state of a tile."""
+    state[:] = np.float32(0.0)
+    for segment in range(SEGMENTS):
+        for x in range(SEGMENT):
+            state[segment * STATE + PASSED + x] = np.float32(-1.0)
+    for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
+        for x in range(min(TILE_WIDTH, image.shape[1] - left)):
+            segment = (x // SEGMENT) * TILE_HEIGHT + y
+            at = segment * STATE + x % SEGMENT
+            i, j = top + y, left + x
+            red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
+            rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
+            if v_alpha is not None:
+                rest -= v_alpha[i, j] * (np.float32(1.0) - alpha[i, j])
+            if depth is not None and v_depth is not None:
+                rest += v_depth[i, j] * depth[i, j]
+                state[DEPTHS + segment * LANES + x % SEGMENT] = v_depth[i, j]
+            state[at + PASSED] = np.float32(1.0)
+            state[at + REST] = rest
+            state[at + V_RED] = red
+            state[at + V_GREEN] = green
+            state[at + V_BLUE] = blue
