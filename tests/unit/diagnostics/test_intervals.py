@@ -9,6 +9,7 @@ import pytest
 from crossgrad_core.diagnostics.grouped import GroupedGramian, Groups
 from crossgrad_core.diagnostics.interval import Interval
 from crossgrad_core.diagnostics.intervals import split_intervals
+from crossgrad_core.diagnostics.pivots import StudentisedGap
 from crossgrad_core.diagnostics.resampling import Resamples, multiplicities
 from crossgrad_core.diagnostics.variance import split_of, variance_split
 
@@ -61,6 +62,50 @@ def test_acceptance_in_a_thousand_repetitions(kind, dimension, lowest, sizes):
     within, between, _ = COVERAGE(kind, dimension, sizes, 1.0, 1000)
     assert lowest <= within <= 0.98
     assert lowest <= between <= 0.98
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "dimension", "ratio", "figure", "lowest"),
+    [
+        # The sample's gap points where gradients vary most: once 99 %.
+        pytest.param("decaying", 30, 0.1, 1, 0.92, id="few directions dominate"),
+        # Too few long gradients make sigma_w^2 too small: once 84 %.
+        pytest.param("student3", 3, 1.0, 2, 0.88, id="ratio without a fourth moment"),
+    ],
+)
+def test_the_hard_cases_are_inside(kind, dimension, ratio, figure, lowest):
+    assert lowest <= COVERAGE(kind, dimension, (12, 12), ratio, 500)[figure] <= 0.98
+
+
+@pytest.mark.parametrize("isotropic", [True, False])
+def test_variance_along_the_true_gap(isotropic):
+    """The variance that the pivot assumes at the true gap, on average, against that of normals."""
+    rng = np.random.default_rng(1)
+    scales = np.ones(30) if isotropic else 1.0 / np.sqrt(1.0 + np.arange(30))
+    # The gap lies where gradients vary least.
+    gap = np.zeros(30)
+    gap[-1] = 1.5
+    groups = Groups(np.arange(24) < 12)
+    assumed, plain = [], []
+    for _ in range(250):
+        rows = rng.normal(size=(24, 30)) * scales
+        rows[12:] += gap
+        parts = GroupedGramian.of(rows @ rows.T, groups)
+        draws = Resamples.of(parts, groups, 20, rng)
+        problem = StudentisedGap.of(parts, groups, draws)
+        along = [d.shift_variance[0] * parts.scale for d in (problem.draws, draws)]
+        floor = problem.floor * parts.scale**2
+        assumed.append(4.0 * (gap @ gap) * along[0] + floor)
+        plain.append(4.0 * (gap @ gap) * along[1] + floor)
+    # 4 d' Sigma d + 2 tr(Sigma^2) for the difference of two means of twelve, less the diagonals.
+    of_noise = (scales**4).sum() * (4.0 / (12 * 11) + 4.0 / (12 * 12))
+    exact = 4.0 * (gap**2 * scales**2).sum() * (2.0 / 12.0) + of_noise
+    if isotropic:
+        assert np.mean(assumed) == pytest.approx(exact, rel=0.05)
+    else:
+        assert np.mean(assumed) > exact
+        assert np.mean(assumed) - exact < 0.65 * (np.mean(plain) - exact)
 
 
 def sample(seed=0, near=9, far=7, dimension=20, shift=0.3):
