@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from crossgrad_core.errors import IncompatibleSelectionError
+from crossgrad_core.registry import load
 from crossgrad_core.testing.combinations import (
     SLOTS,
     STEPS,
@@ -72,6 +73,10 @@ def copied(parameters):
     return {name: tensor.detach().clone() for name, tensor in parameters.items()}
 
 
+def usual_densifier(backbone):
+    return load("backbones", backbone).default_densifier
+
+
 def check(row):
     setup = setup_of(row)
     before, early, after, records = trained(setup)
@@ -114,7 +119,10 @@ def test_combination_trains_and_repeats(row):
 
 @pytest.mark.parametrize("densifier", DENSIFIERS)
 def test_density_control_acts_within_these_few_steps(densifier):
-    row = next(row for row in DESIGN if row[SLOTS.index("densifier")] == densifier)
+    rows = [row for row in DESIGN if row[SLOTS.index("densifier")] == densifier]
+    # On its own backbone where there is one: others may leave it nothing to do in five steps.
+    own = [row for row in rows if usual_densifier(row[SLOTS.index("backbone")]) == densifier]
+    row = [*own, *rows][0]
     *_, records = trained(setup_of(row))
     edits = [key for record in records for key, count in record.counts.items() if count]
     assert set(edits) - AGGREGATION

@@ -115,7 +115,7 @@ def test_an_unknown_link_is_refused_with_a_suggestion():
 def selection(operator, views, blocks=()):
     class Backbone:
         @staticmethod
-        def blocks():
+        def trained_blocks():
             return blocks
 
     sampler = build("samplers", "random", {})
