@@ -52,7 +52,7 @@ class Octree(AnchorBackbone):
         -1, ge=-1, le=40, description="halvings of the scene's cube to the root cell; -1: automatic"
     )
     middle_cell: float = Field(
-        0.02, gt=0, description="cell below the middle level where base_layer is -1, extents"
+        0.005, gt=0, description="cell below the middle level where base_layer is -1, extents"
     )
     init_level: int = Field(
         -1, ge=-1, description="finest level trained at first; -1: the middle one"
