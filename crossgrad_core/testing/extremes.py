@@ -105,7 +105,7 @@ def crowded_pixel(parameters: Parameters, camera: Camera, crowd: int) -> Extreme
     along = (1.0 + share) * _forward(camera)
     spread = 1e-3 * torch.sin(torch.arange(3.0 * crowd, dtype=torch.float64)).reshape(crowd, 3)
     many = _with(many, name, (_center(camera) + along + spread).float())
-    many = _sized(many, (0.02, 0.03, 0.01))
+    many = _sized(many, (0.2, 0.3, 0.1))
     if "opacities" in many:
         many = _with(many, "opacities", torch.full((crowd,), log(0.01 / 0.99)))
     small = replace(camera, width=4, height=4, fx=8.0, fy=8.0, cx=2.0, cy=2.0)
