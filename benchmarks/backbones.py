@@ -83,6 +83,7 @@ def stored(path: Path) -> list[Row]:
 def append(path: Path, row: Row) -> None:
     """Adds a line."""
     new = not path.is_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         if new:
