@@ -29,6 +29,7 @@ from crossgrad_core.training.assemble import (
     read_scene,
     schedule_of,
 )
+from crossgrad_core.training.budget import Length, Planned, Timed, caught_up, steps_for
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.failure import TrainingFailedError
@@ -37,7 +38,7 @@ from crossgrad_core.training.persist import from_checkpoint
 from crossgrad_core.training.resolve import resolved
 from crossgrad_core.training.session import PANELS, Session, totals
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.start import first_state, initial_bytes, steps_for, warm_up
+from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.validation import as_user_error
 
@@ -77,15 +78,17 @@ def run(
         _print_dry_run(setup)
         return 0
     compile_seconds = warm_up(setup)
+    length: Length = Planned(config.revisions)
     if config.seconds is not None:
         setup = _within(setup, config.seconds)
+        length = Timed(config.seconds, setup.schedule.total)
     setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds, compile_seconds
     folder = _new_folder(setup, state)
-    write_atomically(folder / CONFIG, _as_yaml(resolved(setup)).encode())
     setup = replace(setup, config=resolved(setup))
-    return _train(setup, state, Session.fresh(folder, setup))
+    _write_config(folder, setup.config)
+    return _train(setup, state, Session.fresh(folder, setup), length)
 
 
 def parsed(settings: Mapping[str, Any]) -> RunConfig:
@@ -137,7 +140,8 @@ def _setup(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note = steps_for(setup, seconds)
-    config = setup.config.model_copy(update={"steps": steps, "seconds": None})
+    update = {"steps": steps, "seconds": None, "revisions": ()}
+    config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps)
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
 
@@ -155,7 +159,7 @@ def _new_folder(setup: Setup, state: TrainState) -> Path:
     return create_run_folder(name, setup.config.out, needed=needed)
 
 
-def _train(setup: Setup, state: TrainState, session: Session) -> int:
+def _train(setup: Setup, state: TrainState, session: Session, length: Length) -> int:
     """Trains from `state` on and finishes the run's folder whatever happens."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
@@ -173,8 +177,10 @@ def _train(setup: Setup, state: TrainState, session: Session) -> int:
     status: Status
     with stopper.installed():
         try:
-            status = train(setup, state, session, stopper)
-            error = None
+            while (ended := train(setup, state, session, stopper, length.due)) == "paused":
+                setup = length.revised(setup, state)
+                _write_config(session.folder, setup.config)
+            status, error = ended, None
             session.save(setup, state)
         except TrainingFailedError as failure:
             status, error = "failed", str(failure)
@@ -207,7 +213,8 @@ def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
             todo="start a new run; --init point_cloud.ply starts from its Gaussians",
         )
     state.clock.compile += warm_up(setup)
-    return _train(setup, state, Session.resumed(folder, setup, state.step))
+    session = Session.resumed(folder, setup, state.step)
+    return _train(setup, state, session, Planned(setup.config.revisions))
 
 
 def opened(
@@ -244,6 +251,7 @@ def opened(
     config = parsed({**stored, **settings})
     setup, seconds = _setup(config, verbosity)
     state = from_checkpoint(setup, checkpoint)
+    setup = caught_up(setup, state.step)
     state.clock.load += seconds
     return setup, state
 
@@ -317,6 +325,11 @@ def _print_dry_run(setup: Setup) -> None:
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
     print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
+
+
+def _write_config(folder: Path, config: RunConfig) -> None:
+    """Writes what repeats the run; a run that follows the clock renews it as it goes."""
+    write_atomically(folder / CONFIG, _as_yaml(config).encode())
 
 
 def _as_yaml(config: RunConfig) -> str:

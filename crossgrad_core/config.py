@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator
 
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.schedule import ScheduleMode
@@ -50,7 +50,10 @@ class RunConfig(BaseModel):
     views: int | None = Field(None, ge=1, description="views per step, K; default: the sampler's")
     steps: int | None = Field(None, ge=1, description="optimizer steps")
     seconds: float | None = Field(
-        None, gt=0, description="training seconds; the number of steps is fixed from a timed probe"
+        None, gt=0, description="training seconds; the number of steps follows the clock"
+    )
+    revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
+        (), description="(step, steps in all from there on) of a run that followed the clock"
     )
     seed: int = Field(0, ge=0, description="seed of every random number of the run")
     schedule: ScheduleMode = "scaled"

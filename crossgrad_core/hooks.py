@@ -84,6 +84,10 @@ class HookSpecs:
         """Event: the test views were evaluated."""
 
     @hookspec
+    def crossgrad_length(self, step: int, total: int) -> None:
+        """Event: after `step`, a run with a time budget is to have `total` steps in all."""
+
+    @hookspec
     def crossgrad_message(self, text: str) -> None:
         """Event: the run says something to the user (one line of plain text)."""
 

@@ -1,6 +1,6 @@
 """When things happen, in optimizer steps (1-based: the first step is step 1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 ScheduleMode = Literal["scaled", "absolute"]
@@ -75,6 +75,32 @@ class Schedule:
     def grows(self) -> bool:
         """Whether density control edits at all."""
         return self.edits > 0
+
+    @property
+    def first_edit(self) -> int:
+        """The first step after which density control edits, where it edits at all."""
+        return (self.densify_from // self.densify_every + 1) * self.densify_every
+
+    def lengthened(self, wanted: "Schedule", step: int) -> "Schedule":
+        """This schedule with the length of another one, from the end of a step on.
+
+        The ends of the run, of the learning-rate decay and of density control move as far as they
+        are still ahead. Intervals stay, so that nothing happens twice or is left out, and density
+        control that is over, or that was left out, does not come back.
+
+        Args:
+            wanted: The schedule of a run that was as long from its start.
+            step: The step that the run has reached.
+        """
+        over = step >= self.densify_until or not self.grows
+        never = self.prune_large_from >= self.total
+        return replace(
+            self,
+            total=wanted.total,
+            lr_steps=wanted.lr_steps,
+            densify_until=self.densify_until if over else max(step, wanted.densify_until),
+            prune_large_from=wanted.total if never else self.prune_large_from,
+        )
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
         """Active spherical-harmonics degree at a step."""

@@ -135,7 +135,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         float | None,
         typer.Option(
             metavar="S",
-            help="Training seconds; a timed probe fixes the number of steps.",
+            help="Training seconds; the number of steps follows the clock.",
             rich_help_panel=_TRAINING,
         ),
     ] = None,

@@ -21,6 +21,8 @@ Settings: TypeAlias = dict[str, Any]
 OBSERVERS: Final = "observers"
 #: Settings that name one component (or a chain of operators) and hold its options.
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
+#: Settings that say how long a run is.
+LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
 #: Options of the command line whose setting has another name.
 _PLACES: Final[dict[str, tuple[str, ...]]] = {
     "observe": (OBSERVERS,),
@@ -45,11 +47,19 @@ def merged(
         UserError: The file cannot be read, or an assignment makes no sense.
     """
     settings = _normalized(_from_file(config)) if config is not None else {}
-    for name, value in options.items():
-        if value is not None and value != []:
-            _assign(settings, _PLACES.get(name, (name,)), _plain(value))
+    chosen = {
+        _PLACES.get(name, (name,)): _plain(value)
+        for name, value in options.items()
+        if value is not None and value != []
+    }
+    assigned = list(map(_parsed, assignments))
+    if any(path in LENGTHS for path in (*chosen, *(path for path, _ in assigned))):
+        # A new length replaces that of the file as a whole.
+        settings = {key: value for key, value in settings.items() if (key,) not in LENGTHS}
+    for path, value in chosen.items():
+        _assign(settings, path, value)
     # Names first: choosing another component drops the options of the one it replaces.
-    for path, value in sorted(map(_parsed, assignments), key=lambda each: not _is_name(each[0])):
+    for path, value in sorted(assigned, key=lambda each: not _is_name(each[0])):
         _assign(settings, path, value)
     return {key: _with_default_name(key, value) for key, value in settings.items()}
 

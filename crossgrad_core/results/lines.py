@@ -41,6 +41,10 @@ class Pace:
             seconds=_smoothed(self.seconds, record.train_seconds - self.record.train_seconds),
         )
 
+    def lengthened(self, total: int) -> "Pace":
+        """The figures of a run that is now to have `total` steps."""
+        return replace(self, total=total)
+
     def evaluated(self, report: EvaluationReport) -> "Pace":
         """The figures after an evaluation."""
         psnr = report.row.get("psnr")

@@ -30,6 +30,7 @@ class RunLog:
         self._path = folder / FILE
         self._clock = clock
         self._pace = Pace(1)
+        self._interval = 1
 
     def write(self, text: str) -> None:
         """Appends a text of one or more lines, each with the time of day.
@@ -47,6 +48,7 @@ class RunLog:
     def crossgrad_run_start(self, run: RunInfo) -> None:
         """Writes the date, the scene and the notes."""
         self._pace = Pace(run.schedule.total)
+        self._interval = max(1, self._pace.total // PROGRESS_LINES)
         self.write(f"{self._clock():%Y-%m-%d}, scene {run.scene.name}, {self._pace.total} steps")
         for note in run.notes:
             self.write(note)
@@ -55,8 +57,13 @@ class RunLog:
     def crossgrad_step_end(self, record: StepRecord) -> None:
         """Writes progress now and then."""
         self._pace = self._pace.after(record)
-        if record.step % max(1, self._pace.total // PROGRESS_LINES) == 0:
+        if record.step % self._interval == 0:
             self.write(progress_line(self._pace))
+
+    @hookimpl
+    def crossgrad_length(self, total: int) -> None:
+        """Notes the length that progress is now measured against."""
+        self._pace = self._pace.lengthened(total)
 
     @hookimpl
     def crossgrad_evaluation(self, report: EvaluationReport) -> None:

@@ -106,6 +106,7 @@ def survives_every_event(make: Make[Observer]) -> None:
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
                 )
+                hooks.crossgrad_length(step=2, total=3)
                 hooks.crossgrad_message(text="a line of text")
                 hooks.crossgrad_run_end(status="finished")
 

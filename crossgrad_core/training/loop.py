@@ -1,7 +1,7 @@
 """The loop around the step: evaluation, checkpoints, interruption, rewinding."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -17,7 +17,7 @@ from crossgrad_core.training.state import Snapshot, TrainState
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.views import model_of
 
-Status = Literal["finished", "stopped"]
+Status = Literal["finished", "stopped", "paused"]
 
 #: Steps between looks at all parameters. Losses and gradients are looked at in every step; a bad
 #: parameter that touches neither (a Gaussian that is not drawn any more) can wait so long.
@@ -68,8 +68,14 @@ class Stopper:
         self.requested = True
 
 
-def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Status:
-    """Runs the remaining steps of the schedule.
+def train(
+    setup: Setup,
+    state: TrainState,
+    sink: Sink,
+    stopper: Stopper,
+    pauses: Callable[[TrainState], bool] | None = None,
+) -> Status:
+    """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
 
     Raises:
         TrainingFailedError: Something was not finite twice; names step, views and block. `state`
@@ -96,6 +102,8 @@ def train(setup: Setup, state: TrainState, sink: Sink, stopper: Stopper) -> Stat
             setup.hook.crossgrad_model(model=model_of(setup, state))
         _tell_held_back(setup, record)
         _record(setup, state, sink)
+        if pauses is not None and state.step < last and pauses(state):
+            return "paused"
     return "finished" if state.step >= total else "stopped"
 
 
@@ -147,8 +155,10 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
 
 def _record(setup: Setup, state: TrainState, sink: Sink) -> None:
     total, step = setup.schedule.total, state.step
-    eval_every = setup.config.eval_every or max(1, total // 10)
-    save_every = setup.config.save_every or max(1, total // 5)
+    # What the run was planned with: its length may follow the clock, the interval does not.
+    planned = setup.config.steps or total
+    eval_every = setup.config.eval_every or max(1, planned // 10)
+    save_every = setup.config.save_every or max(1, planned // 5)
     if step % eval_every == 0 and step < total:
         sink.evaluate(setup, state)
     if step % save_every == 0 and step < total:

@@ -1,7 +1,6 @@
-"""The first state of a run, compiling what it needs, and how many steps fit into a budget."""
+"""The first state of a run, and compiling what it needs."""
 
 from dataclasses import replace
-from math import ceil
 from pathlib import Path
 from time import perf_counter
 
@@ -11,8 +10,6 @@ from crossgrad_core.blocks import Parameters
 from crossgrad_core.manager import make_manager
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.scene.types import Scene
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.assemble import schedule_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
@@ -20,16 +17,6 @@ from crossgrad_core.training.state import TrainState
 
 #: Random initial points where a scene has none (`--init random`).
 RANDOM_POINTS = 20_000
-#: Steps that the probe of a time budget takes at least.
-PROBE_STEPS = 12
-#: ... and the share of the budget that it takes beyond that.
-PROBE_SHARE = 0.01
-#: What each edit of density control adds to the mean cost of a step, in units of a step at the
-#: start. Two thousand steps with four edits took 1.8 times as long as the first 200 times ten
-#: (89 s and 5.0 s, scene boruszyn_kap at 400 px, see docs/benchmarks.md).
-COST_PER_EDIT = 0.2
-#: Growth slows down: more edits than these are not counted.
-COUNTED_EDITS = 5
 
 
 def first_state(setup: Setup) -> TrainState:
@@ -79,55 +66,15 @@ def warm_up(setup: Setup) -> float:
     if setup.densifier.needs:
         # Once density control is over, its statistics are left out: other kernels.
         steps.append(setup.schedule.densify_until)
+    if setup.schedule.grows:
+        # An edit may draw, too.
+        steps.append(setup.schedule.first_edit - 1)
     for step in steps:
         if step < setup.schedule.total:
             state = first_state(setup)
             state.step = step
             timed_step(setup, state)
     return perf_counter() - start
-
-
-def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
-    """How many steps fit into `seconds` of training, and on what evidence.
-
-    Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
-    """
-    far = replace(unwatched(setup), schedule=Schedule.for_run(10**9))
-    state = first_state(far)
-    timed_step(far, state)
-    state.clock.train = 0.0
-    steps = 0
-    while steps < PROBE_STEPS or (state.clock.train < PROBE_SHARE * seconds):
-        timed_step(far, state)
-        steps += 1
-    each = state.clock.train / steps
-    total = _fitting(setup, seconds / each)
-    expected = total * each * _cost(setup, total)
-    note = (
-        f"{total} steps for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms each, "
-        f"the whole run is expected to take {expected:.0f} s"
-    )
-    return total, note
-
-
-def _cost(setup: Setup, steps: int) -> float:
-    """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
-    if setup.selection.names["densifier"] == "none":
-        return 1.0
-    edits = schedule_of(setup.config, setup.densifier, steps).edits
-    return 1.0 + COST_PER_EDIT * min(edits, COUNTED_EDITS)
-
-
-def _fitting(setup: Setup, affordable: float) -> int:
-    """The most steps that cost no more than `affordable` steps at the initial size (bisection)."""
-    fits, too_many = 1, max(2, ceil(affordable) + 1)
-    while too_many - fits > 1:
-        steps = (fits + too_many) // 2
-        if steps * _cost(setup, steps) <= affordable:
-            fits = steps
-        else:
-            too_many = steps
-    return fits
 
 
 def initial_bytes(setup: Setup) -> int:

@@ -50,6 +50,16 @@ def test_options_win_over_the_file_and_assignments_over_both(config):
     assert merged(config, {"steps": 200}, ["steps=300"])["steps"] == 300
 
 
+@pytest.mark.parametrize(
+    ("options", "assignments"), [({"seconds": 5.0}, []), ({}, ["seconds=5.0"])]
+)
+def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
+    path = tmp_path / "config.yaml"
+    path.write_text("steps: 40\nrevisions: [[10, 60]]\nseed: 1\n")
+    assert merged(path, options, assignments) == {"seconds": 5.0, "seed": 1}
+    assert merged(path, {"seed": 2}, [])["revisions"] == [[10, 60]]
+
+
 def test_unset_options_leave_the_file_alone(config):
     assert merged(config, {"steps": None, "observe": []}, []) == merged(config, {}, [])
 

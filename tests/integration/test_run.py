@@ -106,6 +106,28 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     assert rows == quality(tmp_path / "whole")
 
 
+def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_path, monkeypatch):
+    # Whatever the probe of this machine says, the first plan is wrong.
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps"))
+    run(scene, tmp_path / "timed", steps=None, seconds=1.5, **GROWTH)
+    stored = yaml.safe_load((tmp_path / "timed" / "config.yaml").read_text())
+    assert (stored["steps"], stored["seconds"]) == (40, None)
+    last = load(latest(tmp_path / "timed")).step
+    assert stored["revisions"][-1][1] == last != 40
+    assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
+    assert quality(tmp_path / "timed") == quality(tmp_path / "again")
+    assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
+
+
+def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_path):
+    lengths = {"steps": 30, "revisions": [[10, 50], [20, 44], [34, 48]]}
+    assert run(scene, tmp_path / "whole", **lengths) == 0
+    assert load(latest(tmp_path / "whole")).step == 48
+    assert run(scene, tmp_path / "parts", stop_after=20, **lengths) == 0
+    assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
+    assert same(parameters(tmp_path / "whole"), parameters(tmp_path / "parts"))
+
+
 def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):
     from crossgrad_core.training.setup import Setup
 

@@ -37,6 +37,7 @@ class Progress(Observer):
 
     # What is on the screen; no part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
+    _tenth: int = PrivateAttr(default=1)
     _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
     _last_line: float = PrivateAttr(default=0.0)
 
@@ -44,6 +45,7 @@ class Progress(Observer):
     def crossgrad_run_start(self, run: RunInfo) -> None:
         """Shows the scene, and what was chosen or left out and why."""
         self._pace = Pace(run.schedule.total)
+        self._tenth = max(1, self._pace.total // 10)
         self._last_line = monotonic()
         if self.level == "quiet":
             return
@@ -67,6 +69,13 @@ class Progress(Observer):
             self._say(progress_line(self._pace))
         if self.level == "verbose":
             self._tell_changes(record)
+
+    @hookimpl
+    def crossgrad_length(self, total: int) -> None:
+        """Moves the end of the bar."""
+        self._pace = self._pace.lengthened(total)
+        if self._bar is not None:
+            self._bar.total = total
 
     @hookimpl
     def crossgrad_evaluation(self, report: EvaluationReport) -> None:
@@ -100,8 +109,7 @@ class Progress(Observer):
             self._say(f"step {record.step}: {', '.join(changes)}")
 
     def _line_is_due(self, step: int) -> bool:
-        tenth = step % max(1, self._pace.total // 10) == 0
-        return tenth or monotonic() - self._last_line >= self.interval
+        return step % self._tenth == 0 or monotonic() - self._last_line >= self.interval
 
     def _move_bar(self, record: StepRecord) -> None:
         from tqdm import tqdm

@@ -31,6 +31,39 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
     assert Schedule.for_run(30_000).sh_degree(step) == degree
 
 
+def test_the_first_edit_is_the_first_one():
+    for total in (2000, 30_000, 45_000):
+        schedule = Schedule.for_run(total)
+        edits = [step for step in range(1, total) if schedule.densifies(step)]
+        assert edits[0] == schedule.first_edit
+
+
+def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
+    schedule = Schedule.for_run(20_000)
+    longer = schedule.lengthened(Schedule.for_run(40_000), 3000)
+    assert (longer.total, longer.lr_steps, longer.densify_until) == (40_000, 40_000, 20_000)
+    for name in ("sh_interval", "densify_from", "densify_every", "reset_every", "prune_large_from"):
+        assert getattr(longer, name) == getattr(schedule, name)
+
+
+@pytest.mark.parametrize(("step", "until"), [(700, 750), (900, 900), (1000, 1000), (1200, 1000)])
+def test_density_control_ends_where_it_may_and_never_comes_back(step, until):
+    schedule = Schedule.for_run(2000).lengthened(Schedule.for_run(1500), step)
+    assert schedule.densify_until == until
+    again = schedule.lengthened(Schedule.for_run(4000), 1300)
+    assert again.densify_until == until
+
+
+def test_density_control_that_was_left_out_stays_out():
+    assert not Schedule.for_run(900).lengthened(Schedule.for_run(3000), 100).grows
+
+
+def test_large_gaussians_are_never_pruned_without_a_reset_whatever_the_length():
+    schedule = Schedule.for_run(9000).lengthened(Schedule.for_run(12_000), 100)
+    assert schedule.reset_every is None
+    assert schedule.prune_large_from == 12_000
+
+
 def test_learning_rate_is_log_linear_and_clipped():
     rate = LearningRate(1e-2, 1e-4)
     assert rate.at(0.0) == pytest.approx(1e-2)

@@ -40,6 +40,11 @@ def test_a_resumed_run_begins_where_it_stopped():
     assert "step 701/1000 (70 %)" in progress_line(pace)
 
 
+def test_progress_is_measured_against_the_newest_length():
+    pace = Pace(total=1000).after(record(300)).lengthened(600)
+    assert "step 300/600 (50 %)" in progress_line(pace)
+
+
 def test_last_evaluation_is_remembered():
     pace = Pace(total=10).after(record(1))
     assert pace.evaluated(EvaluationReport(1, {"psnr": None})).psnr is None

@@ -1,19 +1,48 @@
 """How many steps fit into a budget of training seconds."""
 
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import pytest
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.densifier import Densifier
 from crossgrad_core.registry import build
-from crossgrad_core.training.start import _fitting
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.budget import Timed, _fitting, caught_up
+from crossgrad_core.training.state import Clock
 
 
-def setup(densifier="adc"):
-    return SimpleNamespace(
-        config=RunConfig(),
-        densifier=build("densifiers", densifier, {}),
-        selection=SimpleNamespace(names={"densifier": densifier}),
+class Hook:
+    """Keeps what the run says."""
+
+    def __init__(self):
+        self.lengths, self.texts = [], []
+
+    def crossgrad_length(self, step, total):
+        self.lengths.append((step, total))
+
+    def crossgrad_message(self, text):
+        self.texts.append(text)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What of a setup decides about its length."""
+
+    config: RunConfig
+    densifier: Densifier
+    selection: SimpleNamespace
+    schedule: Schedule
+    hook: Hook = field(default_factory=Hook)
+
+
+def setup(densifier="adc", steps=1000):
+    return Run(
+        RunConfig(steps=steps),
+        build("densifiers", densifier, {}),
+        SimpleNamespace(names={"densifier": densifier}),
+        Schedule.for_run(steps),
     )
 
 
@@ -33,3 +62,60 @@ def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
 
 def test_without_density_control_every_step_costs_the_same():
     assert _fitting(setup("none"), 18_000.0) == 18_000
+
+
+def timed(seconds, planned, cost):
+    """A run whose step s takes cost(s, schedule) seconds, and its clock at the end."""
+    run, state = setup(steps=planned), SimpleNamespace(step=0, clock=Clock())
+    length = Timed(seconds, planned)
+    while state.step < run.schedule.total:
+        state.step += 1
+        state.clock.train += cost(state.step, run.schedule)
+        if state.step < run.schedule.total and length.due(state):
+            run = length.revised(run, state)
+    return run, state.clock.train
+
+
+def grown(step, schedule):
+    """Eight times as many primitives at the end of density control."""
+    share = (step - schedule.densify_from) / (schedule.densify_until - schedule.densify_from)
+    return 0.02 * (1.0 + 7.0 * min(1.0, max(0.0, share)))
+
+
+@pytest.mark.parametrize(
+    ("planned", "cost"),
+    [
+        (1500, lambda step, schedule: 0.04),  # four times too short
+        (12_000, lambda step, schedule: 0.04),
+        (3000, grown),
+        (3000, lambda step, schedule: 0.02 if step < 1000 else 0.06),  # others use the machine
+        (3000, lambda step, schedule: 0.06 if step < 1000 else 0.02),
+    ],
+)
+def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
+    run, seconds = timed(140.0, planned, cost)
+    assert seconds == pytest.approx(140.0, rel=0.01)
+    assert run.schedule.total == run.schedule.lr_steps
+    assert run.hook.texts
+
+
+def test_a_budget_that_is_used_up_ends_the_run():
+    _, seconds = timed(10.0, 1000, lambda step, schedule: 1.0)
+    assert seconds == 13.0  # the first look is after twelve steps
+
+
+def test_the_written_lengths_repeat_the_schedule_of_every_step():
+    run, _ = timed(140.0, 3000, grown)
+    revisions = run.config.revisions
+    assert list(revisions) == run.hook.lengths
+    start = replace(run, schedule=Schedule.for_run(3000))
+    assert caught_up(start, 10**9).schedule == run.schedule
+    step = revisions[3][0]
+    assert caught_up(start, step - 1).schedule.total == revisions[2][1]
+    assert caught_up(start, step).schedule.total == revisions[3][1]
+
+
+def test_a_length_that_fits_stays():
+    run, _ = timed(140.0, 1000, lambda step, schedule: 0.14)
+    assert run.config.revisions == ()
+    assert run.schedule == Schedule.for_run(1000)

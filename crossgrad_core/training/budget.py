@@ -1,0 +1,171 @@
+"""How many steps fit into a budget of training seconds: a probe first, then the run's own clock."""
+
+from dataclasses import replace
+from math import ceil
+from typing import Protocol
+
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.assemble import schedule_of
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state, unwatched
+from crossgrad_core.training.state import TrainState
+
+#: Steps that the probe of a time budget takes at least, and that a look at the clock counts.
+PROBE_STEPS = 12
+#: ... and the share of the budget that the probe takes beyond that.
+PROBE_SHARE = 0.01
+#: What each edit of density control adds to the mean cost of a step, in units of a step at the
+#: start. Two thousand steps with four edits took 1.8 times as long as the first 200 times ten
+#: (89 s and 5.0 s, scene boruszyn_kap at 400 px, see docs/benchmarks.md).
+COST_PER_EDIT = 0.2
+#: Growth slows down: more edits than these are not counted.
+COUNTED_EDITS = 5
+#: Share of the budget between two looks at the clock.
+LOOK_SHARE = 0.02
+#: A length that is off by a smaller share of what is left stays.
+TOLERANCE = 0.005
+#: The user is told when the length has changed by this share.
+NEWS_SHARE = 0.1
+
+
+def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
+    """How many steps fit into `seconds` of training, and on what evidence.
+
+    Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
+    """
+    far = replace(unwatched(setup), schedule=Schedule.for_run(10**9))
+    state = first_state(far)
+    timed_step(far, state)
+    state.clock.train = 0.0
+    steps = 0
+    while steps < PROBE_STEPS or (state.clock.train < PROBE_SHARE * seconds):
+        timed_step(far, state)
+        steps += 1
+    each = state.clock.train / steps
+    total = _fitting(setup, seconds / each)
+    note = (
+        f"{total} steps planned for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms "
+        "each; the length follows the clock as the run goes"
+    )
+    return total, note
+
+
+class Length(Protocol):
+    """Who decides about the length of a run while it trains."""
+
+    def due(self, state: TrainState) -> bool:
+        """Whether a decision is due after this step."""
+        ...
+
+    def revised(self, setup: Setup, state: TrainState) -> Setup:
+        """The setup with the length that holds from here on."""
+        ...
+
+
+class Planned:
+    """The length that is written down: fixed, or revised where an earlier run revised it.
+
+    Args:
+        revisions: After which step the run has how many steps in all.
+    """
+
+    def __init__(self, revisions: tuple[tuple[int, int], ...] = ()) -> None:
+        self._revisions = dict(revisions)
+
+    def due(self, state: TrainState) -> bool:
+        """At the steps that are written down."""
+        return state.step in self._revisions
+
+    def revised(self, setup: Setup, state: TrainState) -> Setup:
+        """The setup with the length that is written down."""
+        return lengthened(setup, state.step, self._revisions[state.step])
+
+
+class Timed:
+    """The length that fits into a budget of training seconds, by the run's own clock.
+
+    Args:
+        seconds: The budget.
+        planned: The length that the run starts with.
+    """
+
+    def __init__(self, seconds: float, planned: int) -> None:
+        self._seconds = seconds
+        self._told = planned
+        self._step = 0
+        self._clock = 0.0
+
+    def due(self, state: TrainState) -> bool:
+        """After some steps and a share of the budget."""
+        if state.step < self._step:  # The loop went back to the last good state.
+            self._look(state)
+        seconds = state.clock.train - self._clock
+        return state.step - self._step >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
+
+    def revised(self, setup: Setup, state: TrainState) -> Setup:
+        """The setup with the length that now fits; its configuration says so."""
+        each = (state.clock.train - self._clock) / (state.step - self._step)
+        each *= _cost_ahead(setup.schedule, state.step)
+        self._look(state)
+        left = max(1, round((self._seconds - state.clock.train) / each))
+        before = setup.schedule.total
+        if abs(state.step + left - before) <= TOLERANCE * (before - state.step):
+            return setup
+        total = state.step + left
+        self._tell(setup, total, each)
+        config = setup.config
+        revisions = (*config.revisions, (state.step, total))
+        config = config.model_copy(update={"revisions": revisions})
+        return lengthened(replace(setup, config=config), state.step, total)
+
+    def _look(self, state: TrainState) -> None:
+        self._step, self._clock = state.step, state.clock.train
+
+    def _tell(self, setup: Setup, total: int, each: float) -> None:
+        if abs(total - self._told) < NEWS_SHARE * self._told:
+            return
+        text = f"{total} steps instead of {self._told} fit into {self._seconds:g} s"
+        setup.hook.crossgrad_message(text=f"{text}, at {each * 1000:.1f} ms for each that is left")
+        self._told = total
+
+
+def lengthened(setup: Setup, step: int, total: int) -> Setup:
+    """The setup of a run that has reached `step` and is to have `total` steps in all."""
+    wanted = schedule_of(setup.config, setup.densifier, total)
+    setup.hook.crossgrad_length(step=step, total=total)
+    return replace(setup, schedule=setup.schedule.lengthened(wanted, step))
+
+
+def caught_up(setup: Setup, step: int) -> Setup:
+    """The setup as it was when the run had done `step` steps."""
+    for done, total in setup.config.revisions:
+        if done <= step:
+            setup = lengthened(setup, done, total)
+    return setup
+
+
+def _cost_ahead(schedule: Schedule, step: int) -> float:
+    """Expected mean cost of the steps that are left, in units of a step now."""
+    done = sum(schedule.densifies(each) for each in range(schedule.densify_from, step + 1))
+    return 1.0 + COST_PER_EDIT * min(schedule.edits - done, max(0, COUNTED_EDITS - done))
+
+
+def _cost(setup: Setup, steps: int) -> float:
+    """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
+    if setup.selection.names["densifier"] == "none":
+        return 1.0
+    edits = schedule_of(setup.config, setup.densifier, steps).edits
+    return 1.0 + COST_PER_EDIT * min(edits, COUNTED_EDITS)
+
+
+def _fitting(setup: Setup, affordable: float) -> int:
+    """The most steps that cost no more than `affordable` steps at the initial size (bisection)."""
+    fits, too_many = 1, max(2, ceil(affordable) + 1)
+    while too_many - fits > 1:
+        steps = (fits + too_many) // 2
+        if steps * _cost(setup, steps) <= affordable:
+            fits = steps
+        else:
+            too_many = steps
+    return fits
