@@ -86,13 +86,13 @@ class Schedule:
 
         The ends of the run, of the learning-rate decay and of density control move as far as they
         are still ahead. Intervals stay, so that nothing happens twice or is left out, and density
-        control that is over, or that was left out, does not come back.
+        control that is over does not come back.
 
         Args:
             wanted: The schedule of a run that was as long from its start.
             step: The step that the run has reached.
         """
-        over = step >= self.densify_until or not self.grows
+        over = step >= self.densify_until
         never = self.prune_large_from >= self.total
         return replace(
             self,

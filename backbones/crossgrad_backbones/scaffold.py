@@ -18,7 +18,7 @@ class Scaffold(AnchorBackbone):
     """Anchors in the voxels that hold SfM points; a camera uses all that are in its frustum."""
 
     voxel_size: float | None = Field(
-        None, gt=0, description="edge of a voxel, extents; None: the points' median distance"
+        None, gt=0, description="edge of a voxel, extents; None: twice the points' median distance"
     )
 
     @override

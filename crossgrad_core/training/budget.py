@@ -24,7 +24,10 @@ COUNTED_EDITS = 5
 #: Share of the budget between two looks at the clock.
 LOOK_SHARE = 0.02
 #: A length that is off by a smaller share of what is left stays.
-TOLERANCE = 0.005
+TOLERANCE = 0.02
+#: Share of the newest stretch in the smoothed cost of a step. Views differ, and other programs
+#: come and go.
+SMOOTHING = 0.25
 #: The user is told when the length has changed by this share.
 NEWS_SHARE = 0.1
 
@@ -95,6 +98,7 @@ class Timed:
         self._told = planned
         self._step = 0
         self._clock = 0.0
+        self._each: float | None = None
 
     def due(self, state: TrainState) -> bool:
         """After some steps and a share of the budget."""
@@ -105,14 +109,15 @@ class Timed:
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that now fits; its configuration says so."""
-        each = (state.clock.train - self._clock) / (state.step - self._step)
-        each *= _cost_ahead(setup.schedule, state.step)
+        newest = (state.clock.train - self._clock) / (state.step - self._step)
+        before = newest if self._each is None else self._each
+        self._each = before + SMOOTHING * (newest - before)
         self._look(state)
+        each = self._each * _cost_ahead(setup.schedule, state.step)
         left = max(1, round((self._seconds - state.clock.train) / each))
-        before = setup.schedule.total
-        if abs(state.step + left - before) <= TOLERANCE * (before - state.step):
-            return setup
         total = state.step + left
+        if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
+            return setup
         self._tell(setup, total, each)
         config = setup.config
         revisions = (*config.revisions, (state.step, total))

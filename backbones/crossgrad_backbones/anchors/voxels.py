@@ -7,10 +7,13 @@ from numpy.typing import NDArray
 SMALLEST_VOXEL = 1e-5
 #: The automatic voxel size of a cloud without neighbours, local units.
 LONE_VOXEL = 0.01
+#: The automatic voxel size, in median distances between neighbours. With 1, nearly every point gets
+#: an anchor of its own and ten Gaussians, and a step costs two to four times what vanilla's does.
+SPACING = 2.0
 
 
 def automatic_voxel_size(points: NDArray[np.float64]) -> float:
-    """The median over the points of the distance to the nearest other one, local units.
+    """Twice the median over the points of the distance to the nearest other one, local units.
 
     Scaffold-GS takes the median of the mean *squared* distance to three neighbours for a length;
     that depends on the unit of the input, so it is not reproduced here.
@@ -23,7 +26,7 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     if points.shape[0] <= 1:
         return LONE_VOXEL
     distances, _ = cKDTree(points).query(points, k=2)
-    return max(float(np.median(distances[:, 1])), SMALLEST_VOXEL)
+    return max(SPACING * float(np.median(distances[:, 1])), SMALLEST_VOXEL)
 
 
 def voxel_centers(

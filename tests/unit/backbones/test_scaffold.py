@@ -40,11 +40,11 @@ def test_every_occupied_voxel_has_one_anchor_in_its_middle():
     assert torch.allclose(anchors, middles, atol=1e-7)
 
 
-def test_the_automatic_voxel_is_the_median_distance_to_the_nearest_point():
+def test_the_automatic_voxel_is_twice_the_median_distance_to_the_nearest_point():
     points = SCENE.points
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
-    wanted = np.median(distances.min(axis=1))
+    wanted = 2.0 * np.median(distances.min(axis=1))
     assert automatic_voxel_size(points) == pytest.approx(wanted)
     assert float(created()["voxel_size"]) == pytest.approx(wanted)
 

@@ -54,10 +54,6 @@ def test_density_control_ends_where_it_may_and_never_comes_back(step, until):
     assert again.densify_until == until
 
 
-def test_density_control_that_was_left_out_stays_out():
-    assert not Schedule.for_run(900).lengthened(Schedule.for_run(3000), 100).grows
-
-
 def test_large_gaussians_are_never_pruned_without_a_reset_whatever_the_length():
     schedule = Schedule.for_run(9000).lengthened(Schedule.for_run(12_000), 100)
     assert schedule.reset_every is None
