@@ -20,16 +20,21 @@ from pathlib import Path
 from statistics import mean, stdev
 from threading import Lock
 
+import numpy as np
 from _machine import facts
 
+from crossgrad_core.results.metrics_csv import read_metrics
 from crossgrad_core.results.summary import read_summary
 
 RESULTS = Path(__file__).with_name("results")
 BACKBONES = ("vanilla", "scaffold", "pixel", "mip", "analytic", "octree")
 COLUMNS = (
     *("scene", "backbone", "sampler", "seed", "budget", "seconds", "steps", "views", "primitives"),
-    *("psnr", "ssim", "regimes", "ply_loss", "cpu", "date"),
+    *("psnr", "ssim", "regimes", "ply_loss", "cpu", "date", "curve"),
 )
+#: Where the curves are read off.
+STEPS = (400, 800, 1200, 1600, 2000)
+SHARES = (0.25, 0.5, 0.75)
 Row = dict[str, str]
 
 
@@ -56,18 +61,24 @@ def run(job: Job, arguments: argparse.Namespace) -> Row:
     command += ["--seconds", str(arguments.seconds), "--max-size", str(arguments.max_size)]
     command += ["--threads", "1", "--out", str(out), "-q"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return row_of(job, arguments.seconds, read_summary(out))
+    return row_of(job, arguments.seconds, out)
 
 
-def row_of(job: Job, budget: float, summary: dict) -> Row:  # type: ignore[type-arg]
-    """The line of a finished run."""
+def row_of(job: Job, budget: float, out: Path) -> Row:
+    """The line of the finished run in a folder."""
+    summary = read_summary(out)
     regimes = {name: round(each["psnr"], 4) for name, each in summary["regimes"].items()}
     loss = (summary["ply"] or {}).get("loss")
+    curve = [
+        [int(row["step"]), round(float(row["train_seconds"]), 1), round(float(row["psnr"]), 3)]
+        for row in read_metrics(out)
+    ]
     values = (
         *(*job.key, budget, round(summary["train_seconds"], 1), summary["step"], summary["views"]),
         *(summary["primitives"], round(summary["overall"]["psnr"], 4)),
         *(round(summary["overall"]["ssim"], 5), json.dumps(regimes)),
         *("" if loss is None else round(loss, 3), facts()["cpu"], facts()["date"]),
+        json.dumps(curve),
     )
     return dict(zip(COLUMNS, map(str, values), strict=True))
 
@@ -123,6 +134,28 @@ def section(scene: str, rows: Sequence[Row]) -> list[str]:
     return [*lines, ""]
 
 
+def on_the_way(rows: Sequence[Row]) -> list[str]:
+    """PSNR of one scene at equal steps and at equal seconds before the end."""
+    seconds = [round(share * float(rows[0]["budget"])) for share in SHARES]
+    heads = ["backbone, sampler", *(f"{n:,} steps" for n in STEPS), *(f"{s} s" for s in seconds)]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for backbone, sampler in sorted({(row["backbone"], row["sampler"]) for row in rows}):
+        same = [row for row in rows if (row["backbone"], row["sampler"]) == (backbone, sampler)]
+        curves = [json.loads(row["curve"]) for row in same]
+        cells = [read_off(curves, 0, steps) for steps in STEPS]
+        cells += [read_off(curves, 1, passed) for passed in seconds]
+        lines.append("| " + " | ".join([f"{backbone}, {sampler}", *cells]) + " |")
+    return [*lines, ""]
+
+
+def read_off(curves: Sequence[Sequence[Sequence[float]]], axis: int, place: float) -> str:
+    """Mean PSNR there, straight between evaluations; `-` where some run was over by then."""
+    if any(curve[-1][axis] < place for curve in curves):
+        return "-"
+    found = [np.interp(place, [p[axis] for p in curve], [p[2] for p in curve]) for curve in curves]
+    return f"{mean(map(float, found)):.2f}"
+
+
 def page(rows: Sequence[Row], command: str) -> str:
     """The whole page."""
     machines = sorted({row["cpu"] for row in rows})
@@ -133,10 +166,12 @@ def page(rows: Sequence[Row], command: str) -> str:
         f"{dates[0]} to {dates[-1]}: one core per run, {rows[0]['budget']} training seconds each.",
         "`epoch` draws one view per step, `random` two.",
         "Mean and standard deviation over seeds; PLY loss: what baking to `point_cloud.ply` costs.",
+        "Second table of each scene: PSNR on the way, mean over seeds.",
         "",
     ]
     for scene in sorted({row["scene"] for row in rows}):
         lines += section(scene, [row for row in rows if row["scene"] == scene])
+        lines += on_the_way([row for row in rows if row["scene"] == scene])
     return "\n".join(lines)
 
 

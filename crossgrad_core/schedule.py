@@ -66,15 +66,15 @@ class Schedule:
             anchors_from=total // 20,
         )
 
-    @property
-    def edits(self) -> int:
-        """Number of steps after which density control edits."""
-        return sum(self.densifies(step) for step in range(self.densify_from, self.densify_until))
+    def edits(self, after: int = 0) -> int:
+        """Number of steps behind `after` that density control follows with an edit."""
+        passed = max(after, self.densify_from) // self.densify_every
+        return max(0, (self.densify_until - 1) // self.densify_every - passed)
 
     @property
     def grows(self) -> bool:
         """Whether density control edits at all."""
-        return self.edits > 0
+        return self.edits() > 0
 
     @property
     def first_edit(self) -> int:

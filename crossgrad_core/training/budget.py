@@ -1,5 +1,6 @@
 """How many steps fit into a budget of training seconds: a probe first, then the run's own clock."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
 from typing import Protocol
@@ -46,7 +47,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
         timed_step(far, state)
         steps += 1
     each = state.clock.train / steps
-    total = _fitting(setup, seconds / each)
+    total = _fitting(lambda steps: _cost(setup, steps), seconds / each)
     note = (
         f"{total} steps planned for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms "
         "each; the length follows the clock as the run goes"
@@ -111,11 +112,10 @@ class Timed:
         """The setup with the length that now fits; its configuration says so."""
         newest = (state.clock.train - self._clock) / (state.step - self._step)
         before = newest if self._each is None else self._each
-        self._each = before + SMOOTHING * (newest - before)
+        self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
-        each = self._each * _cost_ahead(setup.schedule, state.step)
-        left = max(1, round((self._seconds - state.clock.train) / each))
-        total = state.step + left
+        affordable = (self._seconds - state.clock.train) / each
+        total = state.step + _fitting(lambda left: _cost_ahead(setup, state.step, left), affordable)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
         self._tell(setup, total, each)
@@ -131,7 +131,7 @@ class Timed:
         if abs(total - self._told) < NEWS_SHARE * self._told:
             return
         text = f"{total} steps instead of {self._told} fit into {self._seconds:g} s"
-        setup.hook.crossgrad_message(text=f"{text}, at {each * 1000:.1f} ms for each that is left")
+        setup.hook.crossgrad_message(text=f"{text}: a step takes {each * 1000:.1f} ms now")
         self._told = total
 
 
@@ -150,26 +150,36 @@ def caught_up(setup: Setup, step: int) -> Setup:
     return setup
 
 
-def _cost_ahead(schedule: Schedule, step: int) -> float:
-    """Expected mean cost of the steps that are left, in units of a step now."""
-    done = sum(schedule.densifies(each) for each in range(schedule.densify_from, step + 1))
-    return 1.0 + COST_PER_EDIT * min(schedule.edits - done, max(0, COUNTED_EDITS - done))
-
-
 def _cost(setup: Setup, steps: int) -> float:
     """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
+    return _growth(setup, schedule_of(setup.config, setup.densifier, steps), 0)
+
+
+def _cost_ahead(setup: Setup, step: int, left: int) -> float:
+    """Expected mean cost of the `left` steps after `step`, in units of one now."""
+    wanted = schedule_of(setup.config, setup.densifier, step + left)
+    return _growth(setup, setup.schedule.lengthened(wanted, step), step)
+
+
+def _growth(setup: Setup, schedule: Schedule, step: int) -> float:
     if setup.selection.names["densifier"] == "none":
         return 1.0
-    edits = schedule_of(setup.config, setup.densifier, steps).edits
-    return 1.0 + COST_PER_EDIT * min(edits, COUNTED_EDITS)
+    ahead = schedule.edits(step)
+    done = schedule.edits() - ahead
+    return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
-def _fitting(setup: Setup, affordable: float) -> int:
-    """The most steps that cost no more than `affordable` steps at the initial size (bisection)."""
+def _fitting(cost: Callable[[int], float], affordable: float) -> int:
+    """The most steps that cost no more than `affordable` steps of unit cost, at least 1.
+
+    Args:
+        cost: Expected mean cost of a step for so many steps.
+        affordable: Steps of unit cost.
+    """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
     while too_many - fits > 1:
         steps = (fits + too_many) // 2
-        if steps * _cost(setup, steps) <= affordable:
+        if steps * cost(steps) <= affordable:
             fits = steps
         else:
             too_many = steps

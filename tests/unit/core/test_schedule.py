@@ -31,11 +31,14 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
     assert Schedule.for_run(30_000).sh_degree(step) == degree
 
 
-def test_the_first_edit_is_the_first_one():
-    for total in (2000, 30_000, 45_000):
-        schedule = Schedule.for_run(total)
-        edits = [step for step in range(1, total) if schedule.densifies(step)]
-        assert edits[0] == schedule.first_edit
+@pytest.mark.parametrize("total", [900, 1200, 1201, 1202, 2000, 30_000, 45_000])
+def test_edits_are_counted_without_looking_at_every_step(total):
+    schedule = Schedule.for_run(total)
+    edits = [step for step in range(1, total) if schedule.densifies(step)]
+    assert schedule.grows == bool(edits)
+    assert edits[:1] in ([], [schedule.first_edit])
+    for after in (0, 500, 599, 600, 650, total // 2, total):
+        assert schedule.edits(after) == sum(step > after for step in edits)
 
 
 def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():

@@ -106,7 +106,7 @@ def test_a_learning_rate_of_zero_freezes_a_block_of_vanilla():
 
 def test_the_densifier_decides_when_it_acts_and_how_it_starts(assembled):
     setup = assembled(densifier="reversing")
-    assert setup.schedule.edits == 1
+    assert setup.schedule.edits() == 1
     start = first_state(setup).parameters["opacities"]
     plain = first_state(assembled(densifier="none")).parameters["opacities"]
     assert torch.allclose(start, plain + 1.0)

@@ -1,6 +1,7 @@
 """How many steps fit into a budget of training seconds."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +10,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.registry import build
 from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.budget import Timed, _fitting, caught_up
+from crossgrad_core.training.budget import Timed, _cost, _fitting, caught_up
 from crossgrad_core.training.state import Clock
 
 
@@ -57,11 +58,11 @@ def setup(densifier="adc", steps=1000):
     ],
 )
 def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
-    assert _fitting(setup(), affordable) == steps
+    assert _fitting(partial(_cost, setup()), affordable) == steps
 
 
 def test_without_density_control_every_step_costs_the_same():
-    assert _fitting(setup("none"), 18_000.0) == 18_000
+    assert _fitting(partial(_cost, setup("none")), 18_000.0) == 18_000
 
 
 def timed(seconds, planned, cost):
