@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.scene.types import Similarity
 from crossgrad_core.spherical import SH_C0
@@ -83,7 +84,7 @@ class SplatCloud:
             means=torch.from_numpy(self.means.astype(np.float32)),
             quats=torch.tensor(self.quats),
             scales=torch.exp(torch.tensor(self.log_scales)),
-            opacities=torch.sigmoid(torch.tensor(self.logit_opacities)),
+            opacities=sigmoid(torch.tensor(self.logit_opacities)),
             sh_dc=torch.tensor(self.sh_dc[:, None, :]),
             sh_rest=torch.tensor(self.sh_rest[:, : (degree + 1) ** 2 - 1]) if degree else None,
             sh_degree=degree,

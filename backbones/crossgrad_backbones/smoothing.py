@@ -9,6 +9,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_backbones.visibility import finest_pixels
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.scene.types import Camera
 
 #: Variance of the filter in squared pixels of the camera that sees a Gaussian finest.
@@ -66,7 +67,7 @@ class _Smoothed(torch.autograd.Function):
         scales, filters = _finite_scales(log_scales), _per_axis(widths)
         smooth = torch.hypot(scales, filters)
         kept = scales.div_(smooth)
-        opacities = logits.sigmoid()
+        opacities = sigmoid(logits)
         drawn = opacities * kept.prod(1)
         # In place: at this size, new memory costs more than the arithmetic.
         shares = kept.square_(), filters.div_(smooth).square_()

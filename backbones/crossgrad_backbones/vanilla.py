@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from crossgrad_core.backbone import Backbone
 from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.scene.types import Camera, Scene
 from crossgrad_core.schedule import Phase
@@ -130,7 +131,7 @@ class Vanilla(Backbone):
             means=parameters["means"],
             quats=parameters["quats"],
             scales=torch.exp(parameters["scales"]),
-            opacities=torch.sigmoid(parameters["opacities"]),
+            opacities=sigmoid(parameters["opacities"]),
             sh_dc=parameters["f_dc"],
             sh_rest=parameters["f_rest"] if degree > 0 else None,
             sh_degree=degree,

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.anchors.heads import COVARIANCE, Raw
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.gaussians import Gaussians
 
 
@@ -55,9 +56,9 @@ def activated(
     return Gaussians(
         means=positions[origin] + offsets[origin, slot] * stretch,
         quats=covariances[:, 3:],
-        scales=size * torch.sigmoid(covariances[:, :3]),
+        scales=size * sigmoid(covariances[:, :3]),
         opacities=opacities[anchor, slot],
-        colors=torch.sigmoid(colors),
+        colors=sigmoid(colors),
         origin=origin,
         slot=slot,
     )

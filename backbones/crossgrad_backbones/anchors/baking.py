@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.directional import ColorFit
 from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.scene.types import Camera
@@ -128,11 +129,11 @@ def _look(
         opacities *= seen.factor[:, None]
     covariances = raw.covariances.view(-1, heads.offsets, COVARIANCE)
     stretch, size = torch.split(torch.exp(log_scales)[:, None, :], 3, -1)
-    scales = size * torch.sigmoid(covariances[..., :3])
+    scales = size * sigmoid(covariances[..., :3])
     return Look(
         opacities,
         torch.cat([scales, normalize(covariances[..., 3:], dim=-1)], -1),
-        torch.sigmoid(raw.colors.view(-1, heads.offsets, 3)),
+        sigmoid(raw.colors.view(-1, heads.offsets, 3)),
         normalize(anchors[:, None] + offsets * stretch - eye, dim=-1),
     )
 

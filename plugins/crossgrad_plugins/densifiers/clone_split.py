@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.densifier import Densifier
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.splats import rotation_matrices
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows, apply_to_parameters
@@ -146,7 +147,7 @@ class CloneSplit(Densifier):
 
     def _pruned(self, context: DensifyContext, plan: Plan, values: Mapping[str, Rows]) -> Tensor:
         """[M] bool, new primitives that are too faint or too large."""
-        opacities = torch.sigmoid(_planned(context, plan, values, "opacities"))
+        opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.step > context.schedule.prune_large_from:
             scales = torch.exp(_planned(context, plan, values, "scales"))

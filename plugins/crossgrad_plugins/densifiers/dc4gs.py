@@ -3,10 +3,10 @@
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 from typing_extensions import override
 
 from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.elementwise import logsigmoid
 from crossgrad_core.splats import rotation_matrices
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import Rows

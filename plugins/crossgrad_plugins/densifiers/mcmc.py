@@ -18,6 +18,7 @@ from crossgrad_core.contexts import (
     Regularized,
 )
 from crossgrad_core.densifier import Densifier
+from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
@@ -72,7 +73,7 @@ class MarkovChainMonteCarlo(Densifier):
     ) -> tuple[Edit | NoEdit, PluginState]:
         if not context.schedule.densifies(context.step):
             return NO_EDIT, state
-        pool = Pool.of(torch.sigmoid(context.parameters["opacities"].detach().double()))
+        pool = Pool.of(sigmoid(context.parameters["opacities"].detach().double()))
         before = pool.source.shape[0]
         wanted = max(0, min(self.cap, int((1.0 + self.growth) * before)) - before)
         pool, relocated = self._relocated(pool, context.rng)
@@ -98,7 +99,7 @@ class MarkovChainMonteCarlo(Densifier):
         opacities, scales = context.parameters["opacities"], context.parameters["scales"]
         if context.gaussians is not None or opacities.shape[0] == 0:
             return None
-        opacity = self.opacity_weight * torch.sigmoid(opacities).mean()
+        opacity = self.opacity_weight * sigmoid(opacities).mean()
         return Regularized(opacity + self.scale_weight * torch.exp(scales).mean())
 
     def _relocated(self, pool: Pool, rng: np.random.Generator) -> tuple[Pool, int]:

@@ -6,10 +6,10 @@ from math import log
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 from typing_extensions import override
 
 from crossgrad_core.contexts import DensifyContext
+from crossgrad_core.elementwise import logsigmoid, sigmoid
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import Edit, NoEdit, Rows, apply_to_parameters
@@ -89,5 +89,5 @@ def halved_logits(logits: Tensor) -> Tensor:
 
 def lowered_logits(logits: Tensor, decrease: float) -> Tensor:
     """Logits [P] of opacities less `decrease`; nothing is raised to the least opacity."""
-    lowered = (torch.sigmoid(logits) - decrease).clamp(min=LEAST_OPACITY)
+    lowered = (sigmoid(logits) - decrease).clamp(min=LEAST_OPACITY)
     return torch.minimum(logits, torch.logit(lowered))

@@ -81,6 +81,9 @@ def weighted(*names):
     return loss
 
 
+#: Bound of a relative error: rounding of a few hundred terms.
+GRADIENT = 256 * torch.finfo(torch.float32).eps
+
 LOSSES = [
     weighted("means", "quats", "scales", "opacities", "colors"),
     mean_volume,
@@ -111,7 +114,9 @@ def test_the_fused_pass_is_the_plain_one(options, faded):
                 torch.zeros_like(tensor) if found.get(name) is None else found[name]
                 for found in (each, exact)
             )
-            assert (have.double() - want).norm() <= 1e-5 * want.norm(), name
+            # The bank's gradient is a difference of sums: its shares add up to 1.
+            bound = GRADIENT if name.startswith("mlp_bank") else GRADIENT / 3
+            assert (have.double() - want).norm() <= bound * want.norm(), name
 
 
 def test_many_stretches_are_the_plain_pass_too():
@@ -144,12 +149,13 @@ def test_networks_that_do_not_matter_get_no_gradient():
     assert not any(name.startswith("mlp_cov") for name in idle)
 
 
-def test_the_bits_do_not_depend_on_the_threads():
+@pytest.mark.parametrize("anchors", [3000, 9001])
+def test_the_bits_do_not_depend_on_the_threads(anchors):
     backbone = Scaffold()
     few = jittered(backbone)
-    source = torch.arange(3000) % len(few["anchors"])
+    source = torch.arange(anchors) % len(few["anchors"])
     many = apply_to_parameters(Edit(source=source), backbone.blocks(), few)
-    given = (backbone, many, Seen(torch.arange(3000)), LOSSES[:2])
+    given = (backbone, many, Seen(torch.arange(anchors)), LOSSES[:2])
     found = []
     for threads in (1, 2):
         configure_threads(threads)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
+from crossgrad_core.elementwise import sigmoid_
 
 #: Anchors of a stretch; fixed, so that sums do not depend on the machine.
 STRETCH = 2048
@@ -38,8 +39,8 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
     # The kernel gave raw numbers and the anchor's size: torch's sigmoid is vectorised.
-    scales.mul_(shares.sigmoid_())
-    colors.sigmoid_()
+    scales.mul_(sigmoid_(shares))
+    sigmoid_(colors)
     remembered = (array(spreads), starts, array(slot), array(shares), array(colors))
     result = (means, quats, scales, kept, colors, origin, slot)
     return result, Kept(joined, hidden, tanhs, *remembered)
