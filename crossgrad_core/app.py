@@ -178,8 +178,10 @@ def _train(setup: Setup, state: TrainState, session: Session, length: Length) ->
     with stopper.installed():
         try:
             while (ended := train(setup, state, session, stopper, length.due)) == "paused":
-                setup = length.revised(setup, state)
-                _write_config(session.folder, setup.config)
+                revised = length.revised(setup, state)
+                if revised.config is not setup.config:  # A planned length is written already.
+                    _write_config(session.folder, revised.config)
+                setup = revised
             status, error = ended, None
             session.save(setup, state)
         except TrainingFailedError as failure:

@@ -14,6 +14,7 @@ from crossgrad_backbones.distances import (
     OPACITIES,
     SCALES,
     Conditioned,
+    added,
     encoded,
     fitted_scale,
     largest_addition,
@@ -114,11 +115,11 @@ class DistanceConditioned(Vanilla):
     ) -> dict[str, Tensor]:
         """Vanilla's parameters for the mean encoding of these cameras."""
         encoding = encoded(parameters[SCALE], cameras).to(parameters["means"])
-        added = {
-            each.base: parameters[each.base] + parameters[each.weights] @ encoding
+        sums = {
+            each.base: parameters[each.base] + added(parameters[each.weights], encoding)
             for each in self._conditioned()
         }
-        return {**parameters, **added}
+        return {**parameters, **sums}
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> Regularized | None:
@@ -137,9 +138,9 @@ class DistanceConditioned(Vanilla):
         """Caps the opacity at the distance where it is largest."""
         if not self.condition_opacities:
             return super().capped_opacities(parameters, cap)
-        added = largest_addition(parameters[SCALE], parameters[OPACITIES.weights].detach())
+        most = largest_addition(parameters[SCALE], parameters[OPACITIES.weights].detach())
         limit = torch.logit(torch.tensor(cap, dtype=torch.float64)).item()
-        return torch.minimum(parameters["opacities"].detach(), limit - added)
+        return torch.minimum(parameters["opacities"].detach(), limit - most)
 
     @override
     def bake(

@@ -66,6 +66,15 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
     return torch.stack([z.mean(), z.square().mean()])
 
 
+def added(weights: Tensor, encoding: Tensor) -> Tensor:
+    """[N, ...] what weights [N, ..., 2] add at an encoding [2].
+
+    No matrix product: its rounding depends on the number of threads.
+    """
+    products: Tensor = weights * encoding
+    return products.sum(-1)
+
+
 def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
     """[N] the most that weights [N, 2] add, w_1 z + w_2 z^2, within the range of z."""
     first, second = weights.unbind(1)
@@ -73,8 +82,8 @@ def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
     # A parabola is largest at an end of the range, or at its vertex where it opens downwards.
     vertex = torch.where(second < 0, -first / (2 * second), least)
     vertex = torch.minimum(torch.maximum(vertex, least), most)
-    added: Tensor = torch.stack([z * first + z * z * second for z in (least, vertex, most)]).amax(0)
-    return added
+    sums: Tensor = torch.stack([z * first + z * z * second for z in (least, vertex, most)])
+    return sums.amax(0)
 
 
 def penalty(weights: Tensor, l2: float, smoothness: float) -> Tensor:

@@ -17,8 +17,7 @@ PROBE_STEPS = 12
 #: ... and the share of the budget that the probe takes beyond that.
 PROBE_SHARE = 0.01
 #: What each edit of density control adds to the mean cost of a step, in units of a step at the
-#: start. Two thousand steps with four edits took 1.8 times as long as the first 200 times ten
-#: (89 s and 5.0 s, scene boruszyn_kap at 400 px, see docs/benchmarks.md).
+#: start: chosen on runs with four edits. The clock corrects it as a run goes.
 COST_PER_EDIT = 0.2
 #: Growth slows down: more edits than these are not counted.
 COUNTED_EDITS = 5

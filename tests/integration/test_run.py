@@ -124,8 +124,10 @@ def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_p
     assert run(scene, tmp_path / "whole", **lengths) == 0
     assert load(latest(tmp_path / "whole")).step == 48
     assert run(scene, tmp_path / "parts", stop_after=20, **lengths) == 0
+    written = (tmp_path / "parts" / "config.yaml").read_bytes()
     assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
     assert same(parameters(tmp_path / "whole"), parameters(tmp_path / "parts"))
+    assert (tmp_path / "parts" / "config.yaml").read_bytes() == written
 
 
 def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ SMALLEST_VOXEL = 1e-5
 #: The automatic voxel size of a cloud without neighbours, local units.
 LONE_VOXEL = 0.01
 #: The automatic voxel size, in median distances between neighbours. With 1, nearly every point gets
-#: an anchor of its own and ten Gaussians, and a step costs two to four times what vanilla's does.
+#: an anchor of its own, hence ten Gaussians where vanilla has one.
 SPACING = 2.0
 
 

@@ -37,12 +37,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
-    FINISHED,
     LARGEST_ALPHA,
     LEAST,
     OFFSETS,
-    ONE,
-    STOPPED,
     TOUCHED,
     exp2,
 )
@@ -81,12 +78,11 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     DEPTHS,
-    PASSED,
-    REST,
     STATE,
     V_BLUE,
     V_GREEN,
     V_RED,
+    blend,
     start_tile,
 )
 
@@ -145,29 +141,19 @@ def _gather(
             touched = alpha >= load(constants, LEAST)
             free = touched & (alpha <= load(constants, LARGEST_ALPHA))
         alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-        before = load(state, at + PASSED)
-        weight = alpha * before
-        after = before - weight
-        blended = after >= load(constants, STOPPED)
-        store(state, at + PASSED, where(blended, after, load(constants, FINISHED)))
-        weight = where(blended, weight, zero)
         v_red = load(state, at + V_RED)
         v_green = load(state, at + V_GREEN)
         v_blue = load(state, at + V_BLUE)
-        sum_red = fma(weight, v_red, sum_red)
-        sum_green = fma(weight, v_green, sum_green)
-        sum_blue = fma(weight, v_blue, sum_blue)
         toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
             v_z = load(state, DEPTHS + segment * LANES)
-            sum_depth = fma(weight, v_z, sum_depth)
             toned = fma(v_z, z, toned)
-        own = weight * toned
-        rest = load(state, at + REST) - own
-        store(state, at + REST, rest)
-        # alpha * dL/d(alpha), the gradient of the exponent and of the log of the opacity
-        s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
-        s = where(blended & free, s, zero)
+        weight, s = blend(alpha, free, toned, state, at, constants)
+        sum_red = fma(weight, v_red, sum_red)
+        sum_green = fma(weight, v_green, sum_green)
+        sum_blue = fma(weight, v_blue, sum_blue)
+        if v_depth is not None:
+            sum_depth = fma(weight, v_z, sum_depth)
         sum_1 = sum_1 + s
         if analytic is None:
             dy = broadcast(rows, row + ROW_DY)

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 from crossgrad_core.simd import (
     LANES,
     Lanes,
-    Mask,
     broadcast,
     fma,
     fnma,
     load,
     smaller,
     splat,
-    store,
     where,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
@@ -26,12 +24,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
-    FINISHED,
     LARGEST_ALPHA,
     LEAST,
     OFFSETS,
-    ONE,
-    STOPPED,
     TOUCHED,
     exp2,
 )
@@ -59,46 +54,31 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     DEPTHS,
-    PASSED,
-    REST,
     STATE,
     V_BLUE,
     V_GREEN,
     V_RED,
+    blend,
 )
 
 
 @device
-def _exponent_gradient(
+def _toned(
     segment: int,
     records: NDArray[np.float32],
     record: int,
-    alpha: Lanes,
-    free: Mask,
     state: NDArray[np.float32],
-    constants: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
 ) -> Lanes:
-    """Blends a segment; returns the loss' gradient by the logarithm of alpha."""
+    """The gradients of a segment's pixels times the colour of the Gaussian."""
     at = segment * STATE
-    zero = splat(np.float32(0.0))
-    before = load(state, at + PASSED)
-    weight = alpha * before
-    after = before - weight
-    blended = after >= load(constants, STOPPED)
-    store(state, at + PASSED, where(blended, after, load(constants, FINISHED)))
-    weight = where(blended, weight, zero)
     toned = load(state, at + V_RED) * broadcast(records, record + RED)
     toned = fma(load(state, at + V_GREEN), broadcast(records, record + GREEN), toned)
     toned = fma(load(state, at + V_BLUE), broadcast(records, record + BLUE), toned)
     if v_depth is not None:
         v_z = load(state, DEPTHS + segment * LANES)
         toned = fma(v_z, broadcast(records, record + DEPTH), toned)
-    own = weight * toned
-    rest = load(state, at + REST) - own
-    store(state, at + REST, rest)
-    s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
-    return where(blended & free, s, zero)
+    return toned
 
 
 @device
@@ -137,7 +117,8 @@ def mean_gradients(
         touched = alpha >= load(constants, LEAST)
         free = touched & (alpha <= load(constants, LARGEST_ALPHA))
     alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-    s = _exponent_gradient(segment, records, record, alpha, free, state, constants, v_depth)
+    toned = _toned(segment, records, record, state, v_depth)
+    _, s = blend(alpha, free, toned, state, segment * STATE, constants)
     if analytic is None:
         sd = s * dx
         lean = decay * broadcast(records, record + SLOPE)

@@ -1,9 +1,10 @@
-"""What the backward passes keep of each pixel of a tile, in segments of eight."""
+"""What the backward passes keep of each pixel of a tile, in segments of eight, and their step."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import LANES
+from crossgrad_core.simd import LANES, Lanes, Mask, fnma, load, splat, store, where
+from crossgrad_plugins.rasterizers.numba_kernels.constants import FINISHED, ONE, STOPPED
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SEGMENT,
@@ -54,3 +55,40 @@ def start_tile(
             state[at + V_RED] = red
             state[at + V_GREEN] = green
             state[at + V_BLUE] = blue
+
+
+@device
+def blend(
+    alpha: Lanes,
+    free: Mask,
+    toned: Lanes,
+    state: NDArray[np.float32],
+    at: int,
+    constants: NDArray[np.float32],
+) -> tuple[Lanes, Lanes]:
+    """Blends a Gaussian into the pixels of a segment.
+
+    Args:
+        alpha: The Gaussian's opacity in the pixels, at most the largest; 0 where it is not drawn.
+        free: Where alpha depends on the parameters: neither capped nor too small.
+        toned: The gradients of the pixels times the colour of the Gaussian.
+        state: State of the tile.
+        at: Where that of the segment begins.
+        constants: From `vector_constants`.
+
+    Returns:
+        The weights of the Gaussian in the pixels, and alpha times the loss' gradient by alpha: the
+        gradient by the exponent and by the logarithm of the opacity.
+    """
+    zero = splat(np.float32(0.0))
+    before = load(state, at + PASSED)
+    weight = alpha * before
+    after = before - weight
+    blended = after >= load(constants, STOPPED)
+    store(state, at + PASSED, where(blended, after, load(constants, FINISHED)))
+    weight = where(blended, weight, zero)
+    own = weight * toned
+    rest = load(state, at + REST) - own
+    store(state, at + REST, rest)
+    s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
+    return weight, where(blended & free, s, zero)

@@ -1,0 +1,59 @@
+"""What a backbone decodes, and its gradients, do not depend on the number of threads."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.registry import entries, load
+from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
+from crossgrad_core.threads import configure_threads
+
+#: torch shares out what has more than 32,768 elements; a share that no vector length divides.
+ROWS = 40_001
+FIELDS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+
+
+@pytest.fixture(autouse=True)
+def _threads():
+    before = configure_threads()
+    yield
+    configure_threads(before)
+
+
+@pytest.fixture(scope="module")
+def large_scene():
+    """The sample scene with many points, spread as its own are."""
+    scene, rng = sample_scene(), np.random.default_rng(0)
+    points = scene.points.mean(0) + scene.points.std(0) * rng.normal(size=(ROWS, 3))
+    colors = rng.integers(0, 256, (ROWS, 3), dtype=np.uint8)
+    return replace(scene, points=points, point_colors=colors)
+
+
+@pytest.mark.parametrize("name", entries("backbones"))
+def test_same_bits_on_any_number_of_threads(name, large_scene):
+    backbone, _ = load("backbones", name)().fitted_to(large_scene)
+    trained = sorted(t for block in backbone.trained_blocks() for t in block.tensors)
+    parameters = backbone.create(large_scene, np.random.default_rng(1))
+    generator = torch.Generator().manual_seed(0)
+    for tensor in trained:
+        values = parameters[tensor].detach()
+        noise = 0.3 * torch.randn(values.shape, generator=generator)
+        parameters[tensor] = (values + noise).requires_grad_()
+    found = []
+    for threads in (1, 2):
+        configure_threads(threads)
+        ready = backbone.prepare(parameters, large_scene, sample_phase())
+        gaussians = backbone.decode(ready, sample_camera(), sample_phase())
+        decoded = [getattr(gaussians, field) for field in FIELDS]
+        decoded = [tensor for tensor in decoded if tensor is not None]
+        assert max(tensor.shape[0] for tensor in decoded) > 2**15
+        differentiable = [tensor for tensor in decoded if tensor.requires_grad]
+        weights = [torch.linspace(-1.0, 1.0, t.numel()).view_as(t) for t in differentiable]
+        gradients = torch.autograd.grad(
+            differentiable, [ready[tensor] for tensor in trained], weights, allow_unused=True
+        )
+        found.append([*decoded, *(gradient for gradient in gradients if gradient is not None)])
+    one, two = found
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
