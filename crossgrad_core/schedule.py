@@ -14,6 +14,9 @@ REFERENCE_STEPS = 30_000
 SHORTEST_WARM_UP = 500
 #: The statistics of so many steps decide about growth, at least (the published interval).
 SHORTEST_INTERVAL = 100
+#: The same for anchors, which count by offset and keep what was too rarely seen to be judged. Half
+#: the published interval: growth of anchors is what short runs lack (docs/benchmarks.md).
+SHORTEST_ANCHOR_INTERVAL = 50
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
 
@@ -23,6 +26,7 @@ class Schedule:
     """All schedule lengths of one run, in optimizer steps.
 
     Attributes:
+        mode: Whether the published schedule was stretched with the run.
         total: Length of the run.
         lr_steps: Length of the log-linear learning-rate decay.
         sh_interval: The SH degree grows by one every so many steps.
@@ -33,8 +37,10 @@ class Schedule:
         prune_large_from: Gaussians that are large in the world are pruned after this step: after
             the first opacity reset, as published, and never where there is none.
         anchors_from: Anchor growing starts after this step.
+        anchors_every: Interval of anchor growing.
     """
 
+    mode: ScheduleMode
     total: int
     lr_steps: int
     sh_interval: int
@@ -44,6 +50,7 @@ class Schedule:
     reset_every: int | None
     prune_large_from: int
     anchors_from: int
+    anchors_every: int
 
     @classmethod
     def for_run(cls, total: int, mode: ScheduleMode = "scaled") -> "Schedule":
@@ -53,8 +60,9 @@ class Schedule:
         published numbers whatever the length.
         """
         if mode == "absolute":
-            return cls(total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 3000, 1500)
+            return cls(mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 3000, 1500, 100)
         return cls(
+            mode=mode,
             total=total,
             lr_steps=total,
             sh_interval=max(100, total // 30),
@@ -64,6 +72,7 @@ class Schedule:
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
             prune_large_from=total // 10 if total >= SHORTEST_RUN_WITH_RESET else total,
             anchors_from=total // 20,
+            anchors_every=max(SHORTEST_ANCHOR_INTERVAL, total // 300),
         )
 
     def edits(self, after: int = 0) -> int:

@@ -126,7 +126,7 @@ class Octree(AnchorBackbone):
 
     def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
         """The finest level that is open; None where all are."""
-        span = COARSE_SHARE * phase.schedule.total
+        span = COARSE_SHARE * phase.schedule.lr_steps
         if not (self.progressive and phase.training and phase.step < span):
             return None
         last = Lattice.of(parameters["lattice"]).count - 1

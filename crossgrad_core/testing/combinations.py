@@ -25,8 +25,8 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
     # Anchors are judged at once, and find free cells near by.
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
-    ("densifier", "anchor"): {"grow_renders": 0, "prune_views": 0, "coarsest": 1},
-    ("densifier", "octree"): {"grow_renders": 0, "prune_views": 0},
+    ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
+    ("densifier", "octree"): {"success_threshold": 0},
 }
 #: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
 STEPS: Final = 5

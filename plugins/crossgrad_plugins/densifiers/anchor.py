@@ -26,7 +26,12 @@ class AnchorControl(AnchorDensifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        return replace(schedule, densify_from=schedule.anchors_from, reset_every=None)
+        return replace(
+            schedule,
+            densify_from=schedule.anchors_from,
+            densify_every=schedule.anchors_every,
+            reset_every=None,
+        )
 
     @override
     def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:

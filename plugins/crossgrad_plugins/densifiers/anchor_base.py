@@ -37,8 +37,12 @@ class AnchorDensifier(Densifier):
     blocks: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
 
     grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to grow at")
-    grow_renders: float = Field(40, ge=0, description="an offset grows after more renders")
-    prune_views: float = Field(80, ge=0, description="an anchor is judged after more views")
+    success_threshold: float = Field(
+        0.8,
+        ge=0,
+        description="an anchor is judged after more views than this share of the interval's steps, "
+        "an offset after more renders than half of it",
+    )
     prune_opacity: float = Field(0.005, ge=0, description="prune below; sum over the offsets")
     largest_log_scale: float = Field(0.05, description="cap of the Gaussians' log size, extents")
 
@@ -74,9 +78,10 @@ class AnchorDensifier(Densifier):
     def _edited(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         sums = state.per_primitive
         parameters = {name: tensor.detach() for name, tensor in context.parameters.items()}
-        judged = sums[VIEWS] > self.prune_views
+        enough = self.success_threshold * context.schedule.densify_every
+        judged = sums[VIEWS] > enough
         transparent = sums[OPACITY] < self.prune_opacity * sums[VIEWS]
-        urge = Urge(mean(sums, GRADIENT, RENDERS), sums[RENDERS] > self.grow_renders)
+        urge = Urge(mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
         new, held_back = self.grown(context, parameters, urge).limited(context.room)
         changed = self.changed(parameters, urge)
         edit = edit_of(parameters, changed, judged & transparent, new)

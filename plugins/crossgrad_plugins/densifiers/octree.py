@@ -12,7 +12,7 @@ from typing_extensions import override
 from crossgrad_core.blocks import Parameters
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.lattice import Lattice
-from crossgrad_core.schedule import Schedule
+from crossgrad_core.schedule import SHORTEST_ANCHOR_INTERVAL, Schedule
 from crossgrad_plugins.densifiers.anchor_base import AnchorDensifier
 from crossgrad_plugins.densifiers.new_anchors import NewAnchors, Urge
 from crossgrad_plugins.densifiers.octree_growing import Thresholds, grown, seen_from_farther
@@ -55,12 +55,13 @@ class OctreeControl(AnchorDensifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        total = schedule.total
+        length = _LENGTH if schedule.mode == "absolute" else schedule.total
         return replace(
             schedule,
-            densify_from=total * _FROM // _LENGTH,
-            densify_until=total * _UNTIL // _LENGTH,
-            densify_every=max(_EVERY, total * _EVERY // _LENGTH),
+            lr_steps=length,
+            densify_from=length * _FROM // _LENGTH,
+            densify_until=length * _UNTIL // _LENGTH,
+            densify_every=max(SHORTEST_ANCHOR_INTERVAL, length * _EVERY // _LENGTH),
             reset_every=None,
         )
 

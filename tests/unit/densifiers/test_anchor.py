@@ -40,10 +40,10 @@ def model(anchors=30, seed=0):
     return parameters
 
 
-def context(parameters, views=(), *, step=EDIT, room=10_000, rng=0):
+def context(parameters, views=(), *, step=EDIT, room=10_000, rng=0, schedule=SCHEDULE):
     return DensifyContext(
         step=step,
-        schedule=SCHEDULE,
+        schedule=schedule,
         scene=None,
         states={},
         rng=np.random.default_rng(rng),
@@ -159,6 +159,14 @@ def test_the_window_is_that_of_the_anchors_without_resets():
     assert (SCHEDULE.densify_from, SCHEDULE.densify_until) == (1500, 15_000)
     assert SCHEDULE.reset_every is None
     assert not SCHEDULE.densifies(1500) and SCHEDULE.densifies(1600)
+
+
+@pytest.mark.parametrize(
+    ("total", "mode", "every"),
+    [(300, "scaled", 50), (2000, "scaled", 50), (60_000, "scaled", 200), (2000, "absolute", 100)],
+)
+def test_short_runs_grow_twice_as_often_as_the_published_ones(total, mode, every):
+    assert AnchorControl().window(Schedule.for_run(total, mode)).densify_every == every
 
 
 def state_of(parameters, seed=0, most=90):
@@ -306,18 +314,20 @@ def test_an_anchor_that_never_draws_is_removed():
     assert edit.source.tolist() == list(range(1, count))
 
 
-def test_what_was_judged_starts_anew_and_the_rest_goes_on():
+@pytest.mark.parametrize(("total", "renders", "views"), [(30_000, 40, 80), (6000, 20, 40)])
+def test_what_was_judged_starts_anew_and_the_rest_goes_on(total, renders, views):
     parameters = model()
     state = state_of(parameters)
+    schedule = AnchorControl().window(Schedule.for_run(total))
     edit, after = AnchorControl(grad_threshold=1e9, prune_opacity=0.0).densify(
-        context(parameters), state
+        context(parameters, schedule=schedule), state
     )
     before = {name: each.numpy() for name, each in state.per_primitive.items()}
     for name, counter, least in (
-        ("gradient", "renders", 40),
-        ("renders", "renders", 40),
-        ("opacity", "views", 80),
-        ("views", "views", 80),
+        ("gradient", "renders", renders),
+        ("renders", "renders", renders),
+        ("opacity", "views", views),
+        ("views", "views", views),
     ):
         wanted = np.where(before[counter] > least, 0.0, before[name])
         np.testing.assert_array_equal(after.per_primitive[name], wanted)

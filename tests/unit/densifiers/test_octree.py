@@ -188,7 +188,7 @@ def fresh(seed=0):
 
 def test_edits_keep_every_anchor_on_a_site_of_its_own():
     backbone, tensors = fresh()
-    control, state = OctreeControl(grow_renders=0, prune_views=0), PluginState()
+    control, state = OctreeControl(success_threshold=0), PluginState()
     rng = np.random.default_rng(1)
     for step in range(2000, 2500, 100):
         before = primitives_of(backbone.blocks(), tensors)
@@ -223,7 +223,7 @@ def check_sites(tensors):
 
 def test_the_strongest_grow_where_room_is_short():
     backbone, tensors = fresh()
-    control = OctreeControl(grow_renders=0, extra_level=0.0)
+    control = OctreeControl(success_threshold=0, extra_level=0.0)
     gradient = torch.linspace(1e-4, 9e-4, tensors["offsets"].shape[0] * 3)
     everything, _ = control.densify(context(tensors, backbone, gradient=gradient), PluginState())
     edit, _ = control.densify(context(tensors, backbone, gradient=gradient, room=4), PluginState())
@@ -235,7 +235,7 @@ def test_the_strongest_grow_where_room_is_short():
 
 def test_new_anchors_start_as_large_as_their_cells():
     backbone, tensors = fresh()
-    edit, _ = OctreeControl(grow_renders=0).densify(
+    edit, _ = OctreeControl(success_threshold=0).densify(
         context(tensors, backbone, gradient=9e-4), PluginState()
     )
     after = apply_to_parameters(edit, backbone.blocks(), tensors)
@@ -244,8 +244,10 @@ def test_new_anchors_start_as_large_as_their_cells():
     assert torch.allclose(after["scales"][new], cells.log().float()[:, None].expand(-1, 6))
 
 
-def test_published_times_at_the_published_length():
-    schedule = OctreeControl().window(Schedule.for_run(40_000))
+@pytest.mark.parametrize(("total", "mode"), [(40_000, "scaled"), (30_000, "absolute")])
+def test_published_times_at_the_published_length_and_on_request(total, mode):
+    schedule = OctreeControl().window(Schedule.for_run(total, mode))
+    assert schedule.lr_steps == 40_000
     edits = [step for step in range(1, 40_001) if schedule.densifies(step)]
     assert edits == list(range(1600, 25_000, 100))
     assert not any(schedule.resets(step) for step in range(1, 40_001))
@@ -256,7 +258,7 @@ def test_times_stretch_with_the_run(total):
     schedule = OctreeControl().window(Schedule.for_run(total))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     assert edits[0] > total * 1500 / 40_000 - 1 and edits[-1] < total * 25_000 / 40_000
-    assert edits[1:] == [] or edits[1] - edits[0] == max(100, math.floor(total / 400))
+    assert edits[1:] == [] or edits[1] - edits[0] == max(50, math.floor(total / 400))
 
 
 def test_statistics_stop_with_growth():

@@ -14,8 +14,8 @@ from crossgrad_core.training.start import first_state
 
 #: Options with which each densifier edits the small scene of the tests.
 OPTIONS = {
-    "anchor": {"grow_renders": 0, "prune_views": 0, "coarsest": 1},
-    "octree": {"grow_renders": 0, "prune_views": 0},
+    "anchor": {"success_threshold": 0, "coarsest": 1},
+    "octree": {"success_threshold": 0},
     "mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4},
     "dc4gs": {"split_scale": 1e-3, "split_threshold": 1e-6, "grad_threshold": 1e-6},
     "revising": {"growth_budget": 0.1, "error_threshold": 0.01, "views": 3},
