@@ -92,7 +92,8 @@ class Lattice:
 
     def _forks(self, exponents: Tensor) -> Tensor:
         """fork^exponents, in the type of the exponents: a step computes it for every anchor."""
-        return torch.exp2(torch.log2(self.fork) * exponents)
+        # Not exp2: its rounding depends on the number of threads.
+        return torch.exp(torch.log(self.fork) * exponents)
 
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
         """[A] in [0, 1], opacity factor of anchors where the boundary level fades in (Octree-GS).

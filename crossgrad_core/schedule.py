@@ -34,10 +34,9 @@ class Schedule:
         densify_until: ... and before this one.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None where there are none.
-        prune_large_from: Gaussians that are large in the world are pruned after this step: after
-            the first opacity reset, as published, and never where there is none.
         anchors_from: Anchor growing starts after this step.
         anchors_every: Interval of anchor growing.
+        coarse_until: Backbones that train from coarse to fine have all levels from this step on.
     """
 
     mode: ScheduleMode
@@ -48,9 +47,9 @@ class Schedule:
     densify_until: int
     densify_every: int
     reset_every: int | None
-    prune_large_from: int
     anchors_from: int
     anchors_every: int
+    coarse_until: int
 
     @classmethod
     def for_run(cls, total: int, mode: ScheduleMode = "scaled") -> "Schedule":
@@ -60,7 +59,7 @@ class Schedule:
         published numbers whatever the length.
         """
         if mode == "absolute":
-            return cls(mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 3000, 1500, 100)
+            return cls(mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500, 100, 7500)
         return cls(
             mode=mode,
             total=total,
@@ -70,9 +69,9 @@ class Schedule:
             densify_until=total // 2,
             densify_every=max(SHORTEST_INTERVAL, total // 300),
             reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
-            prune_large_from=total // 10 if total >= SHORTEST_RUN_WITH_RESET else total,
             anchors_from=total // 20,
             anchors_every=max(SHORTEST_ANCHOR_INTERVAL, total // 300),
+            coarse_until=total // 4,
         )
 
     def edits(self, after: int = 0) -> int:
@@ -94,21 +93,20 @@ class Schedule:
         """This schedule with the length of another one, from the end of a step on.
 
         The ends of the run, of the learning-rate decay and of density control move as far as they
-        are still ahead. Intervals stay, so that nothing happens twice or is left out, and density
-        control that is over does not come back.
+        are still ahead. Intervals stay, so that nothing happens twice or is left out; density
+        control that is over does not come back, and no level closes that was open.
 
         Args:
             wanted: The schedule of a run that was as long from its start.
             step: The step that the run has reached.
         """
         over = step >= self.densify_until
-        never = self.prune_large_from >= self.total
         return replace(
             self,
             total=wanted.total,
             lr_steps=wanted.lr_steps,
             densify_until=self.densify_until if over else max(step, wanted.densify_until),
-            prune_large_from=wanted.total if never else self.prune_large_from,
+            coarse_until=min(self.coarse_until, wanted.coarse_until),
         )
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
@@ -123,6 +121,13 @@ class Schedule:
     def collects(self, step: int) -> bool:
         """Whether densification statistics of this step are still needed."""
         return step < self.densify_until
+
+    def prunes_large(self, step: int) -> bool:
+        """Whether an edit after this step removes what is large in the world.
+
+        After the first opacity reset, as published, and never where there is none.
+        """
+        return self.reset_every is not None and step > self.reset_every
 
     def resets(self, step: int) -> bool:
         """Whether opacities are reset after this step."""

@@ -25,6 +25,14 @@ class PluginState:
     tensors: Mapping[str, Tensor] = field(default_factory=dict)
     per_primitive: Mapping[str, Tensor] = field(default_factory=dict)
 
+    def to(self, device: torch.device) -> "PluginState":
+        """The state with its tensors on a device."""
+        tensors, rows = (
+            {name: tensor.to(device) for name, tensor in each.items()}
+            for each in (self.tensors, self.per_primitive)
+        )
+        return PluginState(self.values, tensors, rows)
+
     def gathered(self, source: Tensor, fresh: Tensor) -> "PluginState":
         """The state after a topology edit.
 

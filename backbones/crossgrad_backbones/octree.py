@@ -15,7 +15,6 @@ from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.planting import planted, spacings, visible_share
 from crossgrad_core.blocks import Block, LearningRate, Parameters
-from crossgrad_core.errors import UserError
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.scene.types import Camera, Scene
@@ -25,8 +24,6 @@ Rounding = Literal["round", "floor", "ceil", "progressive"]
 
 #: How many levels beyond L* are used (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
-#: Share of a run that is over when the last level opens: 10,000 of 40,000 steps.
-COARSE_SHARE = 0.25
 
 
 class Octree(AnchorBackbone):
@@ -51,8 +48,14 @@ class Octree(AnchorBackbone):
     base_layer: int = Field(
         -1, ge=-1, le=40, description="halvings of the scene's cube to the root cell; -1: automatic"
     )
-    middle_cell: float = Field(
-        0.005, gt=0, description="cell below the middle level where base_layer is -1, extents"
+    middle_cell: float | None = Field(
+        None,
+        gt=0,
+        description="cell below the middle level where base_layer is -1, extents; "
+        "None: the root cell is four median distances between points",
+    )
+    plant_everywhere: bool = Field(
+        default=False, description="start with anchors that repeat one of the coarser level, too"
     )
     init_level: int = Field(
         -1, ge=-1, description="finest level trained at first; -1: the middle one"
@@ -76,28 +79,17 @@ class Octree(AnchorBackbone):
 
     @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
-        if len(scene.points) == 0:
-            raise UserError(
-                "an octree has no point to start from",
-                where="--init",
-                expected="points, or Gaussians that can be seen",
-                found="none",
-                todo="use --init random",
-            )
         centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
         lattice = self._lattice(scene.points, centers)
-        positions, levels = planted(scene.points, lattice)
+        positions, levels = planted(scene.points, lattice, everywhere=self.plant_everywhere)
         shares = lattice.shares(positions, levels, torch.from_numpy(centers))
         lattice = lattice.weeding(visible_share(shares, self.visible_threshold))
         lasting = lattice.lasting(shares)
         positions, levels = positions[lasting], levels[lasting]
         finest = float(lattice.cells(lattice.levels - 1))
-        made = self.created(positions.numpy(), finest, scene, rng)
         spacing = spacings(positions.numpy(), levels.numpy(), lattice.count)
-        scales = torch.from_numpy(np.log(spacing)).float()[:, None].repeat(1, 6)
         return {
-            **made,
-            "scales": scales.requires_grad_(made["scales"].requires_grad),
+            **self.created(positions.numpy(), spacing, finest, scene, rng),
             "levels": levels,
             "extra_levels": torch.zeros(len(levels)),
             "lattice": lattice.packed(),
@@ -107,7 +99,10 @@ class Octree(AnchorBackbone):
         largest, smallest = fitting.distance_range(points, centers, self.dist_ratio)
         levels = fitting.number_of_levels(largest, smallest, self.fork)
         corner, edge = fitting.bounding_range(points)
-        cell = fitting.root_cell(edge, levels, self.base_layer, self.middle_cell)
+        wanted = fitting.automatic_root_cell(points)
+        if self.middle_cell is not None:
+            wanted = fitting.root_above(self.middle_cell, levels, self.fork)
+        cell = fitting.root_cell(edge, self.base_layer, wanted)
         scalars = (cell, self.fork, levels, largest, _LEADS[self.rounding], 0.0)
         return Lattice.of(torch.tensor([corner, corner, corner, *scalars], dtype=torch.float64))
 
@@ -126,7 +121,7 @@ class Octree(AnchorBackbone):
 
     def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
         """The finest level that is open; None where all are."""
-        span = COARSE_SHARE * phase.schedule.lr_steps
+        span = phase.schedule.coarse_until
         if not (self.progressive and phase.training and phase.step < span):
             return None
         last = Lattice.of(parameters["lattice"]).count - 1

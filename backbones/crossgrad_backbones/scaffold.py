@@ -12,6 +12,7 @@ from crossgrad_backbones.anchors.voxels import automatic_voxel_size, voxel_cente
 from crossgrad_core.blocks import Parameters
 from crossgrad_core.scene.types import Camera, Scene
 from crossgrad_core.schedule import Phase
+from crossgrad_core.splats import nearest_neighbour_scales
 
 
 class Scaffold(AnchorBackbone):
@@ -24,7 +25,8 @@ class Scaffold(AnchorBackbone):
     @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
         size = self.voxel_size or automatic_voxel_size(scene.points)
-        return self.created(voxel_centers(scene.points, size), size, scene, rng)
+        positions = voxel_centers(scene.points, size)
+        return self.created(positions, nearest_neighbour_scales(positions), size, scene, rng)
 
     @override
     def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:

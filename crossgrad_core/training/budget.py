@@ -37,13 +37,13 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
 
     Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
     """
-    far = replace(unwatched(setup), schedule=Schedule.for_run(10**9))
-    state = first_state(far)
-    timed_step(far, state)
+    probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
+    state = first_state(probed)
+    timed_step(probed, state)
     state.clock.train = 0.0
     steps = 0
     while steps < PROBE_STEPS or (state.clock.train < PROBE_SHARE * seconds):
-        timed_step(far, state)
+        timed_step(probed, state)
         steps += 1
     each = state.clock.train / steps
     total = _fitting(lambda steps: _cost(setup, steps), seconds / each)
@@ -147,6 +147,21 @@ def caught_up(setup: Setup, step: int) -> Setup:
         if done <= step:
             setup = lengthened(setup, done, total)
     return setup
+
+
+def _without_edits(schedule: Schedule) -> Schedule:
+    """A schedule whose steps cost what most do: statistics, all SH bands and levels, no edits."""
+    never = 10**9
+    return replace(
+        schedule,
+        total=never,
+        sh_interval=1,
+        coarse_until=0,
+        densify_from=0,
+        densify_until=never,
+        densify_every=never,
+        reset_every=None,
+    )
 
 
 def _cost(setup: Setup, steps: int) -> float:

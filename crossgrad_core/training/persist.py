@@ -48,7 +48,7 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
             steps=dict(checkpoint.adam_steps),
         ),
         rngs=restored_streams(checkpoint.generators),
-        states=dict(checkpoint.plugins),
+        states={name: state.to(device) for name, state in checkpoint.plugins.items()},
         step=checkpoint.step,
         last=_record(scalars["last"]),
         counters=Counters(**scalars["counters"]),

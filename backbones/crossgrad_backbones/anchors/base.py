@@ -19,12 +19,12 @@ from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_backbones.anchors.volume import mean_volume
 from crossgrad_core.blocks import Parameters
 from crossgrad_core.contexts import RegularizeContext, Regularized
+from crossgrad_core.errors import UserError
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.scene.types import Camera, Scene
 from crossgrad_core.schedule import Phase
-from crossgrad_core.splats import nearest_neighbour_scales
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class AnchorBackbone(AnchorOptions):
     def created(
         self,
         positions: NDArray[np.float64],
+        spacing: NDArray[np.float64],
         voxel_size: float,
         scene: Scene,
         rng: np.random.Generator,
@@ -63,12 +64,13 @@ class AnchorBackbone(AnchorOptions):
 
         Args:
             positions: [P, 3] of the anchors, local units.
+            spacing: [P] their first sizes, local units.
             voxel_size: Edge of the finest voxel, local units.
             scene: The scene, for the appearance codes of its training views.
             rng: Draws the first values of the networks and codes.
         """
         count = positions.shape[0]
-        scales = torch.from_numpy(np.log(nearest_neighbour_scales(positions))).float()
+        scales = torch.from_numpy(np.log(spacing)).float()
         tensors: Parameters = {
             "anchors": torch.from_numpy(positions).float(),
             "offsets": torch.zeros(count, self.offsets, 3),
@@ -86,8 +88,20 @@ class AnchorBackbone(AnchorOptions):
 
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
-        """Anchors where the Gaussians are; of these only the means are taken over."""
+        """Anchors where the Gaussians are; of these only the means are taken over.
+
+        Raises:
+            UserError: None of the Gaussians can be seen.
+        """
         drawn = gaussians.opacities >= ALPHA_THRESHOLD
+        if not bool(drawn.any()):
+            raise UserError(
+                "anchors have no point to start from",
+                where="--init",
+                expected=f"Gaussians with opacities of at least {ALPHA_THRESHOLD:.4f}",
+                found=f"{len(drawn)} Gaussians, all of them fainter",
+                todo="use another file, --init points or --init random",
+            )
         points = gaussians.means[drawn].double().numpy()
         colors = np.full(points.shape, 127, dtype=np.uint8)
         return self.create(replace(scene, points=points, point_colors=colors), rng)

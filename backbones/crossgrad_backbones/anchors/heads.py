@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear, pad
 
+from crossgrad_backbones.anchors import panels
 from crossgrad_backbones.anchors.networks import DIRECTION, Network
 
 #: Strides at which the feature bank reads the feature, from coarse to fine.
@@ -78,9 +79,10 @@ class Heads:
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
         """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
-        scores = linear(linear(views, first, first_bias).relu_(), second, second_bias)
-        shares = torch.softmax(scores, 1)
-        read = [features[:, ::stride].repeat(1, stride) for stride in BANK_STRIDES]
+        hidden = panels.linear(views, first, first_bias).relu()
+        shares = torch.softmax(panels.linear(hidden, second, second_bias), 1)
+        width = features.shape[1]
+        read = [features[:, ::stride].repeat(1, stride)[:, :width] for stride in BANK_STRIDES]
         return shares[:, :1] * read[0] + shares[:, 1:2] * read[1] + shares[:, 2:] * read[2]
 
     def first_layers(

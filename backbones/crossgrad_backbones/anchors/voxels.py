@@ -29,9 +29,7 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     return max(SPACING * float(np.median(distances[:, 1])), SMALLEST_VOXEL)
 
 
-def voxel_centers(
-    points: NDArray[np.float64], size: float, origin: NDArray[np.float64] | float = 0.0
-) -> NDArray[np.float64]:
+def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """[P, 3] centres of the voxels that hold a point, each once, in lexicographic order.
 
     Source: Scaffold-GS, section 3.1: unique(round(p / v)) v.
@@ -39,7 +37,6 @@ def voxel_centers(
     Args:
         points: [N, 3].
         size: Edge of a voxel, in the unit of the points.
-        origin: [3] or a number, centre of voxel (0, 0, 0).
     """
-    cells = np.unique(np.round((points - origin) / size), axis=0)
-    return np.asarray(cells * size + origin)
+    cells = np.unique(np.round(points / size), axis=0)
+    return np.asarray(cells * size)

@@ -5,6 +5,8 @@ from math import log, log2
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_backbones.anchors.voxels import automatic_voxel_size
+
 #: Finer lattices than this would be below the resolution of float32 positions.
 MOST_LEVELS = 16
 #: Limits of the initial points are moved away from 0 by this factor (Octree-GS).
@@ -50,18 +52,33 @@ def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
     return low, max(high - low, 0.0)
 
 
-def root_cell(edge: float, levels: int, base_layer: int, middle_cell: float) -> float:
+def automatic_root_cell(points: NDArray[np.float64]) -> float:
+    """Four median distances between neighbours, local units.
+
+    Twice the automatic voxel of Scaffold-GS: what the farthest cameras see is about as fine as the
+    points are dense, however many finer levels there are for near ones.
+
+    Args:
+        points: [P, 3] local units.
+    """
+    return 2.0 * automatic_voxel_size(points)
+
+
+def root_above(middle_cell: float, levels: int, fork: int) -> float:
+    """Edge of level 0's cells where those below the middle level are `middle_cell` (Octree-GS)."""
+    return middle_cell * float(fork) ** (levels // 2 - 1)
+
+
+def root_cell(edge: float, base_layer: int, wanted: float) -> float:
     """Edge of a cell of level 0: the cube's edge / 2^base_layer (Octree-GS).
 
     Args:
         edge: The cube's edge, local units.
-        levels: Number of levels.
-        base_layer: How often the cube is halved; -1 halves it until the cells of the level below
-            the middle one are about `middle_cell` large.
-        middle_cell: Local units.
+        base_layer: How often the cube is halved; -1: until its cells are about `wanted` large.
+        wanted: Local units; the answer where the cube has no size.
     """
     if edge <= 0.0:
-        return middle_cell
+        return wanted
     if base_layer < 0:
-        base_layer = round(log2(edge / middle_cell)) - levels // 2 + 1
+        base_layer = round(log2(edge / wanted))
     return edge * 2.0**-base_layer

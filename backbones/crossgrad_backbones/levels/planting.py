@@ -5,29 +5,47 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_backbones.anchors.voxels import voxel_centers
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.splats import nearest_neighbour_scales
 
 
-def planted(points: NDArray[np.float64], lattice: Lattice) -> tuple[Tensor, Tensor]:
+def planted(
+    points: NDArray[np.float64], lattice: Lattice, *, everywhere: bool
+) -> tuple[Tensor, Tensor]:
     """Anchors of every level: the points, rounded to the level's lattice, each site once.
 
     Args:
         points: [P, 3] local units.
         lattice: The lattices.
+        everywhere: Whether a site counts also where the points of the coarser site that it belongs
+            to are all on it: its anchor repeats that of the coarser level.
 
     Returns:
         Positions [A, 3] float64 and levels [A] int64, level by level.
     """
-    levels = torch.arange(lattice.count)
     origin = lattice.origin.numpy()
-    each = [
-        torch.from_numpy(voxel_centers(points, float(cell), origin))
-        for cell in lattice.cells(levels)
-    ]
-    counts = torch.tensor([positions.shape[0] for positions in each])
-    return torch.cat(each), levels.repeat_interleave(counts)
+    levels = torch.arange(lattice.count)
+    positions, coarser = [], np.zeros(0, np.int64)
+    for level, cell in enumerate(lattice.cells(levels).tolist()):
+        sites, site = np.unique(np.round((points - origin) / cell), axis=0, return_inverse=True)
+        site = site.reshape(-1)
+        if level > 0 and not everywhere:
+            sites = sites[np.unique(site[_parted(coarser, site)])]
+        positions.append(torch.from_numpy(sites * cell + origin))
+        coarser = site
+    counts = torch.tensor([each.shape[0] for each in positions])
+    return torch.cat(positions), levels.repeat_interleave(counts)
+
+
+def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[P] whether the points that share a point's coarser site are on several of the finer ones.
+
+    Args:
+        coarser: [P] number of each point's site on the level before.
+        site: [P] number of its site.
+    """
+    pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
+    return np.bincount(pairs[:, 0])[coarser] > 1
 
 
 def spacings(

@@ -68,8 +68,8 @@ class AnchorDensifier(Densifier):
     ) -> tuple[Edit | NoEdit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
-        # Statistics begin at T / 60: step 500 of the published schedule.
-        if context.step > context.schedule.lr_steps // 60:
+        # Published: statistics from step 500, edits from step 1500 on.
+        if context.step > context.schedule.densify_from // 3:
             state = observed(context, state)
         if not (state.per_primitive and context.schedule.densifies(context.step)):
             return NO_EDIT, state

@@ -14,6 +14,7 @@ from typing_extensions import override
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.elementwise import sigmoid
+from crossgrad_core.schedule import Phase
 from crossgrad_core.splats import rotation_matrices
 from crossgrad_core.state import PluginState
 from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows, apply_to_parameters
@@ -149,7 +150,7 @@ class CloneSplit(Densifier):
         """[M] bool, new primitives that are too faint or too large."""
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
-        if context.step > context.schedule.prune_large_from:
+        if context.schedule.prunes_large(context.step):
             scales = torch.exp(_planned(context, plan, values, "scales"))
             pruned |= scales.amax(dim=1) > self.prune_scale
         return pruned
@@ -157,6 +158,9 @@ class CloneSplit(Densifier):
     def _with_reset(self, context: DensifyContext, edit: Edit) -> Edit:
         backbone = context.backbone
         after = apply_to_parameters(edit, backbone.blocks(), context.parameters)
+        # Derived tensors are stale after an edit, and the cap may depend on them.
+        phase = Phase(context.step, training=True, schedule=context.schedule)
+        after = backbone.prepare(after, context.scene, phase)
         capped = backbone.capped_opacities(after, self.reset_opacity)
         values = {**edit.values, "opacities": Rows(capped)}
         return replace(edit, values=values, counts={**edit.counts, "reset": capped.shape[0]})

@@ -42,7 +42,9 @@ class PixelDensityControl(CloneSplit):
         """[N] in [0, 1], the factor f of each Gaussian in this view."""
         means = record.gaussians.means
         pose = record.view.camera.world_to_camera.to(means)
-        depths = means @ pose[2, :3] + pose[2, 3]
+        x, y, z = means.unbind(1)
+        # No matrix product: its rounding depends on the number of threads.
+        depths = x * pose[2, 0] + y * pose[2, 1] + z * pose[2, 2] + pose[2, 3]
         # The unit of the local frame is the extent of the training cameras.
         return (depths / self.depth_threshold).square().clamp(max=1.0)
 

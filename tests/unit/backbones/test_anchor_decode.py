@@ -19,6 +19,7 @@ OPTIONS = [
     {"opacity_distance": True},
     {"cov_distance": True, "color_distance": True},
     {"feature_bank": True},
+    {"feature_bank": True, "feature": 10},
     {"appearance": 5, "color_distance": True},
 ]
 VIEWS = sample_scene().train_views
@@ -49,7 +50,8 @@ def mixed(parameters, feature, view):
     width = len(feature)
     result = np.zeros(width)
     for share, stride in zip(shares, (4, 2, 1), strict=True):
-        result += share * np.array([feature[(c * stride) % width] for c in range(width)])
+        read = feature[::stride]
+        result += share * np.array([read[c % len(read)] for c in range(width)])
     return result
 
 

@@ -9,9 +9,11 @@ import torch
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.fitting import (
     MOST_LEVELS,
+    automatic_root_cell,
     bounding_range,
     distance_range,
     number_of_levels,
+    root_above,
     root_cell,
 )
 from crossgrad_backbones.levels.planting import planted, spacings, visible_share
@@ -69,18 +71,26 @@ def test_bounding_range_takes_all_axes_together():
 
 @pytest.mark.parametrize("edge", [0.3, 2.71, 16.77, 1e6])
 @pytest.mark.parametrize("levels", [1, 2, 4, 7])
-def test_automatic_root_cell_gives_the_level_below_the_middle_the_asked_size(edge, levels):
-    cell = root_cell(edge, levels, -1, 0.02)
+@pytest.mark.parametrize("fork", [2, 3])
+def test_the_level_below_the_middle_has_the_asked_size(edge, levels, fork):
+    cell = root_cell(edge, -1, root_above(0.02, levels, fork))
     halvings = math.log2(edge / cell)
     assert halvings == pytest.approx(round(halvings), abs=1e-9)
-    below_the_middle = cell / 2.0 ** (levels // 2 - 1)
+    below_the_middle = cell / float(fork) ** (levels // 2 - 1)
     assert below_the_middle * (1 + 1e-9) >= 0.02 / 2**0.5
     assert below_the_middle <= 0.02 * 2**0.5 * (1 + 1e-9)
 
 
+def test_the_automatic_root_cell_is_four_distances_between_points():
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.4, 0, 0], [0.7, 0, 0], [1.9, 0, 0]])
+    # To their nearest neighbours: 0.1, 0.1, 0.3, 0.3, 1.2.
+    assert automatic_root_cell(points) == pytest.approx(4 * 0.3)
+    assert automatic_root_cell(points[:1]) > 0.0
+
+
 def test_root_cell_of_a_given_layer_and_of_a_single_place():
-    assert root_cell(8.0, 5, 10, 0.02) == 8.0 / 1024
-    assert root_cell(0.0, 1, -1, 0.02) == root_cell(0.0, 1, 10, 0.02) == 0.02
+    assert root_cell(8.0, 10, 0.02) == 8.0 / 1024
+    assert root_cell(0.0, -1, 0.02) == root_cell(0.0, 10, 0.02) == 0.02
 
 
 def lattice(levels, origin=0.0, share=0.0):
@@ -88,26 +98,53 @@ def lattice(levels, origin=0.0, share=0.0):
     return Lattice.of(torch.tensor(numbers, dtype=torch.float64))
 
 
-def test_planting_rounds_to_every_level_once():
-    points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
-    positions, levels = planted(points, lattice(4, origin=-1.1))
-    expected = {
-        (level, *(round((x + 1.1) / (0.5 / 2**level)) for x in point))
-        for level in range(4)
-        for point in points.tolist()
+def sites_by_loops(points, levels, origin, everywhere):
+    """(level, x, y, z) of the sites, from the definition."""
+    site = {
+        (level, i): (level, *(round((x - origin) / (0.5 / 2**level)) for x in point))
+        for level in range(levels)
+        for i, point in enumerate(points.tolist())
     }
+    wanted = set()
+    for (level, i), own in site.items():
+        together = [
+            site[level, j]
+            for j in range(len(points))
+            if level > 0 and site[level - 1, j] == site[level - 1, i]
+        ]
+        if level == 0 or everywhere or any(other != own for other in together):
+            wanted.add(own)
+    return wanted
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_planting_rounds_to_every_level_once(everywhere):
+    points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
+    positions, levels = planted(points, lattice(4, origin=-1.1), everywhere=everywhere)
+    expected = sites_by_loops(points, 4, -1.1, everywhere)
     found = [
         (level, *(round((x + 1.1) / (0.5 / 2**level)) for x in position))
         for level, position in zip(levels.tolist(), positions.tolist(), strict=True)
     ]
     assert len(found) == len(expected) and set(found) == expected
+    assert (len(found) == len(sites_by_loops(points, 4, -1.1, True))) == everywhere
     assert levels.tolist() == sorted(levels.tolist())
 
 
-def test_one_point_gives_one_anchor_per_level():
-    positions, levels = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3))
-    assert levels.tolist() == [0, 1, 2]
+@pytest.mark.parametrize(("everywhere", "wanted"), [(False, [0]), (True, [0, 1, 2])])
+def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywhere, wanted):
+    positions, levels = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
+    assert levels.tolist() == wanted
     assert positions[0].tolist() == [0.0, 0.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("x", "wanted"), [((0.1, 0.2), [0, 1, 1]), ((0.01, 0.05), [0, 3, 3]), ((0.1, 0.1), [0])]
+)
+def test_levels_that_part_no_points_are_passed_over(x, wanted):
+    """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
+    points = np.array([[each, 0.0, 0.0] for each in x])
+    assert planted(points, lattice(4), everywhere=False)[1].tolist() == wanted
 
 
 def test_initial_scales_come_from_neighbours_of_the_same_level():

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from crossgrad_backbones.octree import Octree
+from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -44,7 +45,7 @@ def leveled(seed=0, **options):
     rng = np.random.default_rng(seed)
     scene = scene_of([1.0, 2.0, 4.0], rng.uniform(-0.1, 0.1, (60, 3)))
     options = {"offsets": 2, "feature": 4, "visible_threshold": -1.0, **options}
-    backbone = Octree(**{"middle_cell": 0.05, **options})
+    backbone = Octree(**{"middle_cell": 0.05, "plant_everywhere": True, **options})
     parameters = backbone.create(scene, rng)
     for name in ("features", "offsets"):
         parameters[name] = torch.from_numpy(rng.normal(size=parameters[name].shape)).float()
@@ -55,7 +56,7 @@ def leveled(seed=0, **options):
 
 def test_levels_and_lattice_of_a_scene_worked_out_by_hand():
     """Cameras 1 and 8 away from a single point: D = 8, d = 1, four levels."""
-    backbone = Octree(dist_ratio=1.0, base_layer=2, visible_threshold=0.0)
+    backbone = Octree(dist_ratio=1.0, base_layer=2, visible_threshold=0.0, plant_everywhere=True)
     scene = scene_of([1.0, 8.0], [[0.0, 0, 0], [1e-9, 0, 0]])
     parameters = backbone.create(scene, np.random.default_rng(0))
     lattice = Lattice.of(parameters["lattice"])
@@ -66,7 +67,7 @@ def test_levels_and_lattice_of_a_scene_worked_out_by_hand():
 
 
 def test_cameras_at_one_distance_need_one_level():
-    backbone = Octree(visible_threshold=-1.0)
+    backbone = Octree(visible_threshold=-1.0, middle_cell=0.005)
     scene = scene_of([2.0, 2.0, 2.0], [[0.0, 0, 0], [0.01, 0.02, 0], [0.0, 0.5, 0]])
     parameters = backbone.create(scene, np.random.default_rng(0))
     assert not parameters["levels"].any() and len(parameters["levels"]) == 3
@@ -239,17 +240,18 @@ def test_a_tensor_of_the_run_says_all_that_decoding_needs():
     assert not any(parameters[name].requires_grad for name in ("levels", "extra_levels", "lattice"))
 
 
-def test_no_visible_gaussian_to_start_from_is_told():
+@pytest.mark.parametrize("backbone", [Octree(), Scaffold()])
+def test_no_visible_gaussian_to_start_from_is_told(backbone):
     scene = sample_scene()
     faint = Vanilla().bake(
         Vanilla().create(scene, np.random.default_rng(0)), EVALUATION, [sample_camera()]
     )
     rng = np.random.default_rng(0)
-    started = Octree().adopt(faint, scene, rng)
+    started = backbone.adopt(faint, scene, rng)
     assert len(started["anchors"]) > 0
     faint = replace(faint, opacities=torch.full_like(faint.opacities, 1e-3))
     with pytest.raises(UserError, match="no point to start from"):
-        Octree().adopt(faint, scene, rng)
+        backbone.adopt(faint, scene, rng)
 
 
 def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_round():

@@ -1,42 +1,30 @@
 """What a backbone decodes, and its gradients, do not depend on the number of threads."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.registry import entries, load
-from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.fixtures import sample_camera, sample_phase
 from crossgrad_core.threads import configure_threads
 
-#: torch shares out what has more than 32,768 elements; a share that no vector length divides.
-ROWS = 40_001
 FIELDS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
-@pytest.fixture(autouse=True)
-def _threads():
-    before = configure_threads()
-    yield
-    configure_threads(before)
+pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
-@pytest.fixture(scope="module")
-def large_scene():
-    """The sample scene with many points, spread as its own are."""
-    scene, rng = sample_scene(), np.random.default_rng(0)
-    points = scene.points.mean(0) + scene.points.std(0) * rng.normal(size=(ROWS, 3))
-    colors = rng.integers(0, 256, (ROWS, 3), dtype=np.uint8)
-    return replace(scene, points=points, point_colors=colors)
-
-
-@pytest.mark.parametrize("name", entries("backbones"))
-def test_same_bits_on_any_number_of_threads(name, large_scene):
-    backbone, _ = load("backbones", name)().fitted_to(large_scene)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [*((name, {}) for name in entries("backbones")), ("scaffold", {"feature_bank": True})],
+)
+def test_same_bits_on_any_number_of_threads(name, options, large_scene):
+    backbone, _ = build("backbones", name, options).fitted_to(large_scene)
     trained = sorted(t for block in backbone.trained_blocks() for t in block.tensors)
     parameters = backbone.create(large_scene, np.random.default_rng(1))
     generator = torch.Generator().manual_seed(0)
+    if "extra_levels" in parameters:
+        parameters["extra_levels"] = torch.rand(len(parameters["levels"]), generator=generator)
     for tensor in trained:
         values = parameters[tensor].detach()
         noise = 0.3 * torch.randn(values.shape, generator=generator)

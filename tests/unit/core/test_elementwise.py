@@ -13,11 +13,7 @@ FUNCTIONS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _threads():
-    before = configure_threads()
-    yield
-    configure_threads(before)
+pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

@@ -48,7 +48,7 @@ def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
     schedule = Schedule.for_run(20_000)
     longer = schedule.lengthened(Schedule.for_run(40_000), 3000)
     assert (longer.total, longer.lr_steps, longer.densify_until) == (40_000, 40_000, 20_000)
-    for name in ("sh_interval", "densify_from", "densify_every", "reset_every", "prune_large_from"):
+    for name in ("sh_interval", "densify_from", "densify_every", "reset_every", "coarse_until"):
         assert getattr(longer, name) == getattr(schedule, name)
 
 
@@ -63,7 +63,20 @@ def test_density_control_ends_where_it_may_and_never_comes_back(step, until):
 def test_large_gaussians_are_never_pruned_without_a_reset_whatever_the_length():
     schedule = Schedule.for_run(9000).lengthened(Schedule.for_run(12_000), 100)
     assert schedule.reset_every is None
-    assert schedule.prune_large_from == 12_000
+    assert not any(schedule.prunes_large(step) for step in range(12_001))
+
+
+@pytest.mark.parametrize(("total", "mode"), [(20_000, "scaled"), (2500, "absolute")])
+def test_large_gaussians_are_pruned_after_the_first_reset_whatever_the_length(total, mode):
+    schedule = Schedule.for_run(total, mode).lengthened(Schedule.for_run(40_000, mode), 100)
+    first = next(step for step in range(1, 40_001) if schedule.resets(step))
+    assert not schedule.prunes_large(first) and schedule.prunes_large(first + 1)
+
+
+def test_the_coarse_phase_never_gets_longer():
+    schedule = Schedule.for_run(1000)
+    assert schedule.lengthened(Schedule.for_run(2000), 100).coarse_until == 250
+    assert schedule.lengthened(Schedule.for_run(800), 100).coarse_until == 200
 
 
 def test_learning_rate_is_log_linear_and_clipped():

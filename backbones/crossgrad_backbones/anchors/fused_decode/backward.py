@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept, Layer
-from crossgrad_backbones.anchors.fused_decode.forward import PANEL, STRETCH, array, stretches
+from crossgrad_backbones.anchors.fused_decode.forward import STRETCH, array, stretches
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
+from crossgrad_backbones.anchors.panels import product
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
 
@@ -66,7 +67,7 @@ class _Back:
             hidden = self.hidden[:rows]
             self._second(inputs, kept.hidden[part, mine], self.raw[:rows], hidden)
             layers.rectify_back(part.start, rows, begin, whole, buffer)
-            self.first[0][mine] += _product(hidden, kept.joined[part])
+            self.first[0][mine] += product(hidden, kept.joined[part])
             self.first[1][mine] += hidden.sum(0)
             owners = inputs.view.feature_rows[part]
             self.features.index_copy_(0, owners, hidden[:count] @ weight)
@@ -78,7 +79,7 @@ class _Back:
             weight = inputs.second[head][0]
             outputs = slice(at, at + len(weight))
             columns = slice(place * width, (place + 1) * width)
-            self.second[0][outputs] += _product(raw[:, outputs], hidden[:, columns])
+            self.second[0][outputs] += product(raw[:, outputs], hidden[:, columns])
             torch.mm(raw[:, outputs], weight, out=out[:, columns])
             at = outputs.stop
         self.second[1].add_(raw.sum(0))
@@ -91,16 +92,6 @@ class _Back:
         for head, weight, bias in zip(self.heads, weights, biases, strict=True):
             found[2 * head : 2 * head + 2] = weight, bias
         return found
-
-
-def _product(left: Tensor, right: Tensor) -> Tensor:
-    """[a, b] left [n, a] transposed times right [n, b], n a multiple of `PANEL`.
-
-    Panel by panel: the libraries split one long sum over as many threads as there are, which would
-    let the bits depend on their number.
-    """
-    first, second = (torch.unflatten(each, 0, (-1, PANEL)) for each in (left, right))
-    return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
+from crossgrad_backbones.anchors.panels import PANEL
 from crossgrad_core.elementwise import sigmoid_
 
-#: Anchors of a stretch; fixed, so that sums do not depend on the machine.
+#: Anchors of a stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
 STRETCH = 2048
-#: Hidden layers are padded to a multiple of so many rows; divides STRETCH.
-PANEL = 256
 
 
 def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
@@ -58,7 +57,7 @@ def array(tensor: Tensor) -> NDArray[Any]:
 
 
 def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
-    """Inputs and rectified hidden layers of the networks, padded: no inputs are 0."""
+    """Inputs and rectified hidden layers, padded to a multiple of `PANEL`: no inputs are 0."""
     weight, bias = inputs.first
     anchors = len(inputs.view.rows)
     joined = torch.empty(anchors + -anchors % PANEL, weight.shape[1])

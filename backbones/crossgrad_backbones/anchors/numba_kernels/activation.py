@@ -12,6 +12,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from crossgrad_backbones.anchors.heads import COVARIANCE
 from crossgrad_core.jit import kernel, parallel_kernel
 
 _Floats: TypeAlias = NDArray[np.float32]
@@ -19,8 +20,6 @@ _Ints: TypeAlias = NDArray[np.int64]
 
 #: Anchors that one thread takes at a time.
 SHARE = 256
-#: Numbers of a covariance: 3 scales, 4 of a quaternion.
-COVARIANCE = 7
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
