@@ -85,5 +85,6 @@ class Backbone(Component):
     ) -> Gaussians:
         """Plain SH Gaussians without a graph, for a standard PLY.
 
-        What depends on the view is baked as `cameras` (one or more) see it, on average.
+        What depends on the view is baked as `cameras` (one or more) see it: on average, or as a
+        rule of the backbone's says.
         """

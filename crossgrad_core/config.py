@@ -61,6 +61,9 @@ class RunConfig(BaseModel):
     densify_until: int | None = Field(None, ge=0, description="... and before this one")
     densify_every: int | None = Field(None, ge=1, description="steps between its edits")
     reset_every: int | None = Field(None, ge=1, description="steps between opacity resets")
+    sh_from: int | None = Field(
+        None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
+    )
     preset: Literal["default", "inria"] = "default"
     backward: Literal["separate", "joint"] = "separate"
     device: str = "cpu"

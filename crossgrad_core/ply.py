@@ -4,7 +4,7 @@ Source: 3DGS; the order `x y z nx ny nz f_dc f_rest opacity scale rot`, float32 
 `f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import floor, log10
 from pathlib import Path
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import atomic_file
-from crossgrad_core.ply_table import read_vertices
+from crossgrad_core.ply_table import read_vertices, vertex_properties
 from crossgrad_core.scene.types import Similarity
+from crossgrad_core.spherical import COEFFICIENTS
 from crossgrad_core.splat_cloud import REST, RenderMode, SplatCloud
 
 #: Property names in the order in which they are written.
@@ -134,6 +135,15 @@ def read_ply(path: Path) -> SplatCloud:
     )
 
 
+def sh_degree_of(path: Path) -> int:
+    """The SH degree that a PLY of Gaussians holds, from its header alone.
+
+    Raises:
+        UserError: Not a PLY file, or an unusual number of coefficients.
+    """
+    return COEFFICIENTS.index(1 + len(_rest_names(vertex_properties(path), path)) // 3)
+
+
 def _plain(value: float) -> str:
     """A number without exponent or needless digits; float(text) gives the same bits."""
     return np.format_float_positional(value, trim="-")
@@ -171,7 +181,7 @@ def _rows(cloud: SplatCloud, part: slice) -> NDArray[np.float32]:
     return np.concatenate([column.astype("<f4") for column in columns], axis=1)
 
 
-def _rest_names(columns: Mapping[str, NDArray[np.generic]], path: Path) -> list[str]:
+def _rest_names(columns: Collection[str], path: Path) -> list[str]:
     count = sum(name.startswith("f_rest_") for name in columns)
     names = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or any(name not in columns for name in names):

@@ -81,6 +81,20 @@ def read_vertices(path: Path) -> Vertices:
     raise UserError("PLY file without vertices", where=path, expected="an element called vertex")
 
 
+def vertex_properties(path: Path) -> tuple[str, ...]:
+    """Names of the properties of the element `vertex`, from the header alone.
+
+    Raises:
+        UserError: The file is missing or is not a PLY file.
+    """
+    if not path.is_file():
+        raise UserError("no such PLY file", where=path)
+    with path.open("rb") as file:
+        elements = _read_header(file, path).elements
+    fields = (each.fields or () for each in elements if each.name == "vertex")
+    return tuple(name for each in fields for name, _ in each)
+
+
 def _malformed(path: Path, found: str) -> UserError:
     return UserError("not a readable PLY file", where=path, found=found)
 

@@ -68,9 +68,9 @@ def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[T
 def apply_to_parameters(
     edit: Edit, blocks: tuple[Block, ...], parameters: Parameters
 ) -> Parameters:
-    """The parameters after an edit, as new leaf tensors that require gradients.
+    """The parameters after an edit: new leaf tensors that require gradients where the old ones did.
 
-    Tensors of blocks that are not per-primitive are passed on untouched.
+    What an edit does not change is passed on as the same object.
     """
     new = dict(parameters)
     for block in blocks:

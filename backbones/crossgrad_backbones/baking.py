@@ -28,9 +28,9 @@ def as_plain(
     3-D variances beforehand; at depth z a pixel is z / f local units wide. With S' for what is left
     of S, the opacity is multiplied by the ratio of footprints, sqrt(det S / det(S' + dilation)).
 
-    Of several cameras the one that sees a Gaussian finest decides. Means over the cameras thin out
-    and fade what is near to some and far from others: on boruszyn_kap (24 views, two regimes) they
-    cost 0.9 dB, this rule nothing. What no camera sees stays as it is.
+    Of several cameras the one that sees a Gaussian finest decides about its size, and the one that
+    it covers most densely about its opacity: means over the cameras would thin out and fade what is
+    near to some and far from others. What no camera sees stays as it is.
 
     Args:
         gaussians: Gaussians of another response.

@@ -78,6 +78,17 @@ class Octree(AnchorBackbone):
         )
 
     @override
+    def fitted_to(self, scene: Scene) -> tuple["Octree", tuple[str, ...]]:
+        """Says that anchors which repeat a coarser one are left out."""
+        if self.plant_everywhere:
+            return self, ()
+        note = (
+            "anchors that would repeat one of a coarser level are left out; "
+            "--set backbone.plant_everywhere=true plants them"
+        )
+        return self, (note,)
+
+    @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
         centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
         lattice = self._lattice(scene.points, centers)

@@ -107,6 +107,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.
     """
+    config = _with_first_degree(config)
     selection, notes = select(config, scene, reader)
     components = selection.components
     observers = {choice.name: _built("observers", choice) for choice in config.observers}
@@ -129,6 +130,19 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         notes=tuple(notes),
     )
     return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
+
+
+def _with_first_degree(config: RunConfig) -> RunConfig:
+    """The configuration that says at which SH degree the run starts.
+
+    Written down, so that a run goes on without the file that it started from.
+    """
+    init = config.reading.init
+    if config.sh_from is not None or init in {"points", "random"}:
+        return config
+    from crossgrad_core.ply import sh_degree_of
+
+    return config.model_copy(update={"sh_from": sh_degree_of(Path(init))})
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
@@ -178,7 +192,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
 
 def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
-    names = ("densify_from", "densify_until", "densify_every", "reset_every")
+    names = ("densify_from", "densify_until", "densify_every", "reset_every", "sh_from")
     given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
     return replace(densifier.window(Schedule.for_run(steps, config.schedule)), **given)
 

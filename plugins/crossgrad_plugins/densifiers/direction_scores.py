@@ -13,7 +13,7 @@ PLANES = 5
 def ndc_directions(record: ViewRecord) -> Tensor:
     """[6, 5, N] `Screen.directions` with the absolute gradients per NDC unit; bins, then fields.
 
-    With the Gaussians last, sums over bins are sums of whole rows: ten times faster on the CPU.
+    With the Gaussians last, sums over bins are sums of whole rows: much faster on the CPU.
     """
     directions = record.screen.directions
     if directions is None:

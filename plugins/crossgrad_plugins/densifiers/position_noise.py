@@ -36,7 +36,7 @@ def position_noise(
     log_scales = parameters["scales"].detach()
     opacity = sigmoid(parameters["opacities"].detach())
     factor = strength * sigmoid(GATE_STEEPNESS * (GATE_OPACITY - opacity))
-    # Column by column: reducing rows of three is ten times slower on the CPU.
+    # Column by column: reducing rows of three is much slower on the CPU.
     a, b, c = log_scales.unbind(1)
     largest = torch.exp(torch.maximum(torch.maximum(a, b), c))
     rows = (factor * largest > NEGLIGIBLE).nonzero().squeeze(1)

@@ -113,8 +113,10 @@ def scene(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("backbone", ["analytic", "mip", "distance"])
-def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(backbone, scene, tmp_path):
+@pytest.mark.parametrize(("backbone", "most"), [("analytic", 0.02), ("mip", 0.02), ("distance", 0)])
+def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(
+    backbone, most, scene, tmp_path
+):
     config = RunConfig(scene=str(scene), steps=150, backbone=ComponentChoice(name=backbone))
     setup = assemble(config, read_scene(config, scene)[0], "colmap")
     state = first_state(setup)
@@ -123,4 +125,4 @@ def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(backbone, sc
     for view in (setup.train_views[0], setup.scene.test_views[0]):
         exported = export_ply(setup, state, tmp_path / "baked.ply", view.name)
         assert exported.live_psnr > 14.0
-        assert exported.loss < 0.5
+        assert abs(exported.loss) <= most

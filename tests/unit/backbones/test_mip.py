@@ -9,12 +9,16 @@ import torch
 
 from crossgrad_backbones.mip import MipSplatting, renews
 from crossgrad_backbones.smoothing import filter_widths, smoothed
+from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contexts import AfterStepContext
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene, step_fields
 from crossgrad_core.testing.gaussians import posed_camera
 from crossgrad_core.topology import Edit, apply_to_parameters
+from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.edits import apply_edit
+from crossgrad_core.training.start import first_state
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 NEAR = 1e-3
@@ -184,9 +188,10 @@ def test_a_renewal_is_an_edit_of_the_filter_alone():
 
 
 def test_an_edit_is_followed_by_a_new_filter():
-    parameters = created(MipSplatting())
-    edit = Edit(source=torch.tensor([3, 3, 5]))
-    left = apply_to_parameters(edit, MipSplatting().blocks(), parameters)
-    left["filter"] = torch.full((3,), 9.0)
-    prepared = MipSplatting().prepare(left, sample_scene(), sample_phase())
-    assert torch.equal(prepared["filter"], parameters["filter"][[3, 3, 5]])
+    config = RunConfig(steps=10, backbone=ComponentChoice(name="mip"))
+    setup = assemble(config, sample_scene(), "none")
+    state = first_state(setup)
+    before = state.parameters["filter"].clone()
+    state.parameters["filter"] = torch.full_like(before, 9.0)
+    assert apply_edit(setup, state, Edit(source=torch.tensor([3, 3, 5])))
+    assert torch.equal(state.parameters["filter"], before[[3, 3, 5]])

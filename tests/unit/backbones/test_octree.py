@@ -261,3 +261,8 @@ def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_roun
         config = {"backbone": {"name": other}, "densifier": {"name": "octree"}, "steps": 200}
         with pytest.raises(IncompatibleSelectionError, match="lattice"):
             assemble(RunConfig.model_validate(config), sample_scene(), "none")
+
+
+def test_what_is_left_out_is_told():
+    assert "plant_everywhere=true" in Octree().fitted_to(sample_scene())[1][0]
+    assert Octree(plant_everywhere=True).fitted_to(sample_scene())[1] == ()

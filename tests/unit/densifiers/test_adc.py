@@ -6,13 +6,16 @@ from math import log
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from crossgrad_backbones.mip import MipSplatting
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contexts import DensifyContext, ViewRecord
 from crossgrad_core.gaussians import Gaussians, Screen
 from crossgrad_core.scene.types import Camera, View
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.state import PluginState
+from crossgrad_core.testing.fixtures import sample_phase, sample_scene
 from crossgrad_core.topology import NO_EDIT, apply_to_parameters
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 
@@ -40,15 +43,15 @@ def record(gradient, radii, origin=None):
     return ViewRecord(0, view, None, 0.1, replace(gaussians, origin=origin), screen, torch.zeros(3))
 
 
-def context(views, *, step, params=None, room=100, rng=0):
+def context(views, *, step, params=None, room=100, rng=0, backbone=None):
     return DensifyContext(
         step=step,
         schedule=SCHEDULE,
-        scene=None,
+        scene=sample_scene(),
         states={},
         rng=np.random.default_rng(rng),
         parameters=params or parameters(),
-        backbone=Vanilla(),
+        backbone=backbone or Vanilla(),
         rasterizer=None,
         views=tuple(views),
         means_lr=1e-4,
@@ -91,9 +94,27 @@ def test_small_ones_are_cloned_large_ones_split_and_statistics_reset():
     new = apply_to_parameters(edit, Vanilla().blocks(), params)
     assert torch.equal(new["means"][3], params["means"][0])
     assert new["scales"][4, 0].item() == pytest.approx(log(0.02 / 1.6))
-    offset = (new["means"][4:] - params["means"][1]).abs()
-    assert 0 < offset.max() < 6 * 0.02
     assert float(state.per_primitive["renders"].sum()) == 0
+
+
+def test_children_are_drawn_from_their_parent():
+    """mean + R (s n) with n standard normal, on a turned and stretched parent."""
+    rng = np.random.default_rng(5)
+    params = parameters()
+    with torch.no_grad():
+        params["scales"][1] = torch.tensor([0.02, 0.05, 0.011]).log()
+        params["quats"][1] = torch.from_numpy(rng.normal(size=4)).float()
+    view = record([STILL, MOVING, STILL, STILL], [1] * 4)
+    edit, _ = AdaptiveDensityControl().densify(
+        context([view], step=600, params=params, rng=3), PluginState()
+    )
+    new = apply_to_parameters(edit, Vanilla().blocks(), params)
+    draws = np.random.default_rng(3).standard_normal((2, 3))
+    turn = Rotation.from_quat(np.roll(params["quats"][1].detach().double().numpy(), -1))
+    offsets = turn.apply(np.array([0.02, 0.05, 0.011]) * draws)
+    found = (new["means"][-2:] - params["means"][1]).detach().numpy()
+    assert found == pytest.approx(offsets, rel=1e-4, abs=2e-6)
+    assert edit.source.tolist()[-2:] == [1, 1]
 
 
 def test_faint_ones_are_pruned_and_large_ones_only_after_the_first_reset():
@@ -126,6 +147,27 @@ def test_reset_caps_opacity_and_forgets_its_moments():
     opacities = torch.sigmoid(edit.values["opacities"].values)
     assert opacities.tolist() == pytest.approx([0.01, 0.006, 0.01, 0.01])
     assert not edit.values["opacities"].keep_moments
+
+
+def test_a_reset_that_comes_with_an_edit_caps_what_is_then_drawn():
+    """The filter of backbone mip depends on where the children are."""
+    backbone = MipSplatting()
+    rng = np.random.default_rng(0)
+    params = backbone.create(sample_scene(), rng)
+    rows = len(params["means"])
+    with torch.no_grad():
+        params["means"] *= 2.0
+        params["scales"][: rows // 2] = log(0.05)
+        params["scales"][rows // 2 :] = log(0.002)
+        params["opacities"][:] = 3.0
+    view = record([MOVING] * (rows // 2) + [STILL] * (rows - rows // 2), [1] * rows)
+    ctx = context([view], step=3000, params=params, backbone=backbone, room=10**6)
+    edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
+    assert edit.counts["split"] == rows // 2 and edit.counts["reset"] > 0
+    after = apply_to_parameters(edit, backbone.blocks(), params)
+    after = backbone.prepare(after, sample_scene(), sample_phase())
+    drawn = backbone.splats(after, 0).opacities
+    assert drawn.max().item() == pytest.approx(0.01, rel=1e-5)
 
 
 def test_nothing_happens_between_the_edits_and_after_the_end():

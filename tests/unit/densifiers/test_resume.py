@@ -1,5 +1,7 @@
 """A run that is interrupted between any two steps goes on to the same bits."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -14,6 +16,9 @@ from crossgrad_core.training.start import first_state
 
 #: Options with which each densifier edits the small scene of the tests.
 OPTIONS = {
+    "adc": {"grad_threshold": 1e-6, "split_scale": 1e-3},
+    "absgrad": {"grad_threshold": 1e-6, "abs_threshold": 1e-6, "split_scale": 1e-3},
+    "pixel": {"grad_threshold": 1e-6, "split_scale": 1e-3},
     "anchor": {"success_threshold": 0, "coarsest": 1},
     "octree": {"success_threshold": 0},
     "mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4},
@@ -25,6 +30,10 @@ BACKBONES = {
     "anchor": {"name": "scaffold", "voxel_size": 1e-5},
     "octree": {"name": "octree", "middle_cell": 1e-5},
 }
+
+
+#: What density control counts where it edits.
+EDITS = {"cloned", "split", "pruned", "grown", "added", "relocated"}
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -49,9 +58,34 @@ def test_a_checkpoint_changes_nothing(tmp_path, name, stop):
     second = from_checkpoint(setup, load(latest(tmp_path)))
     edited = 0
     for _ in range(7 - stop):
-        edited += any(timed_step(setup, second).counts.values())
-    assert edited
-    for block, tensor in whole.parameters.items():
-        assert torch.equal(tensor, second.parameters[block]), block
-    for block, moment in whole.adam.exp_avg.items():
-        assert torch.equal(moment, second.adam.exp_avg[block]), block
+        counts = timed_step(setup, second).counts
+        edited += sum(counts.get(kind, 0) for kind in EDITS)
+    assert edited > 0
+    assert_same(whole.parameters, second.parameters)
+    assert_same(whole.adam.exp_avg, second.adam.exp_avg)
+    assert_same(whole.adam.exp_avg_sq, second.adam.exp_avg_sq)
+    assert whole.adam.steps == second.adam.steps
+    assert whole.states.keys() == second.states.keys()
+    for plugin, state in whole.states.items():
+        assert state.values == second.states[plugin].values
+        assert_same(state.tensors, second.states[plugin].tensors)
+        assert_same(state.per_primitive, second.states[plugin].per_primitive)
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, tensor in one.items():
+        assert torch.equal(tensor, other[name]), name
+
+
+def test_what_plugins_remember_follows_the_run_to_its_device(tmp_path):
+    """The device `meta` holds no numbers, and no machine lacks it."""
+    config = RunConfig(steps=10, densify_from=1, densify_until=9)
+    setup = assemble(config, sample_scene(), "none")
+    state = first_state(setup)
+    timed_step(setup, state)
+    save(tmp_path, to_checkpoint(state), Keep(every=None))
+    moved = from_checkpoint(replace(setup, device=torch.device("meta")), load(latest(tmp_path)))
+    held = [*moved.parameters.values(), *moved.adam.exp_avg.values()]
+    statistics = [t for each in moved.states.values() for t in each.per_primitive.values()]
+    assert statistics and all(tensor.device.type == "meta" for tensor in [*held, *statistics])

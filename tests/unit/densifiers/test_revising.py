@@ -228,7 +228,9 @@ def test_with_resets_no_opacity_is_lowered_between_them():
 
 def test_nothing_happens_between_edits():
     assert edit_of(context(step=601)) == NO_EDIT
-    assert edit_of(context(step=28_000)) == NO_EDIT
+    window = RevisingDensification().window(Schedule.for_run(30_000))
+    last, over = (replace(context(step=step), schedule=window) for step in (26_900, 27_000))
+    assert edit_of(last) != NO_EDIT and edit_of(over) == NO_EDIT
 
 
 def test_a_run_grows_and_lowers_opacities():

@@ -1,0 +1,59 @@
+"""Runs that start from the Gaussians of a file."""
+
+import pytest
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.testing.fixtures import sample_camera, sample_scene
+from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.budget import lengthened
+from crossgrad_core.training.export import export_ply
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.resolve import resolved
+from crossgrad_core.training.start import first_state
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of some steps with all SH bands, and the file that it wrote."""
+    setup = assemble(RunConfig(steps=1000), sample_scene(), "none")
+    state = first_state(setup)
+    state.step = 3 * setup.schedule.sh_interval
+    for _ in range(3):
+        timed_step(setup, state)
+    path = tmp_path_factory.mktemp("start") / "point_cloud.ply"
+    export_ply(setup, state, path)
+    return setup, state, path
+
+
+def decoded(setup, state):
+    phase = setup.phase(state.step, training=True)
+    return setup.backbone.decode(state.parameters, sample_camera(), phase)
+
+
+def test_it_begins_with_all_bands_of_the_file(trained):
+    setup, state, path = trained
+    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": str(path)}})
+    again = assemble(config, sample_scene(), "none")
+    ours, wanted = decoded(again, first_state(again)), decoded(setup, state)
+    assert ours.sh_degree == wanted.sh_degree == again.backbone.sh_degree > 0
+    assert torch.equal(ours.sh_rest, wanted.sh_rest) and ours.sh_rest.abs().max() > 0
+    assert torch.allclose(ours.means, wanted.means, atol=1e-6)
+    assert torch.allclose(ours.opacities, wanted.opacities, atol=1e-6)
+    assert lengthened(again, 10, 2000).schedule.sh_from == 3
+
+
+def test_it_goes_on_and_is_repeated_without_the_file(trained, tmp_path):
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes(trained[2].read_bytes())
+    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": str(copy)}})
+    written = resolved(assemble(config, sample_scene(), "none"))
+    copy.unlink()
+    assert written.sh_from == 3
+    assert assemble(written, sample_scene(), "none").schedule.sh_from == 3
+
+
+@pytest.mark.parametrize(("asked", "degree"), [(None, 0), (2, 2)])
+def test_points_begin_with_the_degree_that_is_asked_for(asked, degree):
+    setup = assemble(RunConfig(steps=1000, sh_from=asked), sample_scene(), "none")
+    assert decoded(setup, first_state(setup)).sh_degree == degree
