@@ -15,7 +15,7 @@ Parameters: TypeAlias = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class LearningRate:
-    """A log-linear learning rate from `initial` to `final` over the schedule's length.
+    """A log-linear learning rate from `initial` to `final` over the schedule's length; 0 stays 0.
 
     Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
     """
@@ -25,7 +25,7 @@ class LearningRate:
 
     def at(self, progress: float) -> float:
         """The rate when a share `progress` of the schedule is over (clipped to [0, 1])."""
-        if self.final is None or self.final == self.initial:
+        if self.final is None or self.initial in {0.0, self.final}:
             return self.initial
         u = min(max(progress, 0.0), 1.0)
         return exp((1.0 - u) * log(self.initial) + u * log(self.final))

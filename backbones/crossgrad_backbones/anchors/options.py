@@ -29,10 +29,13 @@ class AnchorOptions(Backbone):
     lr_offsets: float = Field(0.01, gt=0, description="initial, per scene extent")
     lr_offsets_final: float = Field(1e-4, gt=0, description="final, per scene extent")
     lr_features: float = Field(0.0075, ge=0, description="learning rate of the features")
+    lr_features_final: float | None = Field(None, gt=0, description="None: constant, as published")
     lr_scales: float = Field(0.007, ge=0, description="learning rate of the log scales")
+    lr_scales_final: float | None = Field(None, gt=0, description="None: constant, as published")
     lr_opacity: float = Field(0.002, gt=0, description="initial, network of the opacity")
     lr_opacity_final: float = Field(2e-5, gt=0, description="final, network of the opacity")
     lr_cov: float = Field(0.004, ge=0, description="network of the covariance")
+    lr_cov_final: float | None = Field(None, gt=0, description="None: constant, as published")
     lr_color: float = Field(0.008, gt=0, description="initial, network of the colour")
     lr_color_final: float = Field(5e-5, gt=0, description="final, network of the colour")
     lr_bank: float = Field(0.01, gt=0, description="initial, feature bank")
@@ -50,17 +53,19 @@ class AnchorOptions(Backbone):
     def blocks(self) -> tuple[Block, ...]:
         rates = {
             "mlp_opacity": LearningRate(self.lr_opacity, self.lr_opacity_final),
-            "mlp_cov": LearningRate(self.lr_cov),
+            "mlp_cov": LearningRate(self.lr_cov, self.lr_cov_final),
             "mlp_color": LearningRate(self.lr_color, self.lr_color_final),
             "mlp_bank": LearningRate(self.lr_bank, self.lr_bank_final),
         }
         kinds: dict[str, BlockKind] = {"mlp_cov": "geometry", "mlp_bank": "neutral"}
         offsets = LearningRate(self.lr_offsets, self.lr_offsets_final)
+        features = LearningRate(self.lr_features, self.lr_features_final)
+        scales = LearningRate(self.lr_scales, self.lr_scales_final)
         return (
             Block("anchors", ("anchors",), True, "geometry", _FROZEN),
             Block("offsets", ("offsets",), True, "geometry", offsets),
-            Block("features", ("features",), True, "neutral", LearningRate(self.lr_features)),
-            Block("scales", ("scales",), True, "geometry", LearningRate(self.lr_scales)),
+            Block("features", ("features",), True, "neutral", features),
+            Block("scales", ("scales",), True, "geometry", scales),
             *(n.block(kinds.get(n.name, "appearance"), rates[n.name]) for n in self.heads.networks),
             Block("voxel_size", ("voxel_size",), False, "geometry", _FROZEN),
             *self._appearance_blocks(),

@@ -98,6 +98,15 @@ def test_published_learning_rates():
         assert (rates[name].at(0.0), rates[name].at(1.0)) == pytest.approx((first, last))
 
 
+def test_rates_that_are_published_as_constant_may_end_lower():
+    finals = {"lr_features_final": 1e-4, "lr_scales_final": 2e-4, "lr_cov_final": 3e-4}
+    rates = {b.name: b.lr.at(1.0) for b in Scaffold(**finals).blocks()}
+    names = ("features", "scales", "mlp_cov")
+    assert [rates[name] for name in names] == pytest.approx([1e-4, 2e-4, 3e-4])
+    frozen = {b.name: b.lr for b in Scaffold(lr_features=0.0, lr_features_final=1e-4).blocks()}
+    assert frozen["features"].at(0.5) == 0.0
+
+
 def test_a_training_view_has_its_own_code_and_any_other_the_mean():
     backbone = Scaffold(appearance=3)
     parameters = backbone.create(SCENE, np.random.default_rng(0))
