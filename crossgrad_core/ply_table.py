@@ -68,8 +68,7 @@ def read_vertices(path: Path) -> Vertices:
     Raises:
         UserError: The file is missing, is not a PLY file, has no vertices or ends too early.
     """
-    if not path.is_file():
-        raise UserError("no such PLY file", where=path)
+    _require_file(path)
     with path.open("rb") as file:
         header = _read_header(file, path)
         before: list[Element] = []
@@ -87,12 +86,21 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
     Raises:
         UserError: The file is missing or is not a PLY file.
     """
-    if not path.is_file():
-        raise UserError("no such PLY file", where=path)
+    _require_file(path)
     with path.open("rb") as file:
         elements = _read_header(file, path).elements
     fields = (each.fields or () for each in elements if each.name == "vertex")
     return tuple(name for each in fields for name, _ in each)
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise UserError(
+            "no such PLY file",
+            where=path,
+            found="a folder" if path.is_dir() else "nothing",
+            todo="check the path",
+        )
 
 
 def _malformed(path: Path, found: str) -> UserError:
