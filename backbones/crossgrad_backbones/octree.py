@@ -13,7 +13,7 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
 from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
-from crossgrad_backbones.levels.planting import planted, spacings, visible_share
+from crossgrad_backbones.levels.planting import planted, visible_share
 from crossgrad_core.blocks import Block, LearningRate, Parameters
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.lattice import Lattice
@@ -92,17 +92,16 @@ class Octree(AnchorBackbone):
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
         centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
         lattice = self._lattice(scene.points, centers)
-        positions, levels = planted(scene.points, lattice, everywhere=self.plant_everywhere)
-        shares = lattice.shares(positions, levels, torch.from_numpy(centers))
+        anchors = planted(scene.points, lattice, everywhere=self.plant_everywhere)
+        shares = lattice.shares(anchors.positions, anchors.levels, torch.from_numpy(centers))
         lattice = lattice.weeding(visible_share(shares, self.visible_threshold))
-        lasting = lattice.lasting(shares)
-        positions, levels = positions[lasting], levels[lasting]
+        anchors = anchors.kept(lattice.lasting(shares))
         finest = float(lattice.cells(lattice.levels - 1))
-        spacing = spacings(positions.numpy(), levels.numpy(), lattice.count)
+        positions, spacings = anchors.positions.numpy(), anchors.spacings.numpy()
         return {
-            **self.created(positions.numpy(), spacing, finest, scene, rng),
-            "levels": levels,
-            "extra_levels": torch.zeros(len(levels)),
+            **self.created(positions, spacings, finest, scene, rng),
+            "levels": anchors.levels,
+            "extra_levels": torch.zeros(len(anchors.levels)),
             "lattice": lattice.packed(),
         }
 
@@ -114,6 +113,7 @@ class Octree(AnchorBackbone):
         if self.middle_cell is not None:
             wanted = fitting.root_above(self.middle_cell, levels, self.fork)
         cell = fitting.root_cell(edge, self.base_layer, wanted)
+        levels = fitting.resolvable_levels(levels, self.fork, cell, float(np.abs(points).max()))
         scalars = (cell, self.fork, levels, largest, _LEADS[self.rounding], 0.0)
         return Lattice.of(torch.tensor([corner, corner, corner, *scalars], dtype=torch.float64))
 

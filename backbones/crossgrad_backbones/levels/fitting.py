@@ -1,14 +1,16 @@
 """How many levels of detail a scene needs, and how coarse the coarsest is."""
 
-from math import log, log2
+from math import floor, log, log2
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size
 
-#: Finer lattices than this would be below the resolution of float32 positions.
+#: More levels than anybody needs.
 MOST_LEVELS = 16
+#: The least edge of a cell, largest coordinates: float32 positions round to half of 2^-23 of them.
+RESOLUTION = 2.0**-20
 #: Limits of the initial points are moved away from 0 by this factor (Octree-GS).
 BOX_FACTOR = 1.1
 
@@ -82,3 +84,18 @@ def root_cell(edge: float, base_layer: int, wanted: float) -> float:
     if base_layer < 0:
         base_layer = round(log2(edge / wanted))
     return edge * 2.0**-base_layer
+
+
+def resolvable_levels(levels: int, fork: int, cell: float, reach: float) -> int:
+    """How many of the levels have cells that float32 positions can tell apart, at least 1.
+
+    Args:
+        levels: Wanted.
+        fork: Cells of the next level along an edge.
+        cell: Edge of a cell of level 0, local units.
+        reach: Largest coordinate of a point, local units.
+    """
+    if reach <= 0.0:
+        return levels
+    finer = floor(log(cell / (RESOLUTION * reach)) / log(fork))
+    return max(1, min(levels, 1 + finer))

@@ -13,10 +13,11 @@ from crossgrad_backbones.levels.fitting import (
     bounding_range,
     distance_range,
     number_of_levels,
+    resolvable_levels,
     root_above,
     root_cell,
 )
-from crossgrad_backbones.levels.planting import planted, spacings, visible_share
+from crossgrad_backbones.levels.planting import planted, visible_share
 from crossgrad_core.lattice import Lattice
 
 
@@ -120,7 +121,8 @@ def sites_by_loops(points, levels, origin, everywhere):
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_planting_rounds_to_every_level_once(everywhere):
     points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
-    positions, levels = planted(points, lattice(4, origin=-1.1), everywhere=everywhere)
+    anchors = planted(points, lattice(4, origin=-1.1), everywhere=everywhere)
+    positions, levels = anchors.positions, anchors.levels
     expected = sites_by_loops(points, 4, -1.1, everywhere)
     found = [
         (level, *(round((x + 1.1) / (0.5 / 2**level)) for x in position))
@@ -133,9 +135,9 @@ def test_planting_rounds_to_every_level_once(everywhere):
 
 @pytest.mark.parametrize(("everywhere", "wanted"), [(False, [0]), (True, [0, 1, 2])])
 def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywhere, wanted):
-    positions, levels = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
-    assert levels.tolist() == wanted
-    assert positions[0].tolist() == [0.0, 0.0, 0.5]
+    anchors = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
+    assert anchors.levels.tolist() == wanted
+    assert anchors.positions[0].tolist() == [0.0, 0.0, 0.5]
 
 
 @pytest.mark.parametrize(
@@ -144,18 +146,33 @@ def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywher
 def test_levels_that_part_no_points_are_passed_over(x, wanted):
     """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
     points = np.array([[each, 0.0, 0.0] for each in x])
-    assert planted(points, lattice(4), everywhere=False)[1].tolist() == wanted
+    assert planted(points, lattice(4), everywhere=False).levels.tolist() == wanted
 
 
-def test_initial_scales_come_from_neighbours_of_the_same_level():
-    rng = np.random.default_rng(4)
-    positions, levels = rng.uniform(-1, 1, (40, 3)), rng.integers(0, 3, 40)
-    levels[levels == 2] = 3
-    found = spacings(positions, levels, 4)
-    for i in range(40):
-        same = [j for j in range(40) if levels[j] == levels[i] and j != i]
-        nearest = sorted(math.dist(positions[i], positions[j]) ** 2 for j in same)[:3]
-        assert found[i] == pytest.approx(math.sqrt(sum(nearest) / 3))
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_initial_scales_come_from_the_sites_of_the_same_level_planted_or_not(everywhere):
+    points = np.random.default_rng(4).uniform(-1, 1, (60, 3))
+    anchors = planted(points, lattice(4), everywhere=everywhere)
+    assert anchors.levels.max() == 3
+    sites = planted(points, lattice(4), everywhere=True)
+    for position, level, found in zip(*(t.tolist() for t in vars(anchors).values()), strict=True):
+        same = sites.positions[sites.levels == level].tolist()
+        nearest = sorted(math.dist(position, other) ** 2 for other in same)[1:4]
+        assert found == pytest.approx(math.sqrt(sum(nearest) / 3))
+
+
+@pytest.mark.parametrize("fork", [2, 3])
+@pytest.mark.parametrize("reach", [0.5, 12.0, 1e4])
+def test_cells_of_the_finest_level_are_told_apart_by_float32(fork, reach):
+    levels = resolvable_levels(16, fork, 1e-3, reach)
+    cell = 1e-3 / fork ** (levels - 1)
+    if levels > 1:
+        places = np.arange(1, 1001) * cell + (reach - 1001 * cell)
+        found = np.round((places.astype(np.float32).astype(float) - places[0]) / cell)
+        assert found.tolist() == list(range(1000))
+        assert cell / fork < 2.0**-20 * reach or levels == 16
+    assert resolvable_levels(3, fork, 0.5, 1.0) == 3
+    assert resolvable_levels(3, fork, 0.5, 0.0) == 3
 
 
 def test_automatic_visible_share_is_the_mean():
