@@ -29,7 +29,7 @@ def fitted(image: NDArray[np.float64], photo: NDArray[np.float64]) -> NDArray[np
     for own, wanted in zip(image.reshape(-1, 3).T, photo.reshape(-1, 3).T, strict=True):
         rows = np.stack([own, np.ones_like(own)], axis=1)
         channels.append(rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0])
-    return np.stack(channels, axis=1).reshape(image.shape)
+    return np.stack(channels, axis=1).reshape(image.shape).clip(0.0, 1.0)
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
         draw = renderer(setup, state)
         found = []
         for view in setup.scene.test_views:
-            image = draw(view).detach().double().clamp(0.0, 1.0).numpy()
+            image = draw(view).detach().cpu().double().clamp(0.0, 1.0).numpy()
             photo = view.photo.image().numpy() / 255.0
             found.append((psnr(image, photo), psnr(fitted(image, photo), photo)))
         plain, corrected = (mean(each) for each in zip(*found, strict=True))

@@ -214,7 +214,7 @@ def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
             found=f"all {setup.schedule.total} steps done",
             todo="start a new run; --init point_cloud.ply starts from its Gaussians",
         )
-    state.clock.compile += warm_up(setup)
+    state.clock.compile += warm_up(setup, state)
     session = Session.resumed(folder, setup, state.step)
     return _train(setup, state, session, Planned(setup.config.revisions))
 
@@ -250,6 +250,8 @@ def opened(
         )
     stored = yaml.safe_load(path.read_text(encoding="utf-8"))
     stored.pop("stop_after", None)
+    # The degree that a run started with is written down; where it is not, it was 0.
+    stored["sh_from"] = stored.get("sh_from") or 0
     config = parsed({**stored, **settings})
     setup, seconds = _setup(config, verbosity)
     state = from_checkpoint(setup, checkpoint)

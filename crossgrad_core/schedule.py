@@ -60,7 +60,10 @@ class Schedule:
         published numbers whatever the length.
         """
         if mode == "absolute":
-            return cls(mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500, 100, 7500)
+            coarse = min(REFERENCE_STEPS // 4, total // 2)
+            return cls(
+                mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500, 100, coarse
+            )
         return cls(
             mode=mode,
             total=total,

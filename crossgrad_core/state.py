@@ -46,6 +46,8 @@ class PluginState:
 
 def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     """Rows of `old` at `source` [M], with the rows marked in `fresh` [M] set to zero."""
+    # A plugin may keep its numbers elsewhere than the run does.
+    source, fresh = source.to(old.device), fresh.to(old.device)
     new = old[source]
     new[fresh] = torch.zeros((), dtype=old.dtype, device=old.device)
     return new

@@ -22,6 +22,9 @@ def resolved(setup: Setup) -> RunConfig:
     if "grouping" in components:
         chosen["grouping"] = _choice(names["grouping"], components["grouping"])
     scene = None if config.scene is None else Path(config.scene).resolve()
+    init = config.reading.init
+    if init not in {"points", "random"}:
+        init = str(Path(init).resolve())
     return config.model_copy(
         update={
             **chosen,
@@ -29,6 +32,7 @@ def resolved(setup: Setup) -> RunConfig:
             "reader": ComponentChoice(name=names["reader"]),
             "observers": tuple(c for c in config.observers if c.name != "progress"),
             "scene": scene,
+            "reading": config.reading.model_copy(update={"init": init}),
             "out": None,
             "views": selection.views_per_step,
             "steps": config.steps or setup.schedule.total,

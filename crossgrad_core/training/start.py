@@ -1,5 +1,6 @@
 """The first state of a run, and compiling what it needs."""
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -58,8 +59,16 @@ def unwatched(setup: Setup) -> Setup:
     return replace(setup, manager=make_manager(components), plugins=components)
 
 
-def warm_up(setup: Setup) -> float:
-    """Compiles every kernel that the run will need, on a throw-away state; seconds it took."""
+def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
+    """Compiles every kernel that the run will need, on throw-away states.
+
+    Args:
+        setup: The run.
+        reached: The state of a resumed run, which stays as it is.
+
+    Returns:
+        The seconds that it took.
+    """
     start = perf_counter()
     setup = unwatched(setup)
     steps = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
@@ -71,7 +80,7 @@ def warm_up(setup: Setup) -> float:
         steps.append(setup.schedule.first_edit - 1)
     for step in steps:
         if step < setup.schedule.total:
-            state = first_state(setup)
+            state = first_state(setup) if reached is None else deepcopy(reached)
             state.step = step
             timed_step(setup, state)
     return perf_counter() - start

@@ -130,6 +130,18 @@ def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_p
     assert (tmp_path / "parts" / "config.yaml").read_bytes() == written
 
 
+def test_a_run_that_started_from_a_file_goes_on_without_it(scene, tmp_path):
+    run(scene, tmp_path / "source", steps=3)
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_bytes((tmp_path / "source" / "point_cloud.ply").read_bytes())
+    settings = {"steps": 12, "reading": {"init": str(cloud)}}
+    run(scene, tmp_path / "whole", **settings)
+    run(scene, tmp_path / "parts", stop_after=5, **settings)
+    cloud.unlink()
+    assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
+    assert same(parameters(tmp_path / "whole"), parameters(tmp_path / "parts"))
+
+
 def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):
     from crossgrad_core.training.setup import Setup
 

@@ -158,9 +158,10 @@ class CloneSplit(Densifier):
     def _with_reset(self, context: DensifyContext, edit: Edit) -> Edit:
         backbone = context.backbone
         after = apply_to_parameters(edit, backbone.blocks(), context.parameters)
-        # Derived tensors are stale after an edit, and the cap may depend on them.
-        phase = Phase(context.step, training=True, schedule=context.schedule)
-        after = backbone.prepare(after, context.scene, phase)
+        if edit.source is not None:
+            # The backbone will renew derived tensors, and the cap may depend on them.
+            phase = Phase(context.step, training=True, schedule=context.schedule)
+            after = backbone.prepare(after, context.scene, phase)
         capped = backbone.capped_opacities(after, self.reset_opacity)
         values = {**edit.values, "opacities": Rows(capped)}
         return replace(edit, values=values, counts={**edit.counts, "reset": capped.shape[0]})

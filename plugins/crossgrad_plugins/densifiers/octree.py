@@ -59,7 +59,7 @@ class OctreeControl(AnchorDensifier):
         return replace(
             schedule,
             lr_steps=length,
-            coarse_until=length // 4,
+            coarse_until=min(length // 4, schedule.total // 2),
             densify_from=length * _FROM // _LENGTH,
             densify_until=length * _UNTIL // _LENGTH,
             densify_every=max(SHORTEST_ANCHOR_INTERVAL, length * _EVERY // _LENGTH),

@@ -170,6 +170,22 @@ def test_a_reset_that_comes_with_an_edit_caps_what_is_then_drawn():
     assert drawn.max().item() == pytest.approx(0.01, rel=1e-5)
 
 
+def test_a_reset_without_an_edit_caps_what_is_drawn_with_the_filter_as_it_is():
+    backbone = MipSplatting()
+    params = backbone.create(sample_scene(), np.random.default_rng(0))
+    rows = len(params["means"])
+    with torch.no_grad():
+        params["means"] *= 2.0
+        params["opacities"][:] = 3.0
+    view = record([STILL] * rows, [1] * rows)
+    ctx = context([view], step=3000, params=params, backbone=backbone)
+    edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
+    assert edit.source is None
+    after = apply_to_parameters(edit, backbone.blocks(), params)
+    drawn = backbone.splats(after, 0).opacities
+    assert drawn.max().item() == pytest.approx(0.01, rel=1e-5)
+
+
 def test_nothing_happens_between_the_edits_and_after_the_end():
     adc = AdaptiveDensityControl()
     view = record([MOVING] * 4, [1] * 4)

@@ -14,6 +14,8 @@ BACKBONES = {
     "anchor": {"name": "scaffold", "voxel_size": 1e-4},
     "octree": {"name": "octree", "middle_cell": 1e-3},
 }
+#: What density control counts where it edits.
+EDITS = {"cloned", "split", "pruned", "grown", "added", "relocated"}
 OPTIONS = {
     "anchor": {"success_threshold": 0, "coarsest": 1},
     "octree": {"success_threshold": 0},
@@ -32,6 +34,7 @@ def test_same_bits_on_any_number_of_threads(name, large_scene):
         densify_until=9,
         densify_every=3,
         reset_every=6,
+        sh_from=3,
         densifier=ComponentChoice(name=name, **OPTIONS.get(name, {})),
         backbone=ComponentChoice(**BACKBONES.get(name, {"name": "vanilla"})),
     )
@@ -40,10 +43,11 @@ def test_same_bits_on_any_number_of_threads(name, large_scene):
     for threads in (1, 2):
         configure_threads(threads)
         state = first_state(setup)
-        for _ in range(7):
-            timed_step(setup, state)
+        counts = [timed_step(setup, state).counts for _ in range(7)]
         states.append(state)
     one, two = states
+    edited = sum(each.get(kind, 0) for each in counts for kind in EDITS)
+    assert (edited > 0) == (name != "none")
     assert one.primitives(setup) > 2**15
     for tensor, values in one.parameters.items():
         assert torch.equal(values, two.parameters[tensor]), tensor

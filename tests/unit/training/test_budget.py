@@ -10,7 +10,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.registry import build
 from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.budget import Timed, _cost, _fitting, caught_up
+from crossgrad_core.training.budget import Timed, _cost, _fitting, _without_edits, caught_up
 from crossgrad_core.training.state import Clock
 
 
@@ -59,6 +59,16 @@ def setup(densifier="adc", steps=1000):
 )
 def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
     assert _fitting(partial(_cost, setup()), affordable) == steps
+
+
+@pytest.mark.parametrize("mode", ["scaled", "absolute"])
+def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
+    schedule = _without_edits(Schedule.for_run(12_000, mode))
+    steps = range(1, 12_001)
+    assert all(schedule.collects(step) for step in steps)
+    assert not any(schedule.densifies(step) or schedule.resets(step) for step in steps)
+    assert schedule.sh_degree(3) == 3
+    assert schedule.coarse_until == 0 == schedule.densify_from
 
 
 def test_without_density_control_every_step_costs_the_same():

@@ -43,14 +43,12 @@ def test_it_begins_with_all_bands_of_the_file(trained):
     assert lengthened(again, 10, 2000).schedule.sh_from == 3
 
 
-def test_it_goes_on_and_is_repeated_without_the_file(trained, tmp_path):
-    copy = tmp_path / "copy.ply"
-    copy.write_bytes(trained[2].read_bytes())
-    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": str(copy)}})
+def test_file_and_degree_are_written_down(trained, monkeypatch):
+    path = trained[2]
+    monkeypatch.chdir(path.parent)
+    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": path.name}})
     written = resolved(assemble(config, sample_scene(), "none"))
-    copy.unlink()
-    assert written.sh_from == 3
-    assert assemble(written, sample_scene(), "none").schedule.sh_from == 3
+    assert (written.reading.init, written.sh_from) == (str(path.resolve()), 3)
 
 
 @pytest.mark.parametrize(("asked", "degree"), [(None, 0), (2, 2)])
