@@ -2,8 +2,8 @@
 
 torch shares long tensors out among its threads, and what is left over at the end of each share goes
 through scalar code that rounds differently from the vectorised one. For the functions that the
-vector library computes (exp, tanh) this makes no difference, for the sigmoid it does: one number in
-50,000 then depends on the number of threads, and a whole training run with it.
+vector library computes (exp, tanh) this makes no difference, for the sigmoid it does: a few
+numbers then depend on the number of threads, and a whole training run with them.
 """
 
 from collections.abc import Callable

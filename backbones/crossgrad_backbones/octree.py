@@ -109,8 +109,9 @@ class Octree(AnchorBackbone):
         largest, smallest = fitting.distance_range(points, centers, self.dist_ratio)
         levels = fitting.number_of_levels(largest, smallest, self.fork)
         corner, edge = fitting.bounding_range(points)
-        wanted = fitting.automatic_root_cell(points)
-        if self.middle_cell is not None:
+        if self.middle_cell is None:
+            wanted = fitting.automatic_root_cell(points)
+        else:
             wanted = fitting.root_above(self.middle_cell, levels, self.fork)
         cell = fitting.root_cell(edge, self.base_layer, wanted)
         levels = fitting.resolvable_levels(levels, self.fork, cell, float(np.abs(points).max()))

@@ -23,3 +23,8 @@ class SceneOptions(BaseModel):
     init: str = Field("points", description="points (SfM), random, or the path of a PLY file")
     cache_mib: int = Field(2048, ge=16, description="memory for decoded photos, MiB")
     masks: Path | None = Field(None, description="mask folder; default <scene>/masks if present")
+
+    @property
+    def init_file(self) -> Path | None:
+        """The PLY file to start from, or None where there is none."""
+        return None if self.init in {"points", "random"} else Path(self.init)

@@ -137,12 +137,12 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 
     Written down, so that a run goes on without the file that it started from.
     """
-    init = config.reading.init
-    if config.sh_from is not None or init in {"points", "random"}:
+    path = config.reading.init_file
+    if config.sh_from is not None or path is None:
         return config
     from crossgrad_core.ply import sh_degree_of
 
-    return config.model_copy(update={"sh_from": sh_degree_of(Path(init))})
+    return config.model_copy(update={"sh_from": sh_degree_of(path)})
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:

@@ -22,9 +22,8 @@ def resolved(setup: Setup) -> RunConfig:
     if "grouping" in components:
         chosen["grouping"] = _choice(names["grouping"], components["grouping"])
     scene = None if config.scene is None else Path(config.scene).resolve()
-    init = config.reading.init
-    if init not in {"points", "random"}:
-        init = str(Path(init).resolve())
+    path = config.reading.init_file
+    init = config.reading.init if path is None else str(path.resolve())
     return config.model_copy(
         update={
             **chosen,

@@ -2,7 +2,6 @@
 
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -35,14 +34,15 @@ def first_state(setup: Setup) -> TrainState:
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
     """Parameters from the SfM points, from random points, or from a PLY of Gaussians."""
-    init = setup.config.reading.init
-    if init == "points":
-        return setup.backbone.create(setup.scene, rng)
-    if init == "random":
-        return setup.backbone.create(with_random_points(setup.scene, rng), rng)
+    reading = setup.config.reading
+    if reading.init_file is None:
+        scene = setup.scene
+        if reading.init == "random":
+            scene = with_random_points(scene, rng)
+        return setup.backbone.create(scene, rng)
     from crossgrad_core.ply import read_ply
 
-    cloud = read_ply(Path(init)).to_local(setup.scene.similarity)
+    cloud = read_ply(reading.init_file).to_local(setup.scene.similarity)
     return setup.backbone.adopt(cloud.to_gaussians(), setup.scene, rng)
 
 
