@@ -9,9 +9,10 @@ partial sums are added in the order of the chunks: same input, same bits.
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, prange  # type: ignore[attr-defined]
+from numba import carray, prange  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
+from crossgrad_core.jit import strict_device, strict_kernel, strict_parallel_kernel
 from crossgrad_core.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
 from crossgrad_core.numba_kernels.pointers import float32_pointer
 
@@ -26,7 +27,7 @@ CHUNK = 16384
 PIECE = 1024
 
 
-@njit(cache=True)
+@strict_kernel
 def chunk_table(sizes: Ints) -> Ints:
     """[C, 2] tensor and first element of each chunk."""
     total = 0
@@ -42,14 +43,14 @@ def chunk_table(sizes: Ints) -> Ints:
     return table
 
 
-@njit(cache=True, inline="always")
+@strict_device
 def row(address: int, start: int, length: int) -> NDArray[np.float32]:
     """Inside kernels: the `length` elements from element `start` of the tensor at `address`."""
     pointer: Any = float32_pointer(address + 4 * start)  # type: ignore[call-arg]
     return carray(pointer, (length,))
 
 
-@njit(cache=True)
+@strict_device
 def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
     """Gramian of more than four rows, in tiles of two by two; the chunk stays in cache."""
     tile = np.empty((2, 2))
@@ -67,7 +68,7 @@ def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> 
             out[i, j1], out[i1, j1] = tile[0, 1], tile[1, 1]
 
 
-@njit(cache=True)
+@strict_device
 def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, out: Floats) -> None:
     """Upper triangle of one chunk's Gramian; rows of absent views stay as they are (zero)."""
     views = addresses.size
@@ -98,7 +99,7 @@ def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, ou
             out[places[i], places[j]] = compact[i, j]
 
 
-@njit(cache=True)
+@strict_device
 def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     """Adds the chunks' Gramians with Neumaier's compensation, and mirrors the upper triangle."""
     views = partial.shape[1]
@@ -121,14 +122,14 @@ def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     return total
 
 
-@njit(cache=True)
+@strict_device
 def _gramian_task(addresses: Ints, sizes: Ints, table: Ints, c: int, partial: Floats) -> None:
     t, start = table[c, 0], table[c, 1]
     compact = np.empty(partial.shape[1:])
     _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
 
 
-@njit(cache=True, parallel=True)
+@strict_parallel_kernel
 def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
     """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
     tensors, views = addresses.shape
@@ -138,7 +139,7 @@ def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
     return _summed(partial, table, tensors)
 
 
-@njit(cache=True)
+@strict_kernel
 def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
     """The same bits without the cost of waking up other cores."""
     tensors, views = addresses.shape
@@ -148,7 +149,7 @@ def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
     return _summed(partial, table, tensors)
 
 
-@njit(cache=True)
+@strict_device
 def _weighted(
     rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
 ) -> None:
@@ -190,14 +191,14 @@ def _weighted(
         narrow[i] = np.float32(wide[i])
 
 
-@njit(cache=True, error_model="numpy")
+@strict_device
 def _divide(a: Rows, divisor: float) -> None:
     d = np.float32(divisor)
     for i in range(a.size):
         a[i] /= d
 
 
-@njit(cache=True)
+@strict_device
 def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
     """Fills `narrow` with the rows added in order in float32, the bits of accumulation, divided."""
     n = narrow.size
@@ -217,13 +218,13 @@ def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> 
         _divide(narrow, divisor)
 
 
-@njit(cache=True)
+@strict_device
 def _weighted_into(a: Rows, u: float, b: Rows, v: float) -> None:
     for i in range(a.size):
         a[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
 
 
-@njit(cache=True, error_model="numpy")
+@strict_device
 def _plain_into(a: Rows, b: Rows, divisor: float) -> None:
     if divisor == 1.0:
         for i in range(a.size):
@@ -234,7 +235,7 @@ def _plain_into(a: Rows, b: Rows, divisor: float) -> None:
             a[i] = (a[i] + b[i]) / d
 
 
-@njit(cache=True)
+@strict_device
 def _combine_pieces(
     rows: Ints,
     weights: Floats,
@@ -259,7 +260,7 @@ def _combine_pieces(
             result[i] = narrow[i]
 
 
-@njit(cache=True)
+@strict_device
 def _combine_chunk(
     addresses: Ints, weights: Floats, plain: bool, divisor: float, out: int, first: int, end: int
 ) -> None:
@@ -288,7 +289,7 @@ def _combine_chunk(
         _combine_pieces(rows, used, count, plain, divisor, out, first, end)
 
 
-@njit(cache=True, parallel=True)
+@strict_parallel_kernel
 def combine(
     addresses: Ints,
     weights: Floats,
@@ -315,7 +316,7 @@ def combine(
         _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
 
 
-@njit(cache=True)
+@strict_kernel
 def combine_serial(
     addresses: Ints,
     weights: Floats,
@@ -332,7 +333,7 @@ def combine_serial(
         _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
 
 
-@njit(cache=True)
+@strict_kernel
 def overlapping(a: int, b: int, size: int) -> bool:
     """Whether two tensors share the place of a non-zero element."""
     x, y = row(a, 0, size), row(b, 0, size)

@@ -5,16 +5,15 @@ numbers are exact in float64, and squares from 1e-90 to 1e77 are neither lost no
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from crossgrad_core.jit import sum_device
 
 Row = NDArray[np.float32]
 Out = NDArray[np.float64]
 
-_FAST = {"reassoc", "contract"}
 
-
-@njit(cache=True, fastmath=_FAST)
+@sum_device
 def dots_1(a: Row, out: Out) -> None:
     """Upper triangle of the Gramian of one row."""
     aa = 0.0
@@ -24,7 +23,7 @@ def dots_1(a: Row, out: Out) -> None:
     out[0, 0] = aa
 
 
-@njit(cache=True, fastmath=_FAST)
+@sum_device
 def dots_2(a: Row, b: Row, out: Out) -> None:
     """Upper triangle of the Gramian of two rows."""
     aa = ab = bb = 0.0
@@ -36,7 +35,7 @@ def dots_2(a: Row, b: Row, out: Out) -> None:
     out[0, 0], out[0, 1], out[1, 1] = aa, ab, bb
 
 
-@njit(cache=True, fastmath=_FAST)
+@sum_device
 def dots_3(a: Row, b: Row, c: Row, out: Out) -> None:
     """Upper triangle of the Gramian of three rows."""
     aa = ab = ac = bb = bc = cc = 0.0
@@ -52,7 +51,7 @@ def dots_3(a: Row, b: Row, c: Row, out: Out) -> None:
     out[1, 1], out[1, 2], out[2, 2] = bb, bc, cc
 
 
-@njit(cache=True, fastmath=_FAST)
+@sum_device
 def dots_4(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
     """Upper triangle of the Gramian of four rows."""
     aa = ab = ac = ad = bb = bc = bd = cc = cd = dd = 0.0
@@ -73,7 +72,7 @@ def dots_4(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
     out[2, 2], out[2, 3], out[3, 3] = cc, cd, dd
 
 
-@njit(cache=True, fastmath=_FAST)
+@sum_device
 def dots_2x2(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
     """Dot products of the rows (a, b) with the rows (c, d)."""
     ac = ad = bc = bd = 0.0

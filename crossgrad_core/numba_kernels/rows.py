@@ -4,15 +4,16 @@ Addresses are those of `dense`; row i of a tensor of width d starts at element i
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from crossgrad_core.jit import strict_device, strict_kernel, strict_parallel_kernel
 from crossgrad_core.numba_kernels.dense import Flags, Floats, Ints, row
 
 #: Rows that one task works on.
 ROWS = 2048
 
 
-@njit(cache=True)
+@strict_device
 def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floats) -> None:
     tensors, views = addresses.shape
     for t in range(tensors):
@@ -34,7 +35,7 @@ def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floa
                 out[i, k, other] = out[i, other, k]
 
 
-@njit(cache=True, parallel=True)
+@strict_parallel_kernel
 def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
     """[N, K, K] float64 Gramians of the rows of a block of T tensors.
 
@@ -50,7 +51,7 @@ def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
     return out
 
 
-@njit(cache=True)
+@strict_device
 def _combine_task(
     addresses: Ints, weights: Floats, out: int, width: int, first: int, end: int
 ) -> None:
@@ -69,7 +70,7 @@ def _combine_task(
         result[j] = np.float32(wide[j])
 
 
-@njit(cache=True, parallel=True)
+@strict_parallel_kernel
 def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
     """Writes sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
 
@@ -85,7 +86,7 @@ def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
         _combine_task(addresses, weights, out, width, task * ROWS, end)
 
 
-@njit(cache=True)
+@strict_kernel
 def row_overlaps(a: int, b: int, count: int, width: int, out: Flags) -> None:
     """Sets out[i] where row i of two tensors shares the place of a non-zero element."""
     x, y = row(a, 0, count * width), row(b, 0, count * width)

@@ -1,0 +1,219 @@
+"""Compiled kernels on disk: named by all that they were made from, checked before they are used.
+
+One file holds one kernel for one signature: the SHA-256 of the rest, then the key and Numba's
+result. There is no index that two processes could write over, a file appears complete or not at
+all, and one that is damaged counts as missing.
+"""
+
+import ast
+import hashlib
+import importlib.util
+import logging
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import llvmlite
+import numba
+from numba.core.caching import FunctionCache, NullCache
+from numba.core.serialize import dumps
+from typing_extensions import override
+
+_DIGEST = 32
+_FOLDERS = "numba_kernels"
+_CORE = __name__.partition(".")[0]
+_DUMPS = cast("Callable[[object], bytes]", dumps)
+_LOG = logging.getLogger(__name__)
+#: What is said before a kernel is compiled; its argument is the kernel's name.
+COMPILING = "compiling %s"
+
+
+def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's caches are untyped
+    """The cache of a kernel: on disk where there is a place to write to, else none.
+
+    The place is `NUMBA_CACHE_DIR` where set, else `__pycache__` beside the kernel, else the user's
+    cache folder.
+    """
+    try:
+        return _DiskCache(function)
+    except RuntimeError:  # Numba found no folder that it may write to.
+        _tell_uncached(str(Path(function.__code__.co_filename).parent))
+        return _NoCache(function)
+
+
+@cache
+def _tell_uncached(folder: str) -> None:
+    """Says once per folder that its kernels cannot be kept."""
+    _LOG.warning(
+        "compiled kernels cannot be kept, every start compiles them again: neither %s nor the "
+        "user's cache folder can be written to; NUMBA_CACHE_DIR=FOLDER names another one",
+        folder,
+    )
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return function.__qualname__.strip("_")
+
+
+class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
+    """Keeps nothing."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._name = _name(function)
+
+    @override
+    def load_overload(self, sig: object, target_context: object) -> None:
+        """Finds nothing."""
+        _LOG.info(COMPILING, self._name)
+
+
+class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
+    """Numba's cache of functions with files of our own."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._source = Path(function.__code__.co_filename)
+        self._cache_file = _Files(Path(self._cache_path), self._impl.filename_base, self._source)
+
+    @override
+    def load_overload(self, sig: object, target_context: object) -> object | None:
+        """The compiled function; None where it is to be compiled."""
+        found = None
+        # Whatever is wrong with a file: the kernel can always be compiled.
+        with suppress(Exception):
+            found = super().load_overload(sig, target_context)
+        if found is None:
+            _LOG.info(COMPILING, _name(self._py_func))
+        return cast("object | None", found)
+
+    @override
+    def save_overload(self, sig: object, data: object) -> None:
+        """Keeps a compiled function where that is possible."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:  # A full disk, say: the function itself is there.
+            self.disable()
+            _tell_unwritten(str(self._cache_path), str(error))
+
+    @override
+    def _index_key(self, sig: object, codegen: object) -> tuple[Any, ...]:
+        versions = (numba.__version__, llvmlite.__version__)
+        return (*super()._index_key(sig, codegen), versions, fingerprint(self._source))
+
+
+@cache
+def _tell_unwritten(folder: str, error: str) -> None:
+    _LOG.warning("a compiled kernel could not be kept in %s: %s", folder, error)
+
+
+class _Files:
+    """The files of one kernel.
+
+    Args:
+        folder: Where they are.
+        base: What their names begin with.
+        source: The file that the kernel stands in.
+    """
+
+    def __init__(self, folder: Path, base: str, source: Path) -> None:
+        self._folder = folder
+        self._base = base
+        self._source = source
+
+    def load(self, key: object) -> object | None:
+        """What was saved under the key; None where nothing whole is."""
+        try:
+            content = self._path(key).read_bytes()
+        except OSError:
+            return None
+        digest, payload = content[:_DIGEST], content[_DIGEST:]
+        if hashlib.sha256(payload).digest() != digest:
+            return None
+        stored, data = pickle.loads(payload)
+        return cast("object", data) if stored == key else None
+
+    def save(self, key: object, data: object) -> None:
+        """Saves under the key, and deletes what older sources were compiled to."""
+        payload = _DUMPS((key, data))
+        path = self._path(key)
+        temporary = path.with_suffix(f".{os.getpid()}.tmp")
+        try:
+            temporary.write_bytes(hashlib.sha256(payload).digest() + payload)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        self._drop_older()
+
+    def flush(self) -> None:
+        """Deletes all files of the kernel."""
+        for path in self._folder.glob(f"{self._base}.*"):
+            path.unlink(missing_ok=True)
+
+    @property
+    def _generation(self) -> str:
+        return f"{self._base}.{fingerprint(self._source)[:12]}"
+
+    def _path(self, key: object) -> Path:
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()
+        return self._folder / f"{self._generation}.{digest[:20]}.nbc"
+
+    def _drop_older(self) -> None:
+        for path in self._folder.glob(f"{self._base}.*"):
+            if not path.name.startswith(self._generation) and path.suffix != ".tmp":
+                with suppress(OSError):  # Another process may be faster, or hold it open.
+                    path.unlink()
+
+
+@cache
+def fingerprint(source: Path) -> str:
+    """SHA-256 over all files whose constants and functions a kernel in `source` may hold.
+
+    Numba itself notices changes of the file that holds a kernel, but not of the files that hold
+    what the kernel inlines. Those are: all files of its folder; what these import from their own
+    package or from the core; and, where that lies in a folder of kernels, what it imports in turn.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(_sources(source)):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _sources(source: Path) -> set[Path]:
+    found: set[Path] = set()
+    waiting = set(source.parent.glob("*.py"))
+    while waiting:
+        path = waiting.pop()
+        found.add(path)
+        if path.parent.name == _FOLDERS or path.parent == source.parent:
+            waiting |= set(_imported(path)) - found
+    return found
+
+
+def _imported(path: Path) -> Iterator[Path]:
+    """The files of modules that a file imports from its own package or from the core."""
+    packages = {_CORE, _package_of(path)}
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        for name in names:
+            if name.partition(".")[0] in packages:
+                yield from _file_of(name)
+
+
+def _package_of(path: Path) -> str:
+    """The name of the outermost package that holds a file."""
+    folder = path.parent
+    while (folder.parent / "__init__.py").is_file():
+        folder = folder.parent
+    return folder.name
+
+
+def _file_of(name: str) -> Iterator[Path]:
+    spec = importlib.util.find_spec(name)
+    if spec is not None and spec.origin is not None and spec.origin.endswith(".py"):
+        yield Path(spec.origin)
