@@ -288,7 +288,11 @@ def render(folder: Path, *, split: str, out: Path | None, device: str | None = N
     scene = setup.scene
     views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
     if not views:
-        raise UserError("there are no views to render", where=f"--split {split}")
+        raise UserError(
+            "there are no views to render",
+            where=f"--split {split}",
+            todo="choose another --split: train, test or all",
+        )
     writer = PanelWriter.of(folder, state.step, views, len(views))
     if out is not None:
         writer = replace(writer, folder=out)

@@ -43,7 +43,11 @@ def read_state(folder: Path) -> dict[str, Any]:
         UserError: The checkpoint is missing, damaged, or of another format version.
     """
     if not folder.is_dir():
-        raise UserError("no such checkpoint", where=folder)
+        raise UserError(
+            "no such checkpoint",
+            where=folder,
+            todo="name a folder below checkpoints/ in the folder of a run",
+        )
     try:
         state = json.loads((folder / STATE).read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -118,7 +118,11 @@ def read_ply(path: Path) -> SplatCloud:
 
     quats = stacked([f"rot_{i}" for i in range(4)])
     if not quats.any(axis=1).all():
-        raise UserError("PLY file with a rotation of length zero", where=path)
+        raise UserError(
+            "PLY file with a rotation of length zero",
+            where=path,
+            todo="remove these Gaussians, or export the file again",
+        )
     means = np.stack([vertices.columns[axis] for axis in "xyz"], axis=1, dtype=np.float64)
     sh_rest = np.zeros((len(means), REST, 3), dtype=np.float32)
     if rest:
@@ -190,6 +194,7 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
             where=path,
             expected="0, 9, 24 or 45 properties f_rest_0, f_rest_1 ...",
             found=f"{count}",
+            todo="export the file again with whole bands of spherical harmonics",
         )
     return names
 
@@ -238,7 +243,11 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
         offset = np.empty(0)
     if offset.shape != (3,) or not np.isfinite(offset).all():
         raise UserError(
-            "PLY file with an unreadable offset", where=path, expected="three numbers", found=text
+            "PLY file with an unreadable offset",
+            where=path,
+            expected="three numbers",
+            found=text,
+            todo=f"repair or remove the comment that starts with {_OFFSET_TAG}",
         )
     return offset
 
@@ -254,4 +263,5 @@ def _render_mode(comments: Sequence[str], path: Path) -> RenderMode:
         where=path,
         expected=f"{_MODE_TAG} default or mip",
         found=text,
+        todo=f"remove the comment if its Gaussians are meant to be drawn as in {_MODE_TAG} default",
     )

@@ -77,7 +77,12 @@ def read_vertices(path: Path) -> Vertices:
                 read = _read_ascii if header.byte_order is None else _read_binary
                 return Vertices(read(file, path, header, element, before), header.comments)
             before.append(element)
-    raise UserError("PLY file without vertices", where=path, expected="an element called vertex")
+    raise UserError(
+        "PLY file without vertices",
+        where=path,
+        expected="an element called vertex",
+        todo="export the Gaussians again",
+    )
 
 
 def vertex_properties(path: Path) -> tuple[str, ...]:
@@ -104,12 +109,22 @@ def _require_file(path: Path) -> None:
 
 
 def _malformed(path: Path, found: str) -> UserError:
-    return UserError("not a readable PLY file", where=path, found=found)
+    return UserError(
+        "not a readable PLY file",
+        where=path,
+        found=found,
+        todo="copy, download or export the file again",
+    )
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
     if file.readline(8).strip() != b"ply":
-        raise UserError("not a PLY file", where=path, expected="a first line that says ply")
+        raise UserError(
+            "not a PLY file",
+            where=path,
+            expected="a first line that says ply",
+            todo="name a PLY file of Gaussians, such as the point_cloud.ply of a run",
+        )
     lines = _header_lines(file, path)
     comments = [line.removeprefix("comment").strip() for line in lines if _keyword(line, "comment")]
     formats = [line.split()[1:2] for line in lines if _keyword(line, "format")]

@@ -57,7 +57,9 @@ def configure_threads(n: int | None = None) -> int:
             where="threads",
             expected=f"1 to {most}",
             found=str(n),
-            todo=f"set NUMBA_NUM_THREADS={n} before the start to allow more" if n > most else "",
+            todo=f"set NUMBA_NUM_THREADS={n} before the start to allow more"
+            if n > most
+            else "leave --threads out to use all cores",
         )
     _prefer_openmp()
     numba.set_num_threads(n)

@@ -89,7 +89,7 @@ def _slots(slot: str | None) -> tuple[str, ...]:
         raise UserError(
             f"there is no slot named {slot!r}",
             expected=f"one of {listed(GROUPS)}",
-            todo=did_you_mean(slot, GROUPS),
+            todo=sentences(did_you_mean(slot, GROUPS), "leave --slot out to see all of them"),
         )
     return (plural,)
 

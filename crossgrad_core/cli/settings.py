@@ -69,13 +69,17 @@ def _from_file(path: Path) -> Settings:
         found = read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            "the configuration file cannot be read", where=path, found=str(error)
+            "the configuration file cannot be read",
+            where=path,
+            found=str(error),
+            todo="check the path and its permissions; it must be a text file in UTF-8",
         ) from error
     except yaml.YAMLError as error:
         raise UserError(
             "the configuration file is not valid YAML",
             where=path,
             found=" ".join(str(error).split()),
+            todo="repair that line, or start from the config.yaml of a run",
         ) from error
     if found is None:
         return {}
@@ -85,6 +89,7 @@ def _from_file(path: Path) -> Settings:
             where=path,
             expected="lines such as `steps: 3000`",
             found=f"a {type(found).__name__}",
+            todo="write `setting: value` lines; the config.yaml of a run is an example",
         )
     return {str(key): value for key, value in found.items()}
 
@@ -146,6 +151,7 @@ def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:
             "--set does not say which setting has which value",
             expected="KEY=VALUE, for example --set operator.c=0.4",
             found=repr(assignment),
+            todo="put an equals sign between the setting and its value",
         )
     try:
         return path, read_yaml(text)
@@ -238,6 +244,7 @@ def _no_options(path: tuple[str, ...], depth: int) -> UserError:
     return UserError(
         f"{'.'.join(path[:depth])} is a plain setting without options of its own",
         where=f"--set {'.'.join(path)}",
+        todo=f"set it as a whole: --set {'.'.join(path[:depth])}=VALUE",
     )
 
 

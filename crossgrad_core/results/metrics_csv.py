@@ -126,14 +126,24 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
     """
     path = folder / FILE
     if not path.is_file():
-        raise UserError(f"no {FILE}", where=folder, expected="the folder of a crossgrad run")
+        raise UserError(
+            f"no {FILE}",
+            where=folder,
+            expected="the folder of a crossgrad run",
+            todo="name the folder that `crossgrad run` printed",
+        )
     header, *lines = _lines(path) or [[]]
     try:
         return tuple(
             {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
         )
     except ValueError as error:
-        raise UserError(f"unreadable {FILE}", where=path, found=str(error)) from error
+        raise UserError(
+            f"unreadable {FILE}",
+            where=path,
+            found=str(error),
+            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+        ) from error
 
 
 def _lines(path: Path) -> list[list[str]]:

@@ -76,11 +76,21 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / FILE
     if not path.is_file():
-        raise UserError(f"no {FILE}", where=folder, expected="the folder of a crossgrad run")
+        raise UserError(
+            f"no {FILE}",
+            where=folder,
+            expected="the folder of a crossgrad run",
+            todo="name the folder of a run that has ended",
+        )
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise UserError(f"unreadable {FILE}", where=path, found=str(error)) from error
+        raise UserError(
+            f"unreadable {FILE}",
+            where=path,
+            found=str(error),
+            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+        ) from error
     return content
 
 

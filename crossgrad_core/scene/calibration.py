@@ -20,6 +20,7 @@ _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
 _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+_AGAIN = "repair the camera, or export the model again"
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,10 @@ class Calibration:
         """
         if self.width < 1 or self.height < 1:
             raise UserError(
-                "a camera has no pixels", where=where, found=f"{self.width} x {self.height}"
+                "a camera has no pixels",
+                where=where,
+                found=f"{self.width} x {self.height}",
+                todo=_AGAIN,
             )
         try:
             camera = self._camera
@@ -75,6 +79,7 @@ class Calibration:
                 where=where,
                 expected="a camera model of COLMAP",
                 found=self.model,
+                todo="export the model with a camera model of COLMAP, such as PINHOLE or OPENCV",
             ) from error
         if not valid:
             raise UserError(
@@ -82,12 +87,14 @@ class Calibration:
                 where=where,
                 expected=str(camera.params_info),
                 found=str(len(self.params)),
+                todo=_AGAIN,
             )
         if not all(map(math.isfinite, self.params)):
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,
                 found=f"{self.model} {list(self.params)}",
+                todo=_AGAIN,
             )
         focal = [self.params[i] for i in camera.focal_length_idxs()]
         if min(focal, default=1.0) <= 0:
@@ -96,6 +103,7 @@ class Calibration:
                 where=where,
                 expected="pixels > 0",
                 found=f"{min(focal):g}",
+                todo=_AGAIN,
             )
 
     @property

@@ -54,7 +54,12 @@ def read_header(path: Path) -> PhotoHeader:
             "the file is not a photo", where=path, found=found, todo="replace or remove it"
         ) from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError("the photo cannot be read", where=path, found=str(error)) from error
+        raise UserError(
+            "the photo cannot be read",
+            where=path,
+            found=str(error),
+            todo="check its permissions, copy or download it again, or remove it",
+        ) from error
     if not whole:
         raise UserError(
             "the photo is cut short: the end of the file is missing",

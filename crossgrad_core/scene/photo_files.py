@@ -89,7 +89,11 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
     for folder in (option, root / option):
         if folder.is_dir():
             return folder
-    raise UserError("the mask folder is not there", where=option)
+    raise UserError(
+        "the mask folder is not there",
+        where=option,
+        todo="name a folder, as it is or within the scene: --set reading.masks=FOLDER",
+    )
 
 
 def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[str]) -> None:
@@ -106,6 +110,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
         where=folder,
         expected=f"{names[0]}.png for the photo {names[0]}",
         found=name_some(there) or "no mask",
+        todo="name the masks after their photos, or leave reading.masks out",
     )
 
 

@@ -73,6 +73,7 @@ def _given(up: tuple[float, float, float]) -> NDArray[np.float64]:
             where="up",
             expected="three finite numbers that are not all zero",
             found=str(list(up)),
+            todo="give the axis as three numbers, such as [0, 0, 1], or leave it on auto",
         )
     return axis / length
 

@@ -52,7 +52,10 @@ def check_views(raw: RawScene) -> None:
     twice = [name for name, number in names.items() if number > 1]
     if twice:
         raise UserError(
-            "several poses belong to one image name", where=raw.root, found=name_some(twice)
+            "several poses belong to one image name",
+            where=raw.root,
+            found=name_some(twice),
+            todo="keep one image of each name in the model",
         )
     for view in raw.views:
         _check_view(raw, view)
@@ -87,6 +90,7 @@ def _check_view(raw: RawScene, view: RawView) -> None:
             where=raw.root,
             expected="a path below the image folder",
             found=repr(view.name),
+            todo="rename the image in the model, or export the model again",
         )
     view.calibration.check(where)
     pose = view.world_to_camera
@@ -99,4 +103,5 @@ def _check_view(raw: RawScene, view: RawView) -> None:
             where=where,
             expected="an orthonormal, right-handed rotation",
             found=str(rotation.round(4).tolist()),
+            todo="remove the image from the model, or estimate the poses again",
         )

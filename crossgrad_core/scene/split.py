@@ -126,6 +126,11 @@ def _read_list(path: Path) -> frozenset[str] | None:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError("the list of views cannot be read", where=path, found=str(error)) from error
+        raise UserError(
+            "the list of views cannot be read",
+            where=path,
+            found=str(error),
+            todo="save it as text in UTF-8, one name a line, or remove it",
+        ) from error
     names = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
     return frozenset(name for name in names if name and not name.startswith("#"))

@@ -76,6 +76,7 @@ class TorchJD(Operator):
                 f"TorchJD has no weighting named {self.weighting!r}",
                 where="operator.weighting",
                 expected=f"one of {', '.join(filter(None, known))}",
+                todo="choose one of these with --set operator.weighting=NAME",
             )
         if hasattr(found, "reset"):
             raise UserError(
@@ -93,4 +94,5 @@ class TorchJD(Operator):
                 f"TorchJD's {kind.__name__} cannot be made",
                 where="operator.options",
                 found=str(error),
+                todo=f"set the arguments of {kind.__name__}: --set 'operator.options={{...}}'",
             ) from error

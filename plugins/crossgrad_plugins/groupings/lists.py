@@ -58,7 +58,12 @@ def read_labels(path: Path) -> dict[str, str]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError("the list of labels cannot be read", where=path, found=str(error)) from None
+        raise UserError(
+            "the list of labels cannot be read",
+            where=path,
+            found=str(error),
+            todo="check the path; the file is text in UTF-8 with rows `name,label`",
+        ) from None
     table: dict[str, str] = {}
     for row in rows:
         cells = [cell.strip() for cell in row]
@@ -68,11 +73,15 @@ def read_labels(path: Path) -> dict[str, str]:
                 where=path,
                 expected="image.jpg,near",
                 found=",".join(row),
+                todo="write two columns: a view (or folder, ending with a slash) and its label",
             )
         name, label = cells
         if table.setdefault(name, label) != label:
             raise UserError(
-                "a view has two labels", where=path, found=f"{name}: {table[name]}, {label}"
+                "a view has two labels",
+                where=path,
+                found=f"{name}: {table[name]}, {label}",
+                todo="remove one of the two rows",
             )
     return table
 
@@ -115,4 +124,5 @@ def _require_two(train: set[str], path: Path | None) -> None:
         where=path,
         expected="two labels or more",
         found=", ".join(sorted(train)),
+        todo="give some training views another label, or choose another grouping",
     )

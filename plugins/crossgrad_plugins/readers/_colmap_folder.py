@@ -41,6 +41,7 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
             where=scene / wanted,
             expected="cameras and images, as .bin or .txt",
             found=", ".join(str(p.relative_to(scene)) for p in find_models(scene)) or "no model",
+            todo="name one of those that were found, or leave reader.model out",
         )
     models = find_models(scene)
     if not models:
@@ -73,7 +74,12 @@ def check_scene_folder(scene: Path) -> None:
             )
         near = _similar_folder(scene)
     except OSError as error:
-        raise UserError("the scene cannot be read", where=scene, found=str(error)) from error
+        raise UserError(
+            "the scene cannot be read",
+            where=scene,
+            found=str(error),
+            todo="check the permissions of the folder",
+        ) from error
     hint = f"did you mean {near}?" if near else "check the path"
     raise UserError("the scene folder is not there", where=scene, todo=hint)
 

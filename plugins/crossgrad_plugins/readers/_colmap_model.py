@@ -117,7 +117,10 @@ def _convert_text(folder: Path, converted: Path) -> None:
         model.write_binary(converted)
     except (ValueError, IndexError, RuntimeError, OSError) as error:
         raise UserError(
-            "the COLMAP text model cannot be read", where=folder, found=str(error)
+            "the COLMAP text model cannot be read",
+            where=folder,
+            found=str(error),
+            todo="repair the file, or export the model again",
         ) from error
 
 
@@ -192,7 +195,12 @@ def _open(path: Path) -> Iterator[_Walk]:
     try:
         file = path.open("rb")
     except OSError as error:
-        raise UserError("the file cannot be read", where=path, found=str(error)) from error
+        raise UserError(
+            "the file cannot be read",
+            where=path,
+            found=str(error),
+            todo="check that it is there and may be read, or export the model again",
+        ) from error
     with file:
         # An empty file cannot be mapped. The map closes with the last array that looks into it.
         empty = path.stat().st_size == 0
