@@ -5,7 +5,7 @@ TEST_VENV ?= .venv-test
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test matrix lint bench clean
+.PHONY: demo install test matrix compat lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -23,6 +23,9 @@ test:  ## Build the wheel, install it into a fresh environment, run all tests ag
 matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.md says how long)
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m matrix
 
+compat:  ## The tests on Python 3.12, 3.13 and the lowest versions of packages, one worker each
+	COMPAT_VENVS="$(abspath .venv-compat)" sh tests/compat.sh
+
 lint: install  ## ruff and mypy
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"
 	$(BIN)/ruff check .
@@ -35,4 +38,4 @@ bench: install  ## The figures of docs/benchmarks.md (needs the case files named
 	$(BIN)/python benchmarks/operators.py
 
 clean:  ## Remove environments and caches; keeps runs/
-	rm -rf $(VENV) $(TEST_VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TEST_VENV) .venv-compat build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,10 +1,14 @@
 #!/bin/sh
 # Builds the wheel, installs it into its own environment, and runs the tests outside the checkout's
 # import path, so that what is tested is what users install.
+#   PYTHON, TEST_VENV: interpreter and environment; TEST_WORKERS: processes
+#   CONSTRAINTS: versions of the packages; EXTRAS: lint is what runs ruff and mypy
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 venv=${TEST_VENV:-$here/.venv-test}
 python=${PYTHON:-python3}
+constraints=${CONSTRAINTS:-$here/constraints.txt}
+extras=${EXTRAS:-test,lint}
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
@@ -14,13 +18,16 @@ $pip install --constraint "$here/constraints.txt" build hatchling
 "$venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$here" >"$work/build.log" 2>&1 ||
     { cat "$work/build.log"; exit 1; }
 wheel=$(ls "$work"/dist/crossgrad-*.whl)
-$pip install --constraint "$here/constraints.txt" "crossgrad[test,lint] @ file://$wheel"
+$pip install --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
 $pip install --force-reinstall --no-deps "$wheel"
 
 cd "$work"
-"$venv/bin/ruff" check "$here"
-"$venv/bin/ruff" format --check "$here"
-(cd "$here" && "$venv/bin/mypy")
-exec "$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --quiet \
+case ",$extras," in *,lint,*)
+    "$venv/bin/ruff" check "$here"
+    "$venv/bin/ruff" format --check "$here"
+    (cd "$here" && "$venv/bin/mypy")
+    ;;
+esac
+"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --quiet \
     --rootdir "$here" --config-file "$here/pyproject.toml" "$here/tests" "$@"
