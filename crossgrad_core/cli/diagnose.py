@@ -124,4 +124,4 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         "reading": None if max_size is None else {"max_size": max_size},
     }
     settings = {name: value for name, value in given.items() if value is not None}
-    app.diagnose(scene, run, settings, options, out)
+    raise typer.Exit(app.diagnose(scene, run, settings, options, out))

@@ -1,14 +1,16 @@
 """The command `crossgrad diagnose`."""
 
+import sys
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from crossgrad_core.app import opened, parsed, with_defaults
+from crossgrad_core.app import FAILED, opened, parsed, with_defaults
 from crossgrad_core.diagnostics.command import Options, diagnose_run, diagnose_scene
 from crossgrad_core.diagnostics.report import PICTURE, PROBES, Report
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import disk_errors
+from crossgrad_core.training.failure import TrainingFailedError
 
 
 def diagnose(
@@ -17,7 +19,7 @@ def diagnose(
     settings: Mapping[str, object],
     options: Options,
     out: Path | None,
-) -> None:
+) -> int:
     """Diagnoses a scene or a run; prints the report and writes it to a folder.
 
     Args:
@@ -27,6 +29,9 @@ def diagnose(
             a run only `device` and `threads` can be set.
         options: How to probe.
         out: Where the report goes.
+
+    Returns:
+        The exit code: 0, or 1 where training failed; the probes before that are reported.
 
     Raises:
         UserError: The input is bad.
@@ -45,9 +50,18 @@ def diagnose(
         folder = out or run / "diagnose" / stamp
     else:
         config = with_defaults(parsed({**settings, "scene": scene}))
-        report = diagnose_scene(config, options)
+        try:
+            report = diagnose_scene(config, options)
+        except TrainingFailedError as error:
+            return _failed(f"{error}; nothing was probed before")
         folder = out or Path("runs") / report.scene / "diagnose" / stamp
     _write(report, folder)
+    return 0 if report.failure is None else _failed(report.failure)
+
+
+def _failed(why: str) -> int:
+    print(f"training failed: {why}", file=sys.stderr)  # noqa: T201
+    return FAILED
 
 
 def _check_free(out: Path | None) -> None:

@@ -26,6 +26,7 @@ from crossgrad_core.schedule import Schedule
 from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import assemble, read_scene
 from crossgrad_core.training.budget import steps_for
+from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.loop import Stopper, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, warm_up
@@ -61,8 +62,13 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
         config: Scene, reading options, device and threads; components are replaced.
         options: How to probe.
 
+    Returns:
+        The report. Where training failed after the first probe it holds the probes so far, and
+        `failure` says what happened.
+
     Raises:
         UserError: The scene cannot be read, or the grouping cannot group it.
+        TrainingFailedError: Training failed before the first probe.
     """
     configure_threads(config.threads)
     vanilla = config.model_copy(
@@ -77,15 +83,33 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
     scene, reader = read_scene(vanilla, cast("Path", vanilla.scene))
     plan = _plan(scene, options)
     setup = assemble(vanilla, scene, reader)
-    warm_up(setup)
-    steps, _ = steps_for(setup, options.seconds)
+    steps = _affordable_steps(setup, options.seconds)
     setup = replace(setup, schedule=Schedule.for_run(steps, vanilla.schedule))
     watch = Watch(plan, max(1, steps // options.probes), steps, options.seed)
     setup.manager.register(watch, name="diagnostics")
     state = first_state(setup)
-    train(setup, state, _NoSink(), Stopper())
     model = f"a vanilla run of {steps} steps, one view each, in epoch order"
+    try:
+        train(setup, state, _NoSink(), Stopper())
+    except TrainingFailedError as error:
+        if watch.last is None:
+            raise
+        model = f"{model}, which failed; probed before that"
+        return replace(_report(model, watch, model_of(setup, state), options), failure=str(error))
     return _report(model, watch, model_of(setup, state), options)
+
+
+def _affordable_steps(setup: Setup, seconds: float) -> int:
+    """How many steps fit into `seconds`; compiles the kernels first.
+
+    Raises:
+        TrainingFailedError: Not even the steps that are tried out can be taken.
+    """
+    try:
+        warm_up(setup)
+        return steps_for(setup, seconds)[0]
+    except NonFiniteError as error:
+        raise TrainingFailedError(str(error)) from error
 
 
 def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:

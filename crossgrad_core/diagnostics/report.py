@@ -27,6 +27,7 @@ class Report:
         cameras: Rows of `camera_rows`.
         groupings: Rows of `grouping_rows`, for the last probe.
         notes: What the reader should know.
+        failure: Why training ended before its time; None where it did not.
     """
 
     scene: str
@@ -35,6 +36,7 @@ class Report:
     cameras: Sequence[Row]
     groupings: Sequence[Row]
     notes: Sequence[str] = ()
+    failure: str | None = None
 
     def write(self, folder: Path) -> None:
         """Writes the CSV files and the picture.

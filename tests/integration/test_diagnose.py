@@ -12,6 +12,8 @@ from crossgrad_core.diagnostics.app import diagnose
 from crossgrad_core.diagnostics.command import Options
 from crossgrad_core.errors import UserError
 from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.training import loop
+from crossgrad_core.training.failure import NonFiniteError
 
 FILES = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
 QUICK = Options(per_group=4, probes=2, seconds=1.0)
@@ -136,3 +138,53 @@ def test_bad_requests_are_refused(scene, tmp_path):
         diagnose(scene, None, {}, QUICK, tmp_path / "b")
     with pytest.raises(UserError, match="not the folder of a run"):
         diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")
+
+
+def failing_from(monkeypatch, first):
+    """Lets every step from `first` on find something that is not finite."""
+    step = loop.take_step
+
+    def failing(setup, state):
+        record = step(setup, state)
+        if state.step >= first:
+            raise NonFiniteError(state.step, record.names, "the gradient of block means")
+        return record
+
+    monkeypatch.setattr(loop, "take_step", failing)
+
+
+def diagnosed(scene, out):
+    with pytest.raises(SystemExit) as end:
+        main(["diagnose", str(scene), "--seconds", "1", "--views", "3", "--threads", "1",
+              "--out", str(out)])  # fmt: skip
+    return end.value.code
+
+
+def test_a_training_that_fails_reports_its_probes_and_the_reason(
+    scene, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.setattr("crossgrad_core.diagnostics.command.steps_for", lambda *given: (40, ""))
+    monkeypatch.setattr("crossgrad_core.diagnostics.command.warm_up", lambda setup: 0.0)
+    failing_from(monkeypatch, 25)
+    assert diagnosed(scene, tmp_path / "out") == 1
+    printed = capfd.readouterr()
+    assert "training failed: the gradient of block means" in printed.err
+    assert "Traceback" not in printed.err
+    assert "which failed; probed before that" in printed.out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+    assert {row["step"] for row in table(tmp_path / "out")} == {"10", "20"}
+
+
+@pytest.mark.parametrize("compiling", [True, False], ids=["compiling", "training"])
+def test_a_training_that_fails_before_the_first_probe_says_so(
+    scene, tmp_path, monkeypatch, capfd, compiling
+):
+    if not compiling:
+        monkeypatch.setattr("crossgrad_core.diagnostics.command.steps_for", lambda *given: (40, ""))
+        monkeypatch.setattr("crossgrad_core.diagnostics.command.warm_up", lambda setup: 0.0)
+    failing_from(monkeypatch, 1)
+    assert diagnosed(scene, tmp_path / "out") == 1
+    printed = capfd.readouterr()
+    assert "nothing was probed before" in printed.err
+    assert "Traceback" not in printed.err
+    assert not (tmp_path / "out").exists()
