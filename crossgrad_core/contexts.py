@@ -1,6 +1,6 @@
 """What the hooks are offered and what they answer with."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -85,6 +85,15 @@ class StepRecord:
     train_seconds: float
 
 
+#: The photo [H, W, 3] uint8 of a view and its mask [H, W] bool, None where every pixel counts.
+PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
+
+
+def decoded(view: View) -> tuple[Tensor, Tensor | None]:
+    """The photo and the mask of a view, decoded off any clock."""
+    return view.photo.image(), view.photo.mask()
+
+
 @dataclass(frozen=True, eq=False)
 class StepContext:
     """What every seam may know about the step.
@@ -95,6 +104,8 @@ class StepContext:
         scene: The scene.
         states: State of every plugin by the plugin's name; read only.
         rng: The generator of the seam. Every random number of a plugin must come from it.
+        photo: Gives the photo and the mask of a view on the run's device. The time for decoding
+            them counts as loading; `view.photo` would decode them in training time.
     """
 
     step: int
@@ -102,6 +113,7 @@ class StepContext:
     scene: Scene
     states: Mapping[str, PluginState]
     rng: np.random.Generator
+    photo: PhotoOf = field(default=decoded, kw_only=True)
 
     def state(self, plugin: str) -> PluginState:
         """The state that the plugin of that name returned last; empty at first."""

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from crossgrad_core.training.views import (
     Rendered,
     add_regularization,
     joined,
+    photo_of,
     render_views,
 )
 
@@ -152,6 +154,7 @@ def _common(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
         "scene": setup.scene,
         "states": state.states,
         "rng": state.rngs[stream],
+        "photo": partial(photo_of, setup, state),
     }
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import isfinite
 from time import perf_counter
 
@@ -178,6 +179,7 @@ def add_regularization(
         scene=setup.scene,
         states=state.states,
         rng=state.rngs["regularize"],
+        photo=partial(photo_of, setup, state),
         parameters=state.parameters,
         backbone=setup.backbone,
         gaussians=gaussians,

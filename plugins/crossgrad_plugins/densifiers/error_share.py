@@ -49,7 +49,7 @@ def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKin
         with torch.no_grad():
             gaussians = context.backbone.decode(context.parameters, view.camera, phase)
             image = context.rasterizer.render(gaussians, view.camera, background).image
-            error = pixel_error(image, view, kind)
+            error = pixel_error(image, context.photo(view), kind)
         shares = _shares(context, gaussians.detached(), view, error)
         if gaussians.origin is not None:
             shares = torch.zeros_like(largest).index_add_(0, gaussians.origin, shares)
@@ -57,18 +57,17 @@ def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKin
     return largest
 
 
-def pixel_error(image: Tensor, view: View, kind: ErrorKind) -> Tensor:
+def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: ErrorKind) -> Tensor:
     """[H, W] error of each pixel, averaged over the channels; 0 where the photo is masked out.
 
     Args:
         image: [H, W, 3], the render of the view.
-        view: The view.
+        decoded: [H, W, 3] uint8 photo and [H, W] bool mask (None: every pixel counts), on the
+            image's device.
         kind: 1 - SSIM (in [0, 2]) or the absolute difference.
     """
-    mask = view.photo.mask()
-    mask = None if mask is None else mask.to(image.device)
-    photo = unit_range(view.photo.image().to(image.device), image.dtype)
-    ours, theirs = masked(image, mask), masked(photo, mask)
+    photo, mask = decoded
+    ours, theirs = masked(image, mask), masked(unit_range(photo, image.dtype), mask)
     error = 1 - ssim_map(ours, theirs) if kind == "ssim" else (ours - theirs).abs()
     return masked(error, mask).mean(-1)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import log, sqrt
+from time import sleep
 
 import mpmath as mp
 import numpy as np
@@ -134,7 +135,9 @@ def test_masked_pixels_have_no_error(kind):
     assert found.numpy() == pytest.approx(share_of(ctx, 2, kind, mask.numpy()), rel=1e-3, abs=1e-4)
     image = torch.full((HEIGHT, WIDTH, 3), torch.nan)
     image[mask] = 0.5
-    assert pixel_error(image, ctx.scene.train_views[0], kind)[~mask].eq(0).all()
+    photo = ctx.scene.train_views[0].photo
+    error = pixel_error(image, (photo.image(), photo.mask()), kind)
+    assert error[~mask].eq(0).all()
 
 
 @pytest.mark.parametrize(("number", "most"), [(5, 32), (32, 32), (33, 32), (1000, 32), (7, 1)])
@@ -243,3 +246,32 @@ def test_a_run_grows_and_lowers_opacities():
     grown = [record.counts.get("cloned", 0) + record.counts.get("split", 0) for record in records]
     assert [count > 0 for count in grown] == [False, True] * 3
     assert all(tensor.isfinite().all() for tensor in state.parameters.values())
+
+
+class Slow:
+    """A photo that takes a while to decode."""
+
+    SECONDS = 0.05
+
+    def __init__(self, photo):
+        self.mask = photo.mask
+        self._image = photo.image
+
+    def image(self):
+        sleep(self.SECONDS)
+        return self._image()
+
+
+def test_decoding_photos_for_an_edit_counts_as_loading():
+    scene = sample_scene()
+    views = tuple(replace(view, photo=Slow(view.photo)) for view in scene.views)
+    config = RunConfig(
+        reading={"init": "random"}, steps=30, densify_from=1, densify_until=29, densify_every=2,
+        rasterizer=ComponentChoice(name="torch"), sampler=ComponentChoice(name="epoch"),
+        densifier=ComponentChoice(name="revising", growth_budget=0.1, error_threshold=0.01),
+    )  # fmt: skip
+    state = first_state(setup := assemble(config, replace(scene, views=views), "none"))
+    timed_step(setup, state)
+    before = state.clock.load
+    timed_step(setup, state)  # Its edit measures every training view.
+    assert state.clock.load - before >= (1 + VIEWS) * Slow.SECONDS
