@@ -57,6 +57,8 @@ class Operator(Component):
         separate: Whether it needs the views' gradients apart. Where not, the backward passes
             accumulate into one gradient: same bits, no copies.
         views: For which K the operator has a meaning.
+        idle_at_one: Whether it leaves the gradient of a single view as it is. A run with K = 1 then
+            says that the operator does nothing.
         elementwise: Whether it works on elements instead of Gramians; such an operator cannot be a
             link of a chain or serve single blocks.
         granularity: What one Gramian covers: each block's tensors, all geometry / all appearance
@@ -66,9 +68,14 @@ class Operator(Component):
     slot: ClassVar[str] = "operators"
     separate: ClassVar[bool] = True
     views: ClassVar[ViewCounts] = ViewCounts()
+    idle_at_one: ClassVar[bool] = False
     elementwise: ClassVar[bool] = False
 
     granularity: Granularity = Field("tensor", description="what one Gramian covers")
+
+    def does_nothing(self, views: int) -> bool:
+        """Whether the result is the plain sum, whatever the gradients of that many views are."""
+        return views == 1 and self.idle_at_one
 
     @abstractmethod
     def transform(

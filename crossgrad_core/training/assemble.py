@@ -21,6 +21,7 @@ from crossgrad_core.registry import build, entries, find
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.idle import idle_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 
@@ -129,7 +130,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=choose_device(config.device),
         notes=tuple(notes),
     )
-    return replace(setup, notes=(*setup.notes, *_linear_note(setup)))
+    return replace(setup, notes=(*setup.notes, *_linear_note(setup), *idle_note(setup)))
 
 
 def _with_first_degree(config: RunConfig) -> RunConfig:

@@ -1,5 +1,7 @@
 """Aligned-MTL (Senushkin et al. 2023, "Independent component alignment")."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -16,6 +18,8 @@ class Aligned(Operator):
     K eps l_max. Where an eigenvalue falls below that, u jumps: the direction is left out and l_min
     is the next one.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -1,6 +1,6 @@
 """CAGrad (Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning")."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ class CAGrad(Operator):
     supports for up to four, an active-set method above. A single view is left as it is.
     """
 
+    idle_at_one: ClassVar[bool] = True
     c: float = Field(0.5, ge=0, description="radius of the search, as a share of |g_0|")
     rescale: Literal["none", "1+c", "1+c^2"] = Field(
         "none", description="what the direction is divided by"

@@ -34,6 +34,10 @@ class Chain(Operator):
     links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
 
     @override
+    def does_nothing(self, views: int) -> bool:
+        return views == 1 and all(link.does_nothing(views) for link in self.links)
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

@@ -1,7 +1,7 @@
 """Confidence-gated projection (arXiv 2605.00052, appendix; all numbers are ours)."""
 
 from statistics import NormalDist
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ class ConfGate(Operator):
     project; pairs with a zero gradient or without a common element (m = 0) are not counted.
     """
 
+    idle_at_one: ClassVar[bool] = True
     preset: Literal["v2", "low"] = Field("v2", description="v2: tau 0.9; low: tau 0.6")
     tau: float | None = Field(
         None, gt=0, lt=1, description="probability of conflict from which to project; over preset"

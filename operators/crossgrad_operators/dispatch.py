@@ -69,6 +69,10 @@ class Dispatch(Operator):
     )
 
     @override
+    def does_nothing(self, views: int) -> bool:
+        return all(operator.does_nothing(views) for operator in self._operators().values())
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

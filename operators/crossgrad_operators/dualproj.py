@@ -1,5 +1,7 @@
 """DualProj (Lopez-Paz and Ranzato 2017; weighting of the same name in TorchJD)."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -15,6 +17,8 @@ class DualProj(Operator):
     v = argmin v^T G v subject to v >= 1/K; u = v G. All active sets for up to four views, Lawson
     and Hanson's method above.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -23,6 +23,7 @@ class GradDrop(Operator):
     views. The expectation is `sum`. Works on elements, so that granularity means nothing here.
     """
 
+    idle_at_one: ClassVar[bool] = True
     elementwise: ClassVar[bool] = True
 
     @override

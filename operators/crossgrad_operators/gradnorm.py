@@ -1,7 +1,7 @@
 """GradNorm (Chen et al. 2018), with groups of views in place of tasks."""
 
 from collections.abc import Mapping
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ class GradNorm(Operator):
     the views of a group share it.
     """
 
+    idle_at_one: ClassVar[bool] = True
     alpha: float = Field(1.5, ge=0, description="how strongly slow groups are favoured")
     lr: float = Field(0.025, gt=0, description="step of log w")
     baseline: int = Field(50, ge=1, description="losses that make up a group's loss at the start")

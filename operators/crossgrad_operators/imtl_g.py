@@ -1,5 +1,7 @@
 """IMTL-G (Liu et al. 2021, "Towards impartial multi-task learning")."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -16,6 +18,8 @@ class IMTLG(Operator):
     Where G is singular, v is the shortest least-squares solution; where the v add up to zero, or
     nothing but rounding noise is left, the result is zero.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

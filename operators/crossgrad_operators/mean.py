@@ -19,6 +19,7 @@ class Mean(Operator):
     """
 
     separate: ClassVar[bool] = False
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

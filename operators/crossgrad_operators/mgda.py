@@ -1,5 +1,7 @@
 """MGDA (Désidéri 2012; Sener and Koltun 2018)."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -15,6 +17,8 @@ class MGDA(Operator):
     Closed form on every face: all supports for up to four views, Wolfe's method above. |u| is at
     most the shortest gradient's length; zero where the gradients oppose each other exactly.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -1,5 +1,7 @@
 """Nash-MTL (Navon et al. 2022, "Multi-task learning as a bargaining game")."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -16,6 +18,8 @@ class Nash(Operator):
     it is multiplied by the geometric mean of the norms, so that u scales with the gradients and a
     single view stays as it is. Zero where the gradients oppose each other exactly.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -1,5 +1,7 @@
 """PCGrad (Yu et al. 2020, "Gradient surgery for multi-task learning", algorithm 1)."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -16,6 +18,8 @@ class PCGrad(Operator):
     the original g_j; u is the sum of the v. One order per step serves all blocks; with two views
     there is nothing to draw.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -18,6 +18,7 @@ class Sum(Operator):
     """
 
     separate: ClassVar[bool] = False
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

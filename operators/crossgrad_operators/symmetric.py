@@ -1,5 +1,7 @@
 """Symmetric projection, the primary operator of CrossGrad-GS (arXiv 2605.00052)."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -16,6 +18,8 @@ class Symmetric(Operator):
     equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views every
     ordered pair is treated in the order of the slots, always with the original partner.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -1,5 +1,7 @@
 """UPGrad (Quinton and Rey 2024, "Jacobian descent for multi-objective optimization")."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -14,6 +16,8 @@ class UPGrad(Operator):
     For each k: v_k = argmin v^T G v subject to v >= e_k / K; u = sum of the v_k G. Two views: half
     of `symmetric`. All active sets for up to four views, Lawson and Hanson's method above.
     """
+
+    idle_at_one: ClassVar[bool] = True
 
     @override
     def transform(

@@ -48,3 +48,10 @@ def test_the_table_tells_which_views_are_admitted_and_kept_apart(name):
     admitted = [operator.views.admits(views) for views in (1, 2, 3)]
     assert [cell != "refused" for cell in (one, two, more)] == admitted
     assert apart == ("yes" if operator.separate else "no")
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_table_tells_which_operators_leave_a_single_view_as_it_is(name):
+    one = rows()[name][0]
+    if not one.startswith("as its") and one != "as the weighting":
+        assert (one == "g_1") == build("operators", name, {}).does_nothing(1)

@@ -1,0 +1,96 @@
+"""Operators that leave a single gradient as it is say so, and a run with K = 1 notes it."""
+
+import pytest
+import torch
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.aggregation import aggregated, sample_gradients
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+
+OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
+ADMITTING_ONE = [name for name in OURS if build("operators", name, {}).views.admits(1)]
+#: Options under which an operator could do something to one view.
+OPTIONS = {
+    "cagrad": {"c": 0.9, "rescale": "1+c^2"},
+    "chain": {"links": ["symmetric", "pcgrad"]},
+    "confgate": {"warmup": 0, "tau": 0.01},
+    "dispatch": {"preset": "geometry-projection"},
+    "soft": {"threshold": 0.5, "strength": 0.5},
+}
+
+
+def leaves_one_view_alone(operator):
+    """Whether the answer to a single view's gradient is that gradient."""
+    (gradients,) = sample_gradients(1)
+    given = {name: gradient.clone() for name, gradient in gradients.items()}
+    found = aggregated(operator, [gradients]).gradients
+    return all(torch.allclose(found[name], given[name], rtol=1e-6, atol=0) for name in given)
+
+
+@pytest.mark.parametrize("name", ADMITTING_ONE)
+@pytest.mark.parametrize("options", [{}, OPTIONS], ids=["defaults", "options"])
+def test_an_operator_says_whether_it_leaves_one_view_alone(name, options):
+    operator = build("operators", name, options.get(name, {}))
+    if name == "torchjd":  # Which weighting it has is TorchJD's matter: it claims nothing.
+        assert not operator.does_nothing(1)
+        return
+    assert operator.does_nothing(1) == leaves_one_view_alone(operator)
+    assert not operator.does_nothing(2)
+
+
+def test_a_chain_with_a_link_that_does_something_is_not_idle():
+    links = ["preconditioner", "symmetric"]
+    assert not build("operators", "chain", {"links": links}).does_nothing(1)
+
+
+def notes_of(operator, sampler=None, views=None):
+    config = RunConfig(
+        reading={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
+        operator=ComponentChoice.model_validate(operator), views=views,
+        sampler=ComponentChoice.model_validate(sampler or {"name": "epoch"}),
+    )  # fmt: skip
+    notes = assemble(config, sample_scene(), "none").notes
+    return [note for note in notes if "does nothing" in note]
+
+
+def test_an_operator_without_a_second_view_is_noted_once_with_the_way_out():
+    (note,) = notes_of({"name": "pcgrad"})
+    assert "operator pcgrad does nothing at K = 1" in note
+    assert "--views 2" in note
+
+
+@pytest.mark.parametrize(
+    ("operator", "sampler", "views"),
+    [
+        ({"name": "sum"}, None, None),
+        ({"name": "pcgrad"}, None, 2),
+        ({"name": "pcgrad"}, {"name": "random"}, None),
+        ({"name": "preconditioner"}, None, None),
+    ],
+    ids=["sum", "two views", "two by default", "weighs one view"],
+)
+def test_what_does_something_is_not_noted(operator, sampler, views):
+    assert notes_of(operator, sampler, views) == []
+
+
+def test_a_sampler_of_one_view_is_named_as_what_stands_in_the_way():
+    (note,) = notes_of({"name": "pcgrad"}, {"name": "near-far", "alternating": True})
+    assert "--views" not in note and "near-far" in note
+
+
+def test_the_noted_run_is_the_plain_one():
+    def trained(operator):
+        config = RunConfig(
+            reading={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
+            sampler=ComponentChoice(name="epoch"), operator=ComponentChoice(name=operator),
+        )  # fmt: skip
+        state = first_state(setup := assemble(config, sample_scene(), "none"))
+        timed_step(setup, state)
+        return state.parameters
+
+    plain, noted = trained("sum"), trained("pcgrad")
+    assert all(torch.equal(plain[name], noted[name]) for name in plain)
