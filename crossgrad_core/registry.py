@@ -14,6 +14,7 @@ from inspect import isabstract
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.places import raised_at
 from crossgrad_core.slots import GROUPS
 from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
 
@@ -51,6 +52,11 @@ class Entry:
     value: str
     distribution: str
     version: str
+
+    @property
+    def package(self) -> str:
+        """The import package or module that holds its class."""
+        return self.value.partition(":")[0].partition(".")[0].strip()
 
     @property
     def origin(self) -> str:
@@ -112,9 +118,10 @@ def load_entry(entry: Entry) -> "type[Component]":
     except UserError:
         raise
     except Exception as error:
+        place = raised_at(error, entry.package)
         raise UserError(
             f"{singular(entry.slot)} {entry.name} cannot be imported",
-            where=entry.origin,
+            where=sentences(entry.origin, place),
             found=in_one_line(error),
             todo=f"repair or uninstall {entry.distribution}; other runs are not affected",
         ) from error

@@ -69,7 +69,7 @@ def _entries_of(package: str) -> list[registry.Entry]:
 
 def _names_of(entry: registry.Entry) -> tuple[str, str]:
     """Distribution and import package of an entry."""
-    return entry.distribution, entry.value.partition(":")[0].partition(".")[0].strip()
+    return entry.distribution, entry.package
 
 
 def _normalized(name: str) -> str:
@@ -102,8 +102,12 @@ def _verdict(results: Sequence[Result], failures: Sequence[Result]) -> str:
 
 
 def _reason(result: Result) -> str:
-    """`check: reason`, wrapped and indented below its plugin."""
+    """`check: reason`, wrapped and indented below its plugin, and the place on a line of its own.
+
+    The place is not wrapped, so that it can be clicked and copied.
+    """
     text = f"{result.check}: {result.failure}"
-    return fill(
+    reason = fill(
         text, _WIDTH, initial_indent="    - ", subsequent_indent=_INDENT, break_long_words=False
     )
+    return f"{reason}\n{_INDENT}at {result.where}" if result.where else reason

@@ -1,5 +1,6 @@
 """Running the contract checks of a slot on an installed plugin and collecting what they find."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -8,6 +9,7 @@ from unittest import SkipTest
 
 from crossgrad_core import registry
 from crossgrad_core.errors import UserError
+from crossgrad_core.places import defined_at, raised_at
 from crossgrad_core.wording import in_one_line, singular
 
 #: `check(make)`, see `crossgrad_core.testing.contract`; of any slot.
@@ -22,11 +24,13 @@ class Result:
         check: Name of the check.
         failure: Why it failed; None where it passed.
         skipped: Why it does not apply; None where it does.
+        where: `file:line` of the plugin where it failed, or how its package announces it.
     """
 
     check: str
     failure: str | None = None
     skipped: str | None = None
+    where: str = ""
 
 
 def checks_of(slot: str) -> tuple[AnyCheck, ...]:
@@ -41,22 +45,38 @@ def check_entry(entry: registry.Entry) -> list[Result]:
     try:
         component = registry.load_entry(entry)
     except UserError as error:
-        return [Result("it can be loaded", failure=f"{error.found or error.what}")]
+        where = raised_at(error, entry.package) or _announced_at(entry)
+        return [Result("it can be loaded", failure=f"{error.found or error.what}", where=where)]
     try:
         component()
     except Exception as error:
-        return [Result("it can be made with default options", failure=in_one_line(error))]
+        return [_failed("it can be made with default options", error, component)]
     return [_result(check, component) for check in checks_of(entry.slot)]
 
 
-def _result(check: AnyCheck, component: Callable[[], Any]) -> Result:
+def _announced_at(entry: registry.Entry) -> str:
+    """Where the object is that an entry point names, as far as it can be found."""
+    module, _, name = entry.value.partition(":")
+    loaded = sys.modules.get(module.strip())
+    thing = getattr(loaded, name.strip(), None)
+    # What was named may be of another package, and its place no help.
+    own = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
+    return own or getattr(loaded, "__file__", None) or entry.origin
+
+
+def _failed(check: str, error: Exception, component: type) -> Result:
+    where = raised_at(error, component.__module__.partition(".")[0]) or defined_at(component)
+    if isinstance(error, AssertionError):
+        return Result(check, str(error) or "an assertion without a text failed", where=where)
+    return Result(check, in_one_line(error), where=where)
+
+
+def _result(check: AnyCheck, component: type) -> Result:
     name = check.__name__.replace("_", " ")
     try:
         check(component)
     except SkipTest as reason:
         return Result(name, skipped=str(reason))
-    except AssertionError as error:
-        return Result(name, failure=str(error) or "an assertion without a text failed")
     except Exception as error:
-        return Result(name, failure=in_one_line(error))
+        return _failed(name, error, component)
     return Result(name)

@@ -186,7 +186,59 @@ def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatc
     assert "compare lengths with each other" in flat
     assert "it can be loaded: ModuleNotFoundError: No module named 'made_up_lost'" in flat
     assert "1 of 3 plugins keep the contract" in flat
-    assert max(map(len, out.splitlines())) <= 80
+    places = [line.strip() for line in out.splitlines() if line.startswith("      at ")]
+    assert max(len(line) for line in out.splitlines() if line.strip() not in places) <= 80
+    file = third_party.parent / "good" / "made_up_cli.py"
+    line = 1 + OPERATOR.splitlines().index("class Absolute(Halving):")
+    assert f"at {file}:{line}" in places
+    assert "at made_up_lost:A, from bad-package 1.0" in places
+
+
+BROKEN = {
+    "raises in a check": (
+        "from crossgrad_core.plugin import Operator\n"
+        "class Halving(Operator):\n"
+        "    def transform(self, gramians, context, state, rng):\n"
+        "        return gramians.no_such_thing, state\n",
+        4,
+    ),
+    "raises at import": ("import numpy\nnumpy.no_such_thing\n", 2),
+    "raises at construction": (
+        "from crossgrad_core.plugin import Field, Operator\n"
+        "class Halving(Operator):\n"
+        "    share: float\n"
+        "    def transform(self, gramians, context, state, rng):\n"
+        "        return gramians, state\n",
+        2,
+    ),
+    "is not Python": ("import numpy\n\nclass Halving(:\n", 3),
+    "is of the wrong kind": ("\nclass Halving:\n    pass\n", 2),
+    "is abstract": (
+        "from crossgrad_core.plugin import Operator\n\n\nclass Halving(Operator):\n    pass\n",
+        4,
+    ),
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_check_tells_the_file_and_the_line(ran, tmp_path, monkeypatch, broken):
+    source, line = BROKEN[broken]
+    plugins = {"operators": {"halving": "made_up_broken:Halving"}}
+    write_distribution(tmp_path, "broken-package", plugins, {"made_up_broken": source})
+    monkeypatch.syspath_prepend(tmp_path)
+    code, out, _ = ran("plugins", "check", "broken-package")
+    sys.modules.pop("made_up_broken", None)
+    assert code == 1
+    assert f"      at {tmp_path / 'made_up_broken.py'}:{line}\n" in out
+
+
+def test_a_plugin_that_fails_to_import_is_refused_with_the_line(ran, tmp_path, monkeypatch):
+    source, line = BROKEN["raises at import"]
+    plugins = {"operators": {"halving": "made_up_broken:Halving"}}
+    write_distribution(tmp_path, "broken-package", plugins, {"made_up_broken": source})
+    monkeypatch.syspath_prepend(tmp_path)
+    _, _, err = ran("plugins", "show", "halving")
+    assert f"made_up_broken.py:{line}" in err
 
 
 @pytest.mark.parametrize(
