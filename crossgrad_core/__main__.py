@@ -1,5 +1,15 @@
-"""`python -m crossgrad_core` is `crossgrad`."""
+"""The command `crossgrad`, and `python -m crossgrad_core`."""
 
-from crossgrad_core.cli.main import main
+from crossgrad_core.interrupts import ended_quietly
 
-main()
+
+def main() -> None:
+    """Runs the command line; an interrupt is answered before anything large is imported."""
+    with ended_quietly():
+        from crossgrad_core.cli.main import main as command
+
+        command()
+
+
+if __name__ == "__main__":
+    main()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.interrupts import UNFINISHED
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
@@ -80,6 +81,7 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with disk_errors(path, needed):
+        UNFINISHED.add(str(temporary))
         try:
             with temporary.open("wb") as file:
                 yield file
@@ -89,6 +91,7 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
             sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+            UNFINISHED.discard(str(temporary))
 
 
 def write_atomically(path: Path, content: bytes) -> None:

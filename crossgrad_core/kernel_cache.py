@@ -28,8 +28,8 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: What is said before a kernel is compiled; its argument is the kernel's name.
-COMPILING = "compiling %s"
+#: What is said before and after a kernel is compiled; `cli/startup.py` counts on the words.
+_COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
 def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's caches are untyped
@@ -68,7 +68,12 @@ class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
     @override
     def load_overload(self, sig: object, target_context: object) -> None:
         """Finds nothing."""
-        _LOG.info(COMPILING, self._name)
+        _LOG.info(_COMPILING, self._name)
+
+    @override
+    def save_overload(self, sig: object, cres: object) -> None:
+        """Keeps nothing."""
+        _LOG.info(_COMPILED, self._name)
 
 
 class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
@@ -87,12 +92,13 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
         with suppress(Exception):
             found = super().load_overload(sig, target_context)
         if found is None:
-            _LOG.info(COMPILING, _name(self._py_func))
+            _LOG.info(_COMPILING, _name(self._py_func))
         return cast("object | None", found)
 
     @override
     def save_overload(self, sig: object, data: object) -> None:
         """Keeps a compiled function where that is possible."""
+        _LOG.info(_COMPILED, _name(self._py_func))
         try:
             super().save_overload(sig, data)
         except OSError as error:  # A full disk, say: the function itself is there.

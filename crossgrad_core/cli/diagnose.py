@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 _PROBE = "Probe"
 _MODEL = "Model"
 
@@ -107,6 +109,7 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
     Trains a short vanilla run (or takes --run), probes the gradients of single views at frozen
     parameters, and writes CSV files and a picture.
     """
+    announce()
     from crossgrad_core.diagnostics import app
     from crossgrad_core.diagnostics.command import Options
 

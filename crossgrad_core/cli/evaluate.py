@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 
 def evaluate(
     run: Annotated[
@@ -19,6 +21,7 @@ def evaluate(
     ] = None,
 ) -> None:
     """Evaluate the held-out views of a run again."""
+    announce()
     from crossgrad_core import app
 
     app.evaluate(run, device=device, threads=threads)

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 
 class Format(StrEnum):
     """File formats."""
@@ -33,6 +35,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the trained scene to a file that viewers open."""
+    announce()
     from crossgrad_core import app
 
     app.export(run, file_format=file_format.value, out=out, camera=camera)

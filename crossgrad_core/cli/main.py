@@ -10,6 +10,7 @@ from typer.main import get_command
 from crossgrad_core import __version__
 from crossgrad_core.cli import diagnose, evaluate, export, plugins, render, run, stress
 from crossgrad_core.cli.grouped import GroupedCommand
+from crossgrad_core.cli.startup import finish
 from crossgrad_core.errors import UserError
 
 #: Exit status after bad input.
@@ -74,5 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Not `app()`, which would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
     except UserError as error:
+        finish()
         typer.echo(f"error: {error}", err=True)
         sys.exit(BAD_INPUT)
+    finally:
+        finish()

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 
 class Split(StrEnum):
     """Which views are drawn."""
@@ -30,6 +32,7 @@ def render(
     ] = None,
 ) -> None:
     """Draw the views of a run as PNG files."""
+    announce()
     from crossgrad_core import app
 
     app.render(run, split=split.value, out=out, device=device)

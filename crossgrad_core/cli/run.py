@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 _PARTS = "Components (`crossgrad plugins list` shows the names)"
 _TRAINING = "Training"
 _SCENE = "Scene"
@@ -296,6 +298,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
     `crossgrad run --config config.yaml` repeats it.
     """
     given = dict(locals())
+    announce(quiet=quiet)
     from crossgrad_core.cli.settings import merged
 
     for name in ("config", "assignments", "resume", "dry_run", "quiet", "verbose"):

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.startup import announce
+
 #: Elements of the largest gradients.
 LARGE = 10_000_000
 
@@ -25,6 +27,7 @@ def stress(
     ] = None,
 ) -> None:
     """Hold operators against 50-digit arithmetic; exit status 1 if one breaks its promise."""
+    announce()
     from crossgrad_core.stress.cases import cases
     from crossgrad_core.stress.suite import installed, run_suite
     from crossgrad_core.stress.table import as_text, failed, write_csv

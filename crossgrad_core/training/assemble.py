@@ -1,5 +1,6 @@
 """From a configuration to a Setup: load, fit to the scene, object, or say what was left out."""
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from crossgrad_core.training.idle import idle_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 
+_LOG = logging.getLogger(__name__)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
 
@@ -35,6 +37,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     Raises:
         UserError: No reader accepts the folder, or the one that does cannot read it.
     """
+    _LOG.info("reading scene %s", path)
     names = [config.reader.name] if config.reader.name != AUTO else list(entries("readers"))
     for name in names:
         reader = cast("Reader", build("readers", name, config.reader.options))

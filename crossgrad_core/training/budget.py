@@ -1,5 +1,6 @@
 """How many steps fit into a budget of training seconds: a probe first, then the run's own clock."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
@@ -12,6 +13,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import TrainState
 
+_LOG = logging.getLogger(__name__)
 #: Steps that the probe of a time budget takes at least, and that a look at the clock counts.
 PROBE_STEPS = 12
 #: ... and the share of the budget that the probe takes beyond that.
@@ -37,6 +39,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
 
     Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
     """
+    _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
     state = first_state(probed)
     timed_step(probed, state)

@@ -1,5 +1,6 @@
 """The first state of a run, and compiling what it needs."""
 
+import logging
 from copy import deepcopy
 from dataclasses import replace
 from time import perf_counter
@@ -15,6 +16,7 @@ from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
+_LOG = logging.getLogger(__name__)
 #: Random initial points where a scene has none (`--init random`).
 RANDOM_POINTS = 20_000
 
@@ -69,6 +71,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     Returns:
         The seconds that it took.
     """
+    _LOG.info("loading kernels")
     start = perf_counter()
     setup = unwatched(setup)
     steps = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
@@ -83,7 +86,9 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
             state = first_state(setup) if reached is None else deepcopy(reached)
             state.step = step
             timed_step(setup, state)
-    return perf_counter() - start
+    seconds = perf_counter() - start
+    _LOG.debug("loaded kernels in %.1f s", seconds)
+    return seconds
 
 
 def initial_bytes(setup: Setup) -> int:

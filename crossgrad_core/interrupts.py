@@ -1,0 +1,68 @@
+"""Ctrl-C, `kill` and a closed terminal end a command with one line, whatever it is doing.
+
+The exit code is 128 and the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
+SIGTERM, 129 after SIGHUP. This module is the first that the command imports, and imports little.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+#: What asks a command to end, where the system has it.
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+#: Files that are being written; they are deleted where the process ends at once.
+UNFINISHED: set[str] = set()
+
+
+def exit_code(number: int) -> int:
+    """The exit code of a command that a signal ended."""
+    return 128 + number
+
+
+def listened_to() -> list[int]:
+    """The signals that are not ignored; `nohup` and background jobs of scripts ignore some."""
+    return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def tell(text: str) -> None:
+    """Writes one line to stderr, from a signal handler too."""
+    # On a terminal the cursor stands behind "^C" or a progress bar.
+    line = f"\n{text}\n" if sys.stderr.isatty() else f"{text}\n"
+    try:
+        sys.stderr.write(line)
+        sys.stderr.flush()
+    except RuntimeError:  # The handler came while stderr was being written to.
+        with suppress(OSError):
+            os.write(2, line.encode())
+    except (OSError, ValueError):
+        pass  # Nobody can be told any more.
+
+
+def end_at_once(number: int, _frame: FrameType | None) -> None:
+    """Ends the process without unwinding: an exception may be lost in a callback of a library."""
+    tell("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
+    with suppress(Exception):
+        sys.stdout.flush()
+    for path in UNFINISHED:
+        with suppress(OSError):
+            os.unlink(path)
+    os._exit(exit_code(number))
+
+
+@contextmanager
+def ended_quietly() -> Iterator[None]:
+    """Ends the process at once when it is asked to inside the block, and quietly after it."""
+    numbers = listened_to()
+    for number in numbers:
+        signal.signal(number, end_at_once)
+    try:
+        yield
+    finally:
+        # Nothing is left to do but to leave; Python's own handler would print a traceback.
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)

@@ -1,0 +1,111 @@
+"""A command says at once what it does, and tells of kernels only where it compiles some."""
+
+import logging
+import subprocess
+import sys
+import time
+
+import pytest
+
+from crossgrad_core.cli import startup
+
+#: Notes the processor seconds and the heavy modules at the first line, and ends.
+FIRST_LINE = """
+import sys, time
+
+class Writing:
+    def write(self, text):
+        heavy = {"torch", "numba", "numpy", "PIL", "yaml"} & sys.modules.keys()
+        print(time.process_time(), *heavy, *text.split())
+        sys.stdout.flush()
+        sys.exit()
+
+    def __getattr__(self, name):
+        return getattr(sys.__stderr__, name)
+
+sys.stderr = Writing()
+from crossgrad_core.__main__ import main
+main()
+"""
+LOG = logging.getLogger("crossgrad_core.kernel_cache")
+STAGES = logging.getLogger("crossgrad_core.training.start")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("run", "SCENE"), ("eval", "RUN"), ("render", "RUN"), ("export", "RUN"), ("diagnose", "S"),
+     ("stress", "sum")],
+    ids=lambda arguments: arguments[0],
+)  # fmt: skip
+def test_the_first_line_comes_before_anything_large_is_imported(arguments):
+    command = [sys.executable, "-c", FIRST_LINE, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    seconds, *words = done.stdout.split()
+    assert words == ["crossgrad", words[1], "loading", "libraries"]
+    assert float(seconds) < 2.0
+
+
+@pytest.fixture
+def announced(monkeypatch):
+    yield startup.announce
+    startup.finish()
+
+
+def test_stages_are_lines_and_kernels_are_told_only_when_they_are_compiled(announced, capsys):
+    announced()
+    STAGES.info("loading kernels")
+    STAGES.debug("loaded")
+    STAGES.info("training")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:] == ["loading kernels", "training"]
+
+
+def test_compiling_is_told_with_a_clock_that_runs_inside_a_kernel(announced, capsys, monkeypatch):
+    monkeypatch.setattr(startup, "PLAIN_INTERVAL", 0.02)
+    announced()
+    STAGES.info("loading kernels")
+    LOG.info("compiling %s", "outer")
+    LOG.info("compiling %s", "inner")
+    time.sleep(0.1)
+    LOG.info("compiled %s", "inner")
+    LOG.info("compiled %s", "outer")
+    time.sleep(0.05)
+    quiet = capsys.readouterr().err.splitlines()
+    time.sleep(0.1)
+    assert capsys.readouterr().err == ""  # nothing is compiled now
+    STAGES.debug("loaded")
+    assert quiet[2] == startup._EXPLANATION
+    assert len(quiet) > 4 and set(quiet[4:]) == {"  0 s, kernel 2: outer"}
+    assert capsys.readouterr().err == "compiled 2 kernels in 0 s\n"
+
+
+def test_on_a_terminal_the_clock_stays_on_its_line(announced, capsys, monkeypatch):
+    monkeypatch.setattr(startup, "TERMINAL_INTERVAL", 0.02)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    announced()
+    LOG.info("compiling %s", "one")
+    time.sleep(0.1)
+    startup.finish()
+    lines = capsys.readouterr().err.split("\n")
+    assert len(lines) == 4 and lines[-1] == ""
+    assert lines[2].count("\r\x1b[K  0 s, kernel 1: one") > 1
+    assert lines[2].endswith("\r\x1b[Kcompiled 1 kernel in 0 s")
+
+
+def test_quiet_shows_warnings_only(announced, capsys):
+    announced(quiet=True)
+    STAGES.info("loading kernels")
+    LOG.info("compiling %s", "one")
+    LOG.warning("kernels cannot be kept")
+    assert capsys.readouterr().err == "note: kernels cannot be kept\n"
+
+
+def test_an_error_stands_behind_the_last_stage(announced, capsys, tmp_path):
+    from crossgrad_core.cli.main import main
+
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", str(tmp_path / "none")])
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].endswith("loading libraries") and lines[1].startswith("reading scene")
+    assert lines[2].startswith("error: ")
+    assert not logging.getLogger("crossgrad_core").handlers
