@@ -33,6 +33,7 @@ from crossgrad_core.training.budget import Length, Planned, Timed, caught_up, st
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.failure import TrainingFailedError
+from crossgrad_core.training.forecast import Forecast
 from crossgrad_core.training.loop import Stopper, train
 from crossgrad_core.training.persist import from_checkpoint
 from crossgrad_core.training.resolve import resolved
@@ -78,10 +79,10 @@ def run(
         _print_dry_run(setup)
         return 0
     compile_seconds = warm_up(setup)
-    length: Length = Planned(config.revisions)
+    length: Length = Forecast(Planned(config.revisions))
     if config.seconds is not None:
         setup = _within(setup, config.seconds)
-        length = Timed(config.seconds, setup.schedule.total)
+        length = Timed(config.seconds)
     setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds, compile_seconds
@@ -216,7 +217,7 @@ def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
         )
     state.clock.compile += warm_up(setup, state)
     session = Session.resumed(folder, setup, state.step)
-    return _train(setup, state, session, Planned(setup.config.revisions))
+    return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
 
 
 def opened(

@@ -7,6 +7,8 @@ from crossgrad_core.contexts import EvaluationReport, StepRecord
 
 #: Share of a new value in the smoothed loss and step rate.
 SMOOTHING = 0.05
+#: A length that changed by a smaller share is no news.
+NEWS_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,7 @@ class Pace:
         loss: Exponentially smoothed mean loss of the step's views.
         seconds: Exponentially smoothed training seconds of a step; None after a single one.
         psnr: Overall PSNR of the last evaluation, None where there was none yet.
+        planned: Steps that were planned first, where that changed; None elsewhere.
     """
 
     total: int
@@ -28,6 +31,7 @@ class Pace:
     loss: float = 0.0
     seconds: float | None = None
     psnr: float | None = None
+    planned: int | None = None
 
     def after(self, record: StepRecord) -> "Pace":
         """The figures with one more step."""
@@ -43,7 +47,8 @@ class Pace:
 
     def lengthened(self, total: int) -> "Pace":
         """The figures of a run that is now to have `total` steps."""
-        return replace(self, total=total)
+        planned = self.total if self.planned is None else self.planned
+        return replace(self, total=total, planned=planned)
 
     def evaluated(self, report: EvaluationReport) -> "Pace":
         """The figures after an evaluation."""
@@ -76,6 +81,14 @@ def progress_line(pace: Pace) -> str:
     return ", ".join(parts)
 
 
+def length_lines(pace: Pace) -> list[str]:
+    """What became of the planned length, where that is worth a line."""
+    planned = pace.planned
+    if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
+        return []
+    return [f"the length followed the clock: {pace.total} steps instead of {planned}"]
+
+
 def figures(pace: Pace) -> list[str]:
     """Loss, PSNR and primitives, for the end of a progress bar too."""
     parts = [f"loss {pace.loss:.4f}"]
@@ -105,6 +118,14 @@ def duration(seconds: float) -> str:
     if hours:
         return f"{hours}:{minutes:02}:{rest:02}"
     return f"{minutes}:{rest:02}" if minutes else f"{rest} s"
+
+
+def roughly(seconds: float) -> str:
+    """An estimate in whole minutes, with hours where there are several."""
+    minutes = max(1, round(seconds / 60.0))
+    if minutes < 120:  # noqa: PLR2004 - two hours
+        return f"about {minutes} min"
+    return f"about {minutes // 60} h {minutes % 60:02} min"
 
 
 def _smoothed(old: float | None, new: float) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
 from crossgrad_core.files import disk_errors
 from crossgrad_core.hooks import hookimpl
-from crossgrad_core.results.lines import Pace, evaluation_line, progress_line
+from crossgrad_core.results.lines import Pace, evaluation_line, length_lines, progress_line
 
 FILE = "log.txt"
 #: Progress goes into the log so many times in a run.
@@ -79,4 +79,6 @@ class RunLog:
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
         """Writes how the run ended."""
+        for line in length_lines(self._pace):
+            self.write(line)
         self.write(f"run {status}")

@@ -7,7 +7,7 @@ from math import ceil
 from typing import Protocol
 
 from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.assemble import schedule_of
+from crossgrad_core.training.assemble import growth_note, schedule_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
@@ -30,8 +30,6 @@ TOLERANCE = 0.02
 #: Share of the newest stretch in the smoothed cost of a step. Views differ, and other programs
 #: come and go.
 SMOOTHING = 0.25
-#: The user is told when the length has changed by this share.
-NEWS_SHARE = 0.1
 
 
 def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
@@ -85,7 +83,7 @@ class Planned:
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that is written down."""
-        return lengthened(setup, state.step, self._revisions[state.step])
+        return _told(setup, lengthened(setup, state.step, self._revisions[state.step]))
 
 
 class Timed:
@@ -93,12 +91,10 @@ class Timed:
 
     Args:
         seconds: The budget.
-        planned: The length that the run starts with.
     """
 
-    def __init__(self, seconds: float, planned: int) -> None:
+    def __init__(self, seconds: float) -> None:
         self._seconds = seconds
-        self._told = planned
         self._step = 0
         self._clock = 0.0
         self._each: float | None = None
@@ -120,28 +116,32 @@ class Timed:
         total = state.step + _fitting(lambda left: _cost_ahead(setup, state.step, left), affordable)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
-        self._tell(setup, total, each)
-        config = setup.config
-        revisions = (*config.revisions, (state.step, total))
-        config = config.model_copy(update={"revisions": revisions})
-        return lengthened(replace(setup, config=config), state.step, total)
+        revisions = (*setup.config.revisions, (state.step, total))
+        config = setup.config.model_copy(update={"revisions": revisions})
+        return _told(setup, lengthened(replace(setup, config=config), state.step, total))
 
     def _look(self, state: TrainState) -> None:
         self._step, self._clock = state.step, state.clock.train
 
-    def _tell(self, setup: Setup, total: int, each: float) -> None:
-        if abs(total - self._told) < NEWS_SHARE * self._told:
-            return
-        text = f"{total} steps instead of {self._told} fit into {self._seconds:g} s"
-        setup.hook.crossgrad_message(text=f"{text}: a step takes {each * 1000:.1f} ms now")
-        self._told = total
+
+def seconds_ahead(setup: Setup, step: int, each: float) -> float:
+    """Training seconds that the steps after `step` are going to take, growth included.
+
+    Args:
+        setup: The run.
+        step: Steps done.
+        each: Seconds that a step takes now.
+    """
+    left = setup.schedule.total - step
+    return left * each * _growth(setup, setup.schedule, step)
 
 
 def lengthened(setup: Setup, step: int, total: int) -> Setup:
     """The setup of a run that has reached `step` and is to have `total` steps in all."""
     wanted = schedule_of(setup.config, setup.densifier, total)
     setup.hook.crossgrad_length(step=step, total=total)
-    return replace(setup, schedule=setup.schedule.lengthened(wanted, step))
+    schedule = setup.schedule.lengthened(wanted, step)
+    return _with_notes(replace(setup, schedule=schedule), instead_of=setup)
 
 
 def caught_up(setup: Setup, step: int) -> Setup:
@@ -150,6 +150,32 @@ def caught_up(setup: Setup, step: int) -> Setup:
         if done <= step:
             setup = lengthened(setup, done, total)
     return setup
+
+
+def _with_notes(setup: Setup, instead_of: Setup) -> Setup:
+    """The setup with the notes on its length in place of those that were true before."""
+    gone = {*growth_note(instead_of), *_length_note(instead_of)}
+    kept = (note for note in setup.notes if note not in gone)
+    return replace(setup, notes=(*kept, *growth_note(setup), *_length_note(setup)))
+
+
+def _length_note(setup: Setup) -> tuple[str, ...]:
+    planned, total = setup.config.steps, setup.schedule.total
+    if planned is None or planned == total:
+        return ()
+    return (f"the length followed the clock: {total} steps instead of {planned}",)
+
+
+def _told(before: Setup, after: Setup) -> Setup:
+    """The later setup; says where its length brings density control about or leaves it out."""
+    was, now = growth_note(before), growth_note(after)
+    if was and not now:
+        start, end = after.schedule.densify_from, after.schedule.densify_until
+        text = f"density control after all: in {after.schedule.total} steps it lasts from step "
+        before.hook.crossgrad_message(text=f"{text}{start} to step {end}")
+    elif now and not was:
+        before.hook.crossgrad_message(text=now[0])
+    return after
 
 
 def _without_edits(schedule: Schedule) -> Schedule:

@@ -119,6 +119,22 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
+def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkeypatch, capsys):
+    # The plan is too short for density control (it would end in step 14), the run is not.
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps"))
+    settings = {"densify_from": 13, "densify_every": 1, "steps": None, "seconds": 3.0}
+    given = {"scene": str(scene), "out": str(tmp_path / "timed"), "threads": 1, **settings}
+    assert app.run(given, verbosity=0) == 0
+    summary = json.loads((tmp_path / "timed" / "summary.json").read_text())
+    told = [line for line in capsys.readouterr().err.splitlines() if "density control" in line]
+    logged = (tmp_path / "timed" / "log.txt").read_text()
+    assert summary["step"] > 30
+    assert not any("no density control" in note for note in summary["notes"])
+    assert f"followed the clock: {summary['step']} steps instead of 28" in summary["notes"][-1]
+    assert len(told) == 2 and told[0].startswith("- no density control")
+    assert told[1].startswith("density control after all") and told[1] in logged
+
+
 def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_path):
     lengths = {"steps": 30, "revisions": [[10, 50], [20, 44], [34, 48]]}
     assert run(scene, tmp_path / "whole", **lengths) == 0

@@ -9,7 +9,13 @@ from pydantic import Field, PrivateAttr
 from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.observer import Observer
-from crossgrad_core.results.lines import Pace, evaluation_line, figures, progress_line
+from crossgrad_core.results.lines import (
+    Pace,
+    evaluation_line,
+    figures,
+    length_lines,
+    progress_line,
+)
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -96,7 +102,11 @@ class Progress(Observer):
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-        if self.level != "quiet" and status != "finished":
+        if self.level == "quiet":
+            return
+        for line in length_lines(self._pace):
+            self._say(line)
+        if status != "finished":
             self._say(f"run {status}")
 
     def _tell_changes(self, record: StepRecord) -> None:

@@ -100,3 +100,27 @@ def test_the_bar_of_a_resumed_run_does_not_start_at_zero(monkeypatch: pytest.Mon
 def test_a_stopped_run_says_so(capsys: pytest.CaptureFixture[str]):
     make_manager({"progress": Progress()}).hook.crossgrad_run_end(status="stopped")
     assert capsys.readouterr().err == "run stopped\n"
+
+
+@pytest.mark.parametrize(
+    ("totals", "said"),
+    [
+        ((21, 30, 25, 40, 31, 30), ["the length followed the clock: 30 steps instead of 20"]),
+        ((40, 30, 20), []),
+        ((21,), []),
+    ],
+)
+def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
+    hook = make_manager({"progress": Progress()}).hook
+    run = SimpleNamespace(
+        scene=SimpleNamespace(name="s", train=(), test=()),
+        schedule=SimpleNamespace(total=20),
+        folder=None,
+        notes=(),
+    )
+    hook.crossgrad_run_start(run=run)
+    for step, total in enumerate(totals, 1):
+        hook.crossgrad_length(step=step, total=total)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    hook.crossgrad_run_end(status="finished")
+    assert capsys.readouterr().err.splitlines() == said

@@ -89,6 +89,8 @@ def test_log_holds_what_the_run_says(tmp_path: Path):
         hook.crossgrad_step_end(record=record(step))
     hook.crossgrad_message(text="first\n\nthird")
     hook.crossgrad_evaluation(report=EvaluationReport(4, {"psnr": 20.0, "ssim": 0.5}))
+    hook.crossgrad_length(step=4, total=50)
+    hook.crossgrad_length(step=5, total=60)
     hook.crossgrad_run_end(status="stopped")
     lines = (tmp_path / "log.txt").read_text().splitlines()
     assert all(line.startswith("09:08:07") for line in lines)
@@ -101,6 +103,7 @@ def test_log_holds_what_the_run_says(tmp_path: Path):
         "",
         "third",
         "evaluated at step 4: PSNR 20.00 dB, SSIM 0.5000, - s training",
+        "the length followed the clock: 60 steps instead of 40",
         "run stopped",
     ]
 

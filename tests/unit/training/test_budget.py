@@ -10,7 +10,16 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.densifier import Densifier
 from crossgrad_core.registry import build
 from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.budget import Timed, _cost, _fitting, _without_edits, caught_up
+from crossgrad_core.training.assemble import growth_note
+from crossgrad_core.training.budget import (
+    Planned,
+    Timed,
+    _cost,
+    _fitting,
+    _without_edits,
+    caught_up,
+    lengthened,
+)
 from crossgrad_core.training.state import Clock
 
 
@@ -36,6 +45,7 @@ class Run:
     selection: SimpleNamespace
     schedule: Schedule
     hook: Hook = field(default_factory=Hook)
+    notes: tuple[str, ...] = ("a note on the scene",)
 
 
 def setup(densifier="adc", steps=1000):
@@ -78,7 +88,7 @@ def test_without_density_control_every_step_costs_the_same():
 def timed(seconds, planned, cost):
     """A run whose step s takes cost(s, schedule) seconds, and its clock at the end."""
     run, state = setup(steps=planned), SimpleNamespace(step=0, clock=Clock())
-    length = Timed(seconds, planned)
+    length = Timed(seconds)
     while state.step < run.schedule.total:
         state.step += 1
         state.clock.train += cost(state.step, run.schedule)
@@ -107,7 +117,10 @@ def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
     run, seconds = timed(140.0, planned, cost)
     assert seconds == pytest.approx(140.0, rel=0.01)
     assert run.schedule.total == run.schedule.lr_steps
-    assert run.hook.texts
+    assert run.notes == (
+        "a note on the scene",
+        f"the length followed the clock: {run.schedule.total} steps instead of {planned}",
+    )
 
 
 def test_a_budget_that_is_used_up_ends_the_run():
@@ -130,3 +143,45 @@ def test_a_length_that_fits_stays():
     run, _ = timed(140.0, 1000, lambda step, schedule: 0.14)
     assert run.config.revisions == ()
     assert run.schedule == Schedule.for_run(1000)
+    assert run.notes == ("a note on the scene",)
+
+
+def noted(run):
+    """The run with its note on density control, as `app.run` starts it."""
+    return replace(run, notes=(*run.notes, *growth_note(run)))
+
+
+def growth_notes(run):
+    return [note for note in run.notes if "density control" in note]
+
+
+def test_notes_that_the_clock_overtakes_are_withdrawn():
+    run = noted(setup(steps=935))
+    assert len(growth_notes(run)) == 1
+    longer = lengthened(run, 100, 3000)
+    assert growth_notes(longer) == []
+    assert longer.notes[-1] == "the length followed the clock: 3000 steps instead of 935"
+    shorter = lengthened(longer, 200, 900)
+    assert growth_notes(shorter) == list(growth_note(shorter)) != []
+    assert shorter.notes[-1] == "the length followed the clock: 900 steps instead of 935"
+    back = lengthened(shorter, 300, 935)
+    assert back.notes == run.notes
+
+
+@pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
+def test_the_user_is_told_once_that_density_control_takes_place_after_all(length):
+    run, state = noted(setup(steps=935)), SimpleNamespace(step=0, clock=Clock())
+    while state.step < run.schedule.total:
+        state.step += 1
+        state.clock.train += 0.04
+        if state.step < run.schedule.total and length.due(state):
+            run = length.revised(run, state)
+    assert growth_notes(run) == []
+    (text,) = run.hook.texts
+    assert text.startswith("density control after all: in ") and "from step 500 to step" in text
+
+
+def test_the_user_is_told_where_density_control_is_left_out_later():
+    run = noted(setup(steps=3000))
+    Planned(((20, 900),)).revised(run, SimpleNamespace(step=20))
+    assert run.hook.texts == list(growth_note(setup(steps=900)))

@@ -1,0 +1,75 @@
+"""A run of so many steps says after the first ones how long it takes."""
+
+from dataclasses import make_dataclass
+from types import SimpleNamespace
+
+import pytest
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.registry import build
+from crossgrad_core.results.lines import roughly
+from crossgrad_core.schedule import Schedule
+from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
+from crossgrad_core.training.forecast import LOOK_STEPS, Forecast
+from crossgrad_core.training.state import Clock
+
+RUN = make_dataclass(
+    "Run", ["config", "densifier", "selection", "schedule", "hook", "notes"], frozen=True
+)
+
+
+def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
+    """What a run says whose steps take `each` seconds, the first one `wait` more."""
+    said, revised = [], []
+    hook = SimpleNamespace(
+        crossgrad_message=lambda text: said.append((state.step, text)),
+        crossgrad_length=lambda step, total: revised.append((step, total)),
+    )
+    run = RUN(
+        config=RunConfig(steps=steps),
+        densifier=build("densifiers", densifier, {}),
+        selection=SimpleNamespace(names={"densifier": densifier}),
+        schedule=Schedule.for_run(steps),
+        hook=hook,
+        notes=(),
+    )
+    length = Forecast(Planned(revisions))
+    state = SimpleNamespace(step=first, clock=Clock(train=100.0 * bool(first) + wait))
+    for _ in range(min(steps - first - 1, 200)):
+        state.step += 1
+        state.clock.train += each
+        if length.due(state):
+            run = length.revised(run, state)
+    return said
+
+
+def test_the_default_length_is_told_in_hours_once_with_a_way_out():
+    ((step, text),) = texts(0.1, 30_000, wait=60.0)  # a slow first step is not taken for the rest
+    hours = (30_000 - step) * 0.1 * (1.0 + COST_PER_EDIT * COUNTED_EDITS) / 3600
+    assert 1.6 < hours < 1.7
+    assert f"{30_000 - step:,} more steps take about 100 min" in text
+    assert "one takes 100 ms now, growth included" in text and "--seconds S" in text
+
+
+def test_without_density_control_nothing_is_added():
+    ((step, text),) = texts(1.0, 30_000, "none")
+    assert step == 1 + LOOK_STEPS
+    assert "29,996 more steps take about 8 h 20 min (one takes 1000 ms now)" in text
+
+
+def test_a_resumed_run_tells_what_is_left():
+    ((_, text),) = texts(1.0, 30_000, "none", first=29_000)
+    assert "996 more steps take about 17 min" in text
+
+
+def test_a_short_run_says_nothing():
+    assert texts(0.01, 900) == []
+    assert texts(0.01, 900, revisions=((20, 800),)) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(61, "1 min"), (7100, "118 min"), (7200, "2 h 00 min"), (360_000, "100 h 00 min")],
+)
+def test_estimates_are_rough(seconds, text):
+    assert roughly(seconds) == f"about {text}"
