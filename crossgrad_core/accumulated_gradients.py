@@ -9,6 +9,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.blocks import Block
+from crossgrad_core.gradient_passes import unit_roundoff
 from crossgrad_core.gradient_passes.plain import plain_sums
 from crossgrad_core.gradient_passes.squares import column_gramians
 from crossgrad_core.gradients import Elementwise, ViewGradients
@@ -107,8 +108,17 @@ class AccumulatedGradients(ViewGradients):
         self._require_blocks(granularity)
         return np.stack(self._present, axis=1)
 
+    @property
+    @override
+    def unit(self) -> float:
+        return unit_roundoff([list(self._sum.values())])
+
     @override
     def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
+        self._refuse()
+
+    @override
+    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
         self._refuse()
 
     @override

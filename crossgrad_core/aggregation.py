@@ -1,6 +1,7 @@
 """From the gradients of K views to one, by way of Gramians: what all Gramian operators share."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,8 @@ def operator_context(
         distances=context.distances,
         reference_distance=context.reference_distance,
         present=present,
+        unit=context.gradients.unit,
+        remainders=partial(context.gradients.remainders, granularity),
     )
 
 

@@ -13,8 +13,8 @@ from typing_extensions import override
 
 from crossgrad_core.accumulated_gradients import AccumulatedGradients
 from crossgrad_core.blocks import Block
-from crossgrad_core.gradient_passes import Column, generic, is_native, native
-from crossgrad_core.gradient_passes.squares import column_gramians
+from crossgrad_core.gradient_passes import Column, exact, generic, is_native, native, unit_roundoff
+from crossgrad_core.gradient_passes.squares import column_gramians, column_remainders
 from crossgrad_core.gradients import Elementwise, ViewGradients
 from crossgrad_core.operator import Granularity
 
@@ -61,6 +61,7 @@ class DenseViewGradients(ViewGradients):
         self._overwrite = overwrite
         self._spent = False
         self._known: dict[Granularity, NDArray[np.float64]] = {}
+        self._lost: dict[Granularity, NDArray[np.float64]] = {}
         self._tensors = tuple(name for block in self._blocks for name in block.tensors)
         self._columns: tuple[Column, ...] = tuple(
             [_prepared(view.get(name)) for view in views] for name in self._tensors
@@ -89,6 +90,20 @@ class DenseViewGradients(ViewGradients):
         if finite.all():
             return raw.copy()
         return np.where(finite[:, :, None] & finite[:, None, :], raw, 0.0)
+
+    @property
+    @override
+    def unit(self) -> float:
+        return unit_roundoff(self._columns)
+
+    @override
+    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        if granularity not in self._lost:
+            self._require_unspent()
+            # What is added to an infinity or a NaN makes no difference.
+            found = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
+            self._lost[granularity] = found
+        return self._lost[granularity]
 
     @override
     def present(self, granularity: Granularity) -> NDArray[np.bool_]:
@@ -203,6 +218,21 @@ class DenseViewGradients(ViewGradients):
                 places = [self._tensors.index(name) for name in block.tensors]
                 parts.append(self._squares[places].sum(axis=0)[None])
         return np.concatenate(parts) if parts else np.zeros((0, self._views, self._views))
+
+    def _remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        raw = self._raw(granularity)
+        if granularity != "gaussian":
+            return column_remainders(self._columns, self._groups(granularity).of_tensor, raw)
+        parts, first = [np.zeros((0, self._views, self._views))], 0
+        for block, columns, rows in self._by_block():
+            part = raw[first : first + rows]
+            first += rows
+            if block.per_primitive:
+                parts.append(exact.row_remainders(columns, rows, part))
+            else:
+                group = np.array([0 if name in block.tensors else -1 for name in self._tensors])
+                parts.append(column_remainders(self._columns, group, part))
+        return np.concatenate(parts)
 
     def _by_block(self) -> Sequence[tuple[Block, Sequence[Column], int]]:
         result, place = [], 0

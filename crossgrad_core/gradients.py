@@ -28,9 +28,21 @@ class ViewGradients(ABC):
     def names(self, granularity: Granularity) -> tuple[str, ...]:
         """[B] name of the block (or group) that each Gramian belongs to."""
 
+    @property
+    @abstractmethod
+    def unit(self) -> float:
+        """Smallest unit roundoff of the gradients' types: what results can be right to."""
+
     @abstractmethod
     def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
         """[B, K, K] float64 Gramians; views with a non-finite gradient have zero rows."""
+
+    @abstractmethod
+    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        """[B, K, K] what rounding took from the Gramians: the sum of both has twice the digits.
+
+        Takes ten times as long as the Gramians.
+        """
 
     @abstractmethod
     def present(self, granularity: Granularity) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """The operator slot: K per-view gradients of a block -> one update direction."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -35,6 +35,10 @@ class OperatorContext:
         reference_distance: Their median over all training cameras.
         present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
             columns of the others are zero in the Gramian; an operator must give them weight 0.
+        unit: Unit roundoff of the gradients' type: no result needs to be closer.
+        remainders: Works out [B, K, K], what rounding to float64 took from the Gramians; both
+            together have twice the digits. It takes another, slower pass over the gradients: for
+            Gramians so close to singular that their own rounding shows. None where nobody knows.
     """
 
     step: int
@@ -45,6 +49,8 @@ class OperatorContext:
     distances: NDArray[np.float64]
     reference_distance: float
     present: NDArray[np.bool_]
+    unit: float = 2.0**-24
+    remainders: Callable[[], NDArray[np.float64]] | None = None
 
 
 class Operator(Component):

@@ -18,3 +18,9 @@ def is_native(column: Column) -> bool:
         if gradient is not None and (gradient.dtype != torch.float32 or not gradient.is_cpu):
             return False
     return True
+
+
+def unit_roundoff(columns: Sequence[Column]) -> float:
+    """The smallest unit roundoff of the gradients' types, 2^-24 for float32 ones or none at all."""
+    types = {gradient.dtype for column in columns for gradient in column if gradient is not None}
+    return min(torch.finfo(kind).eps / 2 for kind in types or {torch.float32})

@@ -18,7 +18,7 @@ def gramian(column: Column, scale: float = 1.0) -> Tensor:
     """[K, K] float64 Gramian of `scale` times a column's gradients, on their device."""
     first = _any(column)
     total = first.new_zeros((len(column), len(column)), dtype=torch.float64)
-    partial = [wide @ wide.T for wide in _pieces(column, scale)]
+    partial = [wide @ wide.T for wide in pieces(column, scale)]
     return torch.stack(partial).sum(dim=0) if partial else total
 
 
@@ -80,7 +80,7 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     for column in columns:
         if not rows or all(g is None for g in column):
             continue
-        for piece, wide in _row_pieces(column, rows):
+        for piece, wide in row_pieces(column, rows):
             total[piece] += torch.einsum("knd,lnd->nkl", wide, wide).cpu().numpy()
     return total
 
@@ -112,7 +112,7 @@ def _any(column: Column) -> Tensor:
     return next(g for g in column if g is not None)
 
 
-def _pieces(column: Column, scale: float) -> Iterator[Tensor]:
+def pieces(column: Column, scale: float) -> Iterator[Tensor]:
     """[K, L] float64 pieces of the column's gradients, times `scale`."""
     first = _any(column)
     step = PIECE.get(first.device.type, PIECE["cpu"])
@@ -128,7 +128,7 @@ def _pieces(column: Column, scale: float) -> Iterator[Tensor]:
         yield torch.stack(rows)
 
 
-def _row_pieces(column: Column, rows: int) -> Iterator[tuple[slice, Tensor]]:
+def row_pieces(column: Column, rows: int) -> Iterator[tuple[slice, Tensor]]:
     """Row ranges with [K, n, d] float64 gradients of their rows."""
     first = _any(column)
     width = max(first.numel() // rows, 1)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.gradient_passes import Column, generic, is_native, native
+from crossgrad_core.gradient_passes import Column, exact, generic, is_native, native
 
 #: Largest magnitudes of float64 gradients whose squares and products stay well inside float64.
 SAFE: Final = (1e-140, 1e140)
@@ -24,7 +24,7 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
     touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]
     compiled = [t for t in touched if is_native(columns[t])]
     others = [t for t in touched if not is_native(columns[t])]
-    scale = _scale([columns[t] for t in others])
+    scale = _scale(columns)
     if compiled:
         gramians[compiled] = native.gramians([columns[t] for t in compiled])
         if scale != 1.0:
@@ -35,9 +35,23 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
     return gramians
 
 
+def column_remainders(
+    columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[B, K, K] what rounding took from the sums `gramians` of `column_gramians`.
+
+    Args:
+        columns: T columns.
+        group: [T] which of the sums each column is part of; -1 for none.
+        gramians: [B, K, K].
+    """
+    return exact.remainders(columns, group, gramians, _scale(columns))
+
+
 def _scale(columns: Sequence[Column]) -> float:
     """The power of two that keeps products of float64 gradients inside float64."""
-    wide = [column for column in columns if _dtype(column) == torch.float64]
+    touched = [column for column in columns if any(g is not None for g in column)]
+    wide = [column for column in touched if _dtype(column) == torch.float64]
     if not wide:
         return 1.0
     sizes = torch.stack([generic.largest(column) for column in wide]).cpu().numpy()

@@ -59,7 +59,8 @@ class Chain(Operator):
             empty = _noise(seen, product, gramians)
             product = np.where(empty[:, :, None], 0.0, product)
             seen = np.where(empty[:, :, None] | empty[:, None, :], 0.0, seen)
-            seen_context = replace(context, present=~empty)
+            # Products of rounded matrices are rounded themselves.
+            seen_context = replace(context, present=~empty, remainders=None)
         return product, outer_state(states)
 
     @hookimpl

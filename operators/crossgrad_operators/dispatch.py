@@ -137,11 +137,13 @@ class Dispatch(Operator):
 
 
 def _part(context: OperatorContext, part: NDArray[np.int64]) -> OperatorContext:
+    whole = context.remainders
     return replace(
         context,
         blocks=tuple(context.blocks[b] for b in part),
         kinds=tuple(context.kinds[b] for b in part),
         present=context.present[part],
+        remainders=None if whole is None else lambda: whole()[part],
     )
 
 

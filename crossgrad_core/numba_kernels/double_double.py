@@ -1,0 +1,81 @@
+"""Arithmetic with unevaluated sums of two float64 numbers: about 32 digits.
+
+A number is a pair (high, low) with |low| at most half a unit in the last place of high. The sums
+and products of float64 numbers are exact (Knuth 1969, Dekker 1971), those of pairs right to a few
+times 2^-104.
+"""
+
+import numpy as np
+from numba import njit
+
+#: Splits a float64 number into two halves whose products are exact.
+_SPLITTER = 134217729.0
+
+
+@njit(cache=True, inline="always")
+def two_sum(a: float, b: float) -> tuple[float, float]:
+    """The sum and what rounding took from it."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+@njit(cache=True, inline="always")
+def quick_two_sum(a: float, b: float) -> tuple[float, float]:
+    """The same where |a| >= |b|."""
+    total = a + b
+    return total, b - (total - a)
+
+
+@njit(cache=True, inline="always")
+def two_product(a: float, b: float) -> tuple[float, float]:
+    """The product and what rounding took from it; magnitudes below 1e150."""
+    product = a * b
+    scaled = _SPLITTER * a
+    a_high = scaled - (scaled - a)
+    a_low = a - a_high
+    scaled = _SPLITTER * b
+    b_high = scaled - (scaled - b)
+    b_low = b - b_high
+    error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+    return product, error
+
+
+@njit(cache=True)
+def add(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
+    """(a + a_low) + (b + b_low)."""
+    high, low = two_sum(a, b)
+    more, less = two_sum(a_low, b_low)
+    high, low = quick_two_sum(high, low + more)
+    return quick_two_sum(high, low + less)
+
+
+@njit(cache=True)
+def multiply(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
+    """(a + a_low) (b + b_low)."""
+    high, low = two_product(a, b)
+    return quick_two_sum(high, low + (a * b_low + a_low * b))
+
+
+@njit(cache=True)
+def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
+    """(a + a_low) / (b + b_low)."""
+    first = a / b
+    high, low = multiply(b, b_low, first, 0.0)
+    rest, rest_low = add(a, a_low, -high, -low)
+    second = rest / b
+    high, low = multiply(b, b_low, second, 0.0)
+    rest, _ = add(rest, rest_low, -high, -low)
+    high, low = quick_two_sum(first, second)
+    return add(high, low, rest / b, 0.0)
+
+
+@njit(cache=True)
+def square_root(a: float, a_low: float) -> tuple[float, float]:
+    """The root of a + a_low >= 0."""
+    if a <= 0.0:
+        return 0.0, 0.0
+    root = np.sqrt(a)
+    high, low = two_product(root, root)
+    rest, _ = add(a, a_low, -high, -low)
+    return quick_two_sum(root, rest / (2.0 * root))
