@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from crossgrad_core.scene.blank_photos import without_blank_photos
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
 from crossgrad_core.scene.options import SceneOptions
@@ -20,8 +21,9 @@ from crossgrad_core.scene.types import Camera, Scene, View
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     """The scene that is trained on.
 
-    Views without a photo, or in neither split list, are left out. The local frame is that of the
-    training cameras. No photo is decoded and nothing is written to disk.
+    Views without a photo, or in neither split list, and training views that are masked as a whole
+    are left out. The local frame is that of the training cameras. Nothing is written to disk, and
+    no photo is decoded but those whose mask or transparency leaves it open whether a pixel counts.
 
     Raises:
         UserError: The input cannot be trained on; says what is wrong, where, and what to do.
@@ -30,6 +32,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     points, point_notes = check_points(raw, options)
     photos = choose_photos(raw, options)
     split = split_views(sorted(photos.sources), options, raw.root, raw.split)
+    split = without_blank_photos(split, photos.sources, raw.root)
     listed = {*split.train, *split.test}
     used = sorted((v for v in raw.views if v.name in listed), key=lambda view: view.name)
     train = _positions(used, split.train)

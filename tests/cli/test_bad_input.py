@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from crossgrad_core.cli.main import main
 from crossgrad_core.testing.scenes import write_tiny_scene
@@ -110,8 +111,6 @@ def photo_is_text(scene, tmp):
 
 
 def photo_of_another_shape(scene, tmp):
-    from PIL import Image
-
     Image.new("RGB", (40, 40)).save(scene / "images/0001.jpg")
     return ["run", str(scene), *BASE]
 
@@ -152,6 +151,40 @@ def zero_points(scene, tmp):
 
     edited(scene, change)
     return ["run", str(scene), *BASE]
+
+
+def masked(scene: Path, grey: int) -> list[str]:
+    (scene / "masks").mkdir()
+    for photo in (scene / "images").iterdir():
+        Image.new("L", (48, 32), grey).save(scene / "masks" / f"{photo.name}.png")
+    return ["run", str(scene), *BASE]
+
+
+def all_photos_masked(scene, tmp):
+    return masked(scene, 0)
+
+
+def all_photos_transparent(scene, tmp):
+    for photo in sorted((scene / "images").iterdir()):
+        Image.new("RGBA", (48, 32)).save(photo.with_suffix(".png"))
+        photo.unlink()
+    return ["run", str(scene), *BASE]
+
+
+def mask_of_another_shape(scene, tmp):
+    arguments = masked(scene, 255)
+    Image.new("L", (48, 48)).save(scene / "masks" / "0001.jpg.png")
+    return arguments
+
+
+def mask_folder_not_there(scene, tmp):
+    return ["run", str(scene), "--set", "reading.masks=msks", *BASE]
+
+
+def masks_of_other_photos(scene, tmp):
+    (scene / "mine").mkdir()
+    Image.new("L", (48, 32)).save(scene / "mine" / "other.png")
+    return ["run", str(scene), "--set", "reading.masks=mine", *BASE]
 
 
 def scene_not_there(scene, tmp):
@@ -260,7 +293,9 @@ def plugin_not_there(scene, tmp):
 MAKERS = [
     truncated_cameras, truncated_images, truncated_points, garbage_cameras, empty_model, no_sparse,
     no_photos, half_a_photo, photo_is_text, photo_of_another_shape, nan_pose, negative_focal,
-    unknown_camera_model, two_images_of_one_name, zero_points, scene_not_there, scene_is_a_file,
+    unknown_camera_model, two_images_of_one_name, zero_points, all_photos_masked,
+    all_photos_transparent, mask_of_another_shape, mask_folder_not_there, masks_of_other_photos,
+    scene_not_there, scene_is_a_file,
     unknown_option, unknown_operator, unknown_component_option, option_out_of_bounds,
     unknown_setting, set_without_value, zero_steps, steps_and_seconds, odd_pair, bad_background,
     no_such_device, used_output_folder, broken_config, config_not_there, init_is_no_ply,

@@ -321,13 +321,16 @@ class TestPhotos:
             with Image.open(path / "images" / f"{name}.png") as image:
                 converted = image.convert(mode)
             if mode == "RGBA":
-                converted.putalpha(Image.new("L", converted.size, 100))
+                alpha = Image.new("L", converted.size, 100)
+                alpha.paste(255, (24, 0, 48, 32))
+                converted.putalpha(alpha)
             converted.save(path / "images" / f"{name}.png")
         scene = read(path)
         assert "1 of 8 with transparency: alpha < 0.5 does not count" in notes(scene)
         assert "1 of 8 grey: three equal channels" in notes(scene)
         assert scene.views[1].photo.image().shape == (32, 48, 3)
-        assert not scene.views[2].photo.mask().any()
+        keep = scene.views[2].photo.mask()
+        assert not keep[:, :24].any() and keep[:, 24:].all()
         assert scene.views[3].photo.mask() is None
 
     @pytest.mark.parametrize("name", ["0002.png.png", "0002.png"])
