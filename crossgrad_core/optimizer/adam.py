@@ -96,7 +96,8 @@ def update_tensor(
         flat = [t.detach().view(-1).numpy() for t in tensors]
         update_arrays(flat[0], grad.detach().contiguous().view(-1).numpy(), flat[1], flat[2], step)
         # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
-        torch.autograd.graph.increment_version(tensors)
+        for tensor in tensors:  # Older versions of torch take one at a time.
+            torch.autograd.graph.increment_version(tensor)
     else:
         update_reference(param, grad, exp_avg, exp_avg_sq, step)
 
