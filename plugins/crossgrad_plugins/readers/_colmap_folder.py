@@ -108,11 +108,14 @@ def _similar_folder(scene: Path) -> Path | None:
 def _no_model(scene: Path) -> UserError:
     below = sorted(path.name for path in scene.iterdir())
     return UserError(
-        "the scene has no COLMAP model",
+        "the scene has no COLMAP model, which says where each photo was taken from",
         where=scene,
-        expected="sparse/0/ with cameras, images and points3D, as .bin or .txt",
+        expected="images/ with the photos and sparse/0/ with cameras, images and points3D, as .bin "
+        "or .txt",
         found=", ".join(below[:8]) or "an empty folder",
-        todo="run COLMAP first (crossgrad prepare PHOTOS SCENE), or name the model's folder",
+        todo="name the folder that holds sparse/, or estimate the poses with pycolmap, which is "
+        "installed with crossgrad: extract_features, match_exhaustive, incremental_mapping "
+        "(docs/photos.md has the lines)",
     )
 
 
