@@ -86,6 +86,6 @@ def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
         return []
     return [
         f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
-        "others are decoded again whenever they are drawn (more memory: cache_mib; smaller photos: "
-        "max_size or a folder of reduced photos)"
+        "others are decoded again whenever they are drawn (more memory: --set reading.cache_mib=N; "
+        "smaller photos: --max-size N)"
     ]

@@ -1,0 +1,56 @@
+"""docs/settings.md names every setting of a run, with its option and its default."""
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from crossgrad_core.cli.main import app
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.scene.options import SceneOptions
+
+PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")
+MODELS = {"run": RunConfig, "reading": SceneOptions}
+FIELDS = [(model, name) for model in MODELS for name in MODELS[model].model_fields]
+
+
+def rows(text):
+    """Setting -> option, default and meaning."""
+    cells = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+?) \| (.+) \|$", text, re.MULTILINE)
+    return {name: rest for name, *rest in cells}
+
+
+BEFORE, _, AFTER = PAGE.partition("## Reading")
+TABLES = {"run": rows(BEFORE), "reading": rows(AFTER)}
+
+
+@pytest.fixture(scope="module")
+def options():
+    """The options of `crossgrad run` by the setting that they are for."""
+    parameters = get_command(app).commands["run"].params
+    return {each.name: each.opts[0] for each in parameters} | {"observers": "--observe"}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_setting_has_a_row_in_its_order(model):
+    assert list(TABLES[model]) == list(MODELS[model].model_fields)
+
+
+@pytest.mark.parametrize(("model", "name"), FIELDS)
+def test_the_option_of_a_setting_is_the_command_line_s(model, name, options):
+    option = TABLES[model][name][0].strip("`")
+    expected = {"scene": "SCENE"}.get(name) or options.get(name, "-")
+    assert option == expected
+
+
+@pytest.mark.parametrize(("model", "name"), FIELDS)
+def test_the_default_of_a_setting_is_the_schema_s(model, name):
+    default = MODELS[model].model_fields[name].default
+    stated = TABLES[model][name][1]
+    if isinstance(default, ComponentChoice):
+        default = default.name
+    if isinstance(default, str | int | float):
+        assert stated == f"`{default}`"
+    else:  # Decided at the start of the run: in words.
+        assert not re.fullmatch(r"`\w+`", stated)
