@@ -1,5 +1,14 @@
 """The one error type that users see, and how it is worded."""
 
+import re
+from typing import Final
+
+#: Longest part of a message besides the place; the middle of a longer one is left out.
+LONGEST: Final = 500
+# Control characters could move the cursor or recolour the terminal; lone surrogates stand for bytes
+# that are not UTF-8, and cannot be written to a file.
+_UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+
 
 class UserError(Exception):
     """Bad input from the user: reported as one message with exit code 2, never as a traceback.
@@ -26,12 +35,23 @@ class UserError(Exception):
         """The error as indented lines: what, where, expected, found, what to do."""
         rows = (
             ("where", self.where),
-            ("expected", self.expected),
-            ("found", self.found),
-            ("to do", self.todo),
+            ("expected", _shortened(self.expected)),
+            ("found", _shortened(self.found)),
+            ("to do", _shortened(self.todo)),
         )
-        lines = [self.what] + [f"  {label + ':':<10}{text}" for label, text in rows if text]
-        return "\n".join(lines)
+        lines = [f"  {label + ':':<10}{text}" for label, text in rows if text]
+        return _showable("\n".join([_shortened(self.what), *lines]))
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+
+
+def _showable(text: str) -> str:
+    """Text from anybody's file as a terminal can show it."""
+    return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
 class IncompatibleSelectionError(UserError):

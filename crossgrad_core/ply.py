@@ -4,6 +4,7 @@ Source: 3DGS; the order `x y z nx ny nz f_dc f_rest opacity scale rot`, float32 
 `f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
 """
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from math import floor, log10
 from pathlib import Path
@@ -33,6 +34,12 @@ POSITION_TOLERANCE = 1e-4
 _OFFSET_TAG = "crossgrad_offset:"
 _MODE_TAG = "SplatRenderMode:"
 _CHUNK = 65_536
+_LARGEST = float(np.finfo(np.float32).max)
+#: Natural logarithm of the largest size; float32 ends at e^88.
+_LARGEST_LOG_SCALE = 80.0
+#: Lengths of a rotation whose square float32 can hold.
+_ROTATION_LENGTHS = (1e-18, 1e18)
+_OFFSET = re.compile(r"\s+".join([r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"] * 3))
 _IDENTITY = Similarity(np.zeros(3), 1.0)
 
 
@@ -110,19 +117,17 @@ def read_ply(path: Path) -> SplatCloud:
     missing = [name for name in wanted if name not in vertices.columns]
     if missing:
         raise _no_gaussians(path, vertices.columns, missing)
+    if not len(vertices.columns["x"]):
+        raise _empty(path)
     for name in (*wanted, *rest):
-        _check_finite(vertices.columns[name], name, path)
+        top = _LARGEST_LOG_SCALE if name.startswith("scale_") else _LARGEST
+        _check_finite(vertices.columns[name], name, path, top)
 
     def stacked(names: Sequence[str]) -> NDArray[np.float32]:
         return np.stack([vertices.columns[name] for name in names], axis=1, dtype=np.float32)
 
     quats = stacked([f"rot_{i}" for i in range(4)])
-    if not quats.any(axis=1).all():
-        raise UserError(
-            "PLY file with a rotation of length zero",
-            where=path,
-            todo="remove these Gaussians, or export the file again",
-        )
+    _check_rotations(quats, path)
     means = np.stack([vertices.columns[axis] for axis in "xyz"], axis=1, dtype=np.float64)
     sh_rest = np.zeros((len(means), REST, 3), dtype=np.float32)
     if rest:
@@ -199,6 +204,30 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
     return names
 
 
+def _empty(path: Path) -> UserError:
+    return UserError(
+        "PLY file without Gaussians",
+        where=path,
+        expected="at least one vertex",
+        found="0 vertices",
+        todo="export the Gaussians again, or start from the SfM points (--init points)",
+    )
+
+
+def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
+    lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
+    shortest, longest = _ROTATION_LENGTHS
+    wrong = (lengths < shortest) | (lengths > longest)
+    if wrong.any():
+        raise UserError(
+            "PLY file with a rotation of length zero or of no length that float32 can square",
+            where=path,
+            expected=f"quaternions rot_0 ... rot_3 of length {shortest:g} to {longest:g}",
+            found=f"{int(wrong.sum()):,} of {len(quats):,} out of this range",
+            todo="remove these Gaussians, or export the file again",
+        )
+
+
 def _no_gaussians(
     path: Path, columns: Mapping[str, NDArray[np.generic]], missing: list[str]
 ) -> UserError:
@@ -214,9 +243,11 @@ def _no_gaussians(
     )
 
 
-def _check_finite(column: NDArray[np.generic], name: str, path: Path) -> None:
-    # Larger than any float32 counts as infinite; NaN fails the comparison too.
-    valid = np.abs(column.astype(np.float64)) <= np.finfo(np.float32).max
+def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float) -> None:
+    # More than float32 can work with counts as infinite; NaN fails the comparison too.
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        numbers = column.astype(np.float64)
+    valid = (numbers >= -_LARGEST) & (numbers <= top)
     if not valid.all():
         raise UserError(
             "PLY file with numbers that are not finite",
@@ -237,11 +268,9 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
     text = _tagged(comments, _OFFSET_TAG)
     if text is None:
         return np.zeros(3)
-    try:
-        offset = np.array([float(word) for word in text.split()])
-    except ValueError:
-        offset = np.empty(0)
-    if offset.shape != (3,) or not np.isfinite(offset).all():
+    match = _OFFSET.fullmatch(text)
+    offset = np.array([float(word) for word in match.groups()] if match else [np.nan] * 3)
+    if not (np.abs(offset) <= _LARGEST).all():
         raise UserError(
             "PLY file with an unreadable offset",
             where=path,

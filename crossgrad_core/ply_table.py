@@ -1,7 +1,8 @@
 """The vertices of a PLY file as named columns: ascii or binary, any property order and type."""
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import size_text
+from crossgrad_core.wording import listed
 
 #: PLY type name -> numpy type without byte order.
 _TYPES = {
@@ -32,6 +34,8 @@ _TYPES = {
     "float64": "f8",
 }
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+# Not `isdigit`, which knows other scripts; and no file holds 10^18 records.
+_COUNT = re.compile(r"[0-9]{1,18}")
 _LONGEST_HEADER_LINE = 65_536
 _MOST_HEADER_LINES = 10_000
 
@@ -43,6 +47,20 @@ class Element:
     name: str
     count: int
     fields: tuple[tuple[str, str], ...] | None
+
+
+@dataclass
+class _Draft:
+    """An element whose properties are still being read."""
+
+    name: str
+    count: int
+    fields: dict[str, str] = field(default_factory=dict)
+    lists: bool = False
+
+    def done(self) -> Element:
+        """The element."""
+        return Element(self.name, self.count, None if self.lists else tuple(self.fields.items()))
 
 
 @dataclass(frozen=True)
@@ -81,7 +99,8 @@ def read_vertices(path: Path) -> Vertices:
         "PLY file without vertices",
         where=path,
         expected="an element called vertex",
-        todo="export the Gaussians again",
+        found=listed(element.name for element in header.elements),
+        todo="export the Gaussians as a PLY file of vertices",
     )
 
 
@@ -138,18 +157,18 @@ def _keyword(line: str, *words: str) -> bool:
 
 
 def _elements(lines: list[str], path: Path) -> tuple[Element, ...]:
-    elements: list[Element] = []
+    drafts: dict[str, _Draft] = {}
     for line in lines:
         match line.split():
-            case ["element", name, count] if count.isdigit():
-                elements.append(Element(name, int(count), ()))
-            case ["property", *words] if elements:
-                elements[-1] = _with_property(elements[-1], words, path)
+            case ["element", name, count] if _COUNT.fullmatch(count) and name not in drafts:
+                drafts[name] = draft = _Draft(name, int(count))
+            case ["property", *words] if drafts:
+                _add_property(draft, words, path)
             case [("format" | "comment" | "obj_info"), *_] | []:
                 pass
             case _:
                 raise _malformed(path, f"the header line {line!r}")
-    return tuple(elements)
+    return tuple(draft.done() for draft in drafts.values())
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:
@@ -165,17 +184,16 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
     raise _malformed(path, "a header that does not end")
 
 
-def _with_property(element: Element, words: list[str], path: Path) -> Element:
+def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
     if words[:1] == ["list"]:
-        return Element(element.name, element.count, None)
+        draft.lists = True
+        return
     if len(words) != 2 or words[0] not in _TYPES:  # noqa: PLR2004 - a type and a name
         raise _malformed(path, f"the property {' '.join(words)!r}")
-    if element.fields is None:
-        return element
-    if words[1] in dict(element.fields):
-        raise _malformed(path, f"two properties called {words[1]!r}")
-    fields = (*element.fields, (words[1], _TYPES[words[0]]))
-    return Element(element.name, element.count, fields)
+    kind, name = words
+    if name in draft.fields:
+        raise _malformed(path, f"two properties called {name!r}")
+    draft.fields[name] = _TYPES[kind]
 
 
 def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
@@ -210,6 +228,8 @@ def _read_binary(
         found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
         expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
         raise _truncated(path, expected, found)
+    if dtype.itemsize == 0:  # An element without properties takes no room at all.
+        return {}
     file.seek(start)
     rows = np.fromfile(file, dtype=dtype, count=vertex.count)
     return {name: rows[name] for name in dtype.names or ()}
@@ -222,12 +242,20 @@ def _read_ascii(
         _dtype(vertex, header, path)
     names = [name for name, _ in vertex.fields or ()]
     skip = sum(item.count for item in before)
-    lines = list(islice(file, skip, skip + vertex.count))
+    # Every line takes a byte at least, so that a count that cannot be true is not counted to.
+    possible = skip + vertex.count <= path.stat().st_size
+    lines = list(islice(file, skip, skip + vertex.count)) if possible else []
     if len(lines) < vertex.count:
-        raise _truncated(path, f"{vertex.count:,} lines of vertices", f"{len(lines):,}")
+        found = f"{len(lines):,}" if possible else size_text(path.stat().st_size)
+        raise _truncated(path, f"{vertex.count:,} lines of vertices", found)
     try:
-        table = np.array([line.split() for line in lines], dtype=np.float64)
-        table = table.reshape(vertex.count, len(names))
+        table = _parsed(lines).reshape(vertex.count, len(names))
     except ValueError as error:
         raise _malformed(path, f"a vertex line that is not {len(names)} numbers") from error
     return {name: table[:, i] for i, name in enumerate(names)}
+
+
+def _parsed(lines: list[bytes]) -> NDArray[np.float64]:
+    if any(b"_" in line for line in lines):
+        raise ValueError("Python's digit groups are no numbers of PLY")
+    return np.array([line.split() for line in lines], dtype=np.float64)

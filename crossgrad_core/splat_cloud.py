@@ -83,7 +83,7 @@ class SplatCloud:
         return Gaussians(
             means=torch.from_numpy(self.means.astype(np.float32)),
             quats=torch.tensor(self.quats),
-            scales=torch.exp(torch.tensor(self.log_scales)),
+            scales=torch.exp(torch.tensor(self.log_scales)).clamp_min(_SMALLEST_SCALE),
             opacities=sigmoid(torch.tensor(self.logit_opacities)),
             sh_dc=torch.tensor(self.sh_dc[:, None, :]),
             sh_rest=torch.tensor(self.sh_rest[:, : (degree + 1) ** 2 - 1]) if degree else None,

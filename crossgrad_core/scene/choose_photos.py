@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene import pillow
 from crossgrad_core.scene.calibration import Calibration, Pinhole
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.options import SceneOptions
@@ -19,12 +20,14 @@ from crossgrad_core.scene.photo_notes import (
     note_kinds,
     note_memory,
     note_pairing,
+    note_reductions,
     note_sizes,
     note_undistortion,
 )
 from crossgrad_core.scene.photos import PhotoSource
 from crossgrad_core.scene.raw import RawScene
-from crossgrad_core.scene.wording import count, name_some
+from crossgrad_core.scene.reduction import choose_reduction
+from crossgrad_core.scene.wording import count, megapixels, name_some
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         if view.name not in found.paths:
             continue
         path, header = found.paths[view.name], found.headers[view.name]
+        reduction = choose_reduction(path, header, options.max_size)
+        header = header.reduced(reduction)
         width, height, orientation = _fit(view.calibration, header, path)
         fitted = view.calibration.resized(width, height)
         # Photos of one camera share its undistortion.
@@ -91,6 +96,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
             background=raw.background,
             distorted=None if fitted.is_pinhole else fitted,
             target=target,
+            reduction=reduction,
         )
     for name, mask in masks.items():
         _check_mask(mask, sources[name])
@@ -99,6 +105,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         *reduced_notes,
         *note_undistortion(sources),
         *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),
+        *note_reductions(sources),
         *note_kinds(sources, found.headers, raw.background),
         *note_memory(sources, options),
     )
@@ -207,6 +214,14 @@ def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> d
 
 def _check_mask(path: Path, source: PhotoSource) -> None:
     header = read_header(path)
+    if header.width * header.height > pillow.MOST_PIXELS:
+        raise UserError(
+            "the mask is too large to be decoded at once",
+            where=path,
+            expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
+            found=f"{header.width} x {header.height} pixels",
+            todo="save it smaller: a mask of any size in the proportion of its photo will do",
+        )
     photo = Calibration("PINHOLE", source.width, source.height, ())
     sizes = [(header.width, header.height)]
     if source.orientation != 1:

@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene import pillow
+from crossgrad_core.scene.pillow import opened
+from crossgrad_core.scene.wording import megapixels
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -20,15 +23,19 @@ RESIZE_FILTER = "scikit-image resize, anti-aliased"
 _FULL_8_BIT, _FULL_16_BIT = 255, 65535
 
 
-def decode_photo(path: Path) -> tuple[Pixels, Pixels | None]:
+def decode_photo(path: Path, reduction: int = 1) -> tuple[Pixels, Pixels | None]:
     """A photo as [H, W, 3] RGB and, where it has any, its [H, W] alpha channel.
 
     Grey, palette, CMYK and 16-bit photos become 8-bit RGB. EXIF rotation is not applied.
 
+    Args:
+        path: The file.
+        reduction: 2, 4 or 8 decode a JPEG file with its sides divided by so much.
+
     Raises:
         UserError: The photo is damaged or of a kind that cannot be shown.
     """
-    return _decode(path, _read_photo)
+    return _decode(path, _read_photo, reduction)
 
 
 def decode_mask(path: Path) -> Pixels:
@@ -42,7 +49,7 @@ def decode_mask(path: Path) -> Pixels:
     grey = _decode(path, _read_grey)
     top = int(grey.max())
     white = 1 if top <= 1 else _FULL_8_BIT if top <= _FULL_8_BIT else _FULL_16_BIT
-    return np.where(2 * grey >= white, _FULL_8_BIT, 0).astype(np.uint8)
+    return np.where(grey >= (white + 1) // 2, _FULL_8_BIT, 0).astype(np.uint8)
 
 
 def resize(image: Pixels, width: int, height: int) -> Pixels:
@@ -76,19 +83,19 @@ def turn(pixels: Pixels, orientation: int) -> Pixels:
     return turned.get(orientation, pixels)
 
 
-def _decode(path: Path, read: "Callable[[Image], T]") -> T:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return read(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError(
-            "the photo cannot be decoded",
-            where=path,
-            found=str(error),
-            todo="copy or download it again, or remove it",
-        ) from error
+def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
+    with opened(path, "the photo cannot be decoded") as image:
+        if reduction > 1:
+            image.draft(None, (image.width // reduction, image.height // reduction))
+        if image.width * image.height > pillow.MOST_PIXELS:
+            raise UserError(
+                "the photo is too large to be decoded at once",
+                where=path,
+                expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
+                found=f"{image.width} x {image.height} pixels",
+                todo="it has changed since the scene was read: put the old one back",
+            )
+        return read(image)
 
 
 def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:

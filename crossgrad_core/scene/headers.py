@@ -1,10 +1,12 @@
 """What a photo file says about itself without being decoded, and whether it is whole."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.pillow import opened
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -12,6 +14,9 @@ if TYPE_CHECKING:
 _TAIL = 64
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
+_PNG_DEPTH, _PNG_CHANNELS = 24, {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+_JPEG_PIXELS_PER_BYTE = 8 * 64
+_DEFLATE_RATIO = 1032  # https://zlib.net/zlib_tech.html, maximum compression factor
 _ORIENTATION = 0x0112
 _QUARTER_TURNS = range(5, 9)
 _TIFF_DATA = ((273, 279), (324, 325))  # offsets and byte counts of strips and of tiles
@@ -26,12 +31,18 @@ class PhotoHeader:
         height: Pixels.
         alpha: Whether pixels may be transparent.
         grey: Whether the photo has no colour.
+        reducible: Whether it can be decoded at a reduced size in less memory.
     """
 
     width: int
     height: int
     alpha: bool
     grey: bool
+    reducible: bool = False
+
+    def reduced(self, by: int) -> "PhotoHeader":
+        """The photo decoded with each side divided by 1, 2, 4 or 8."""
+        return replace(self, width=-(-self.width // by), height=-(-self.height // by))
 
 
 def read_header(path: Path) -> PhotoHeader:
@@ -40,48 +51,51 @@ def read_header(path: Path) -> PhotoHeader:
     Raises:
         UserError: Not a readable photo, or its end is missing.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with path.open("rb") as file:
-            whole = _is_whole(file)
-            with Image.open(file) as image:
-                whole = whole and _has_all_tiff_data(image, path.stat().st_size)
-                header = _describe(image)
-    except UnidentifiedImageError as error:
-        found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
-        raise UserError(
-            "the file is not a photo", where=path, found=found, todo="replace or remove it"
-        ) from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError(
-            "the photo cannot be read",
-            where=path,
-            found=str(error),
-            todo="check its permissions, copy or download it again, or remove it",
-        ) from error
-    if not whole:
-        raise UserError(
-            "the photo is cut short: the end of the file is missing",
-            where=path,
-            todo="copy or download it again, or remove it",
-        )
-    return header
+    with opened(path, "the photo cannot be read") as image, path.open("rb") as file:
+        size = path.stat().st_size
+        whole = _is_whole(file) and _has_all_tiff_data(image, size)
+        if not whole or image.width * image.height > _most_pixels(image, file, size):
+            raise UserError(
+                "the photo is cut short: the end of the file is missing",
+                where=path,
+                expected=f"{image.width} x {image.height} pixels",
+                found=f"{size:,} bytes",
+                todo="copy or download it again, or remove it",
+            )
+        return _describe(image)
 
 
 def read_quarter_turn(path: Path) -> int | None:
-    """The EXIF orientation of a photo, if it swaps width and height (5 to 8)."""
-    from PIL import Image
+    """The EXIF orientation of a photo, if it swaps width and height (5 to 8).
 
-    with Image.open(path) as image:
-        orientation = int(image.getexif().get(_ORIENTATION, 1))
-    return orientation if orientation in _QUARTER_TURNS else None
+    Raises:
+        UserError: The EXIF header is damaged.
+    """
+    with opened(path, "the photo's EXIF header cannot be read") as image:
+        orientation = image.getexif().get(_ORIENTATION)
+    return next((turn for turn in _QUARTER_TURNS if turn == orientation), None)
 
 
 def _describe(image: "Image") -> PhotoHeader:
     alpha = "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
     grey = image.mode in {"1", "L", "LA", "La", "F"} or image.mode.startswith("I")
-    return PhotoHeader(image.width, image.height, alpha, grey)
+    reducible = image.format in {"JPEG", "MPO"} and not image.info.get("progressive")
+    return PhotoHeader(image.width, image.height, alpha, grey, reducible)
+
+
+def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
+    """How many pixels a file of so many bytes can hold at most, in formats where that is known.
+
+    A header that claims more would have memory set aside for a photo that is not there.
+    """
+    if image.format in {"JPEG", "MPO"}:
+        # A block of 8 x 8 pixels takes one bit at least, the Huffman code of its mean.
+        return _JPEG_PIXELS_PER_BYTE * size
+    if image.format == "PNG":
+        file.seek(_PNG_DEPTH)
+        depth, colors = file.read(2)
+        return _DEFLATE_RATIO * size * 8 / (depth * _PNG_CHANNELS[colors])
+    return inf
 
 
 def _is_whole(file: BinaryIO) -> bool:

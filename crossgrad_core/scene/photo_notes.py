@@ -4,12 +4,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from crossgrad_core.scene import pillow
 from crossgrad_core.scene.decode import RESIZE_FILTER
 from crossgrad_core.scene.headers import PhotoHeader
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.photo_files import PhotoFolder
 from crossgrad_core.scene.photos import PhotoSource
-from crossgrad_core.scene.wording import count, name_some
+from crossgrad_core.scene.wording import count, megapixels, name_some
 
 _MIB = 2**20
 _SHOWN_SIZES = 3
@@ -60,6 +61,16 @@ def note_sizes(
     if scaled:
         notes.append(f"photos: {scaled} of another size than their camera, which was scaled")
     return notes
+
+
+def note_reductions(sources: Sources) -> list[str]:
+    """How many photos are so large that they are decoded at a reduced size."""
+    reduced = [s.reduction for s in sources.values() if s.reduction > 1]
+    if not reduced:
+        return []
+    how = ", ".join(f"1/{size}" for size in sorted(set(reduced)))
+    which = f"{count(len(reduced), 'photo')} above {megapixels(pillow.MOST_PIXELS)}"
+    return [f"photos: {which} decoded at {how} of their width and height"]
 
 
 def note_kinds(

@@ -34,8 +34,9 @@ class PhotoSource:
         mask: The mask file, or None.
         alpha: Whether the file may have transparent pixels.
         background: RGB in [0, 1] behind transparent pixels; None where they do not count.
-        distorted: The calibration to undistort with, in the file's size; None for a pinhole.
+        distorted: The calibration to undistort with, in the size above; None for a pinhole.
         target: (width, height) as trained.
+        reduction: What the file's width and height are divided by while it is decoded.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class PhotoSource:
     background: tuple[float, float, float] | None
     distorted: Calibration | None
     target: tuple[int, int]
+    reduction: int = 1
 
     @property
     def may_mask(self) -> bool:
@@ -68,7 +70,7 @@ class PhotoSource:
         Raises:
             UserError: The photo or its mask is damaged or has changed its size.
         """
-        rgb, alpha = decode_photo(self.path)
+        rgb, alpha = decode_photo(self.path, self.reduction)
         rgb = turn(rgb, self.orientation)
         self._check_size(rgb)
         keep = self._decode_mask()

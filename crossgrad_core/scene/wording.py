@@ -14,3 +14,8 @@ def name_some(names: Sequence[str]) -> str:
 def count(number: int, noun: str) -> str:
     """`1 photo`, `2 photos`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def megapixels(pixels: int) -> str:
+    """`201.3 megapixels`."""
+    return f"{pixels / 1e6:,.1f} megapixels"

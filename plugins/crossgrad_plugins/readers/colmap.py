@@ -19,7 +19,8 @@ from crossgrad_plugins.readers._colmap_folder import (
     choose_model,
     find_models,
 )
-from crossgrad_plugins.readers._colmap_model import ColmapImage, ColmapModel, read_model
+from crossgrad_plugins.readers._colmap_model import read_model
+from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
 
 
 class ColmapReader(Reader):

@@ -186,9 +186,10 @@ def test_reads_line_ends_of_other_systems_in_the_header(tmp_path: Path):
     assert_same(read_ply(tmp_path / "b.ply"), cloud)
 
 
-def test_empty_cloud_survives(tmp_path: Path):
+def test_a_file_without_gaussians_is_refused(tmp_path: Path):
     write_ply(tmp_path / "a.ply", make_cloud(0))
-    assert len(read_ply(tmp_path / "a.ply")) == 0
+    with pytest.raises(UserError, match=r"without Gaussians(?s:.*)0 vertices(?s:.*)to do"):
+        read_ply(tmp_path / "a.ply")
 
 
 def test_gaussians_that_are_not_finite_are_left_out(tmp_path: Path):

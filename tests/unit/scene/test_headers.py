@@ -1,4 +1,6 @@
 import io
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -17,7 +19,12 @@ def save(path, **options):
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "bmp"])
 def test_header_of_a_whole_photo(suffix, tmp_path):
-    assert read_header(save(tmp_path / f"a.{suffix}")) == PhotoHeader(60, 40, False, False)
+    header = read_header(save(tmp_path / f"a.{suffix}"))
+    assert header == PhotoHeader(60, 40, False, False, reducible=suffix == "jpg")
+
+
+def test_a_progressive_jpeg_cannot_be_decoded_at_a_reduced_size(tmp_path):
+    assert not read_header(save(tmp_path / "a.jpg", progressive=True)).reducible
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
@@ -88,3 +95,57 @@ def test_quarter_turns_are_found(orientation, turn, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = orientation
     assert read_quarter_turn(save(tmp_path / "a.jpg", exif=exif)) == turn
+
+
+def with_size(data: bytes, width: int, height: int) -> bytes:
+    """A JPEG or PNG file whose header claims another size."""
+    if data.startswith(b"\x89PNG"):
+        chunk = b"IHDR" + struct.pack(">II", width, height) + data[24:29]
+        return data[:12] + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    at = data.index(b"\xff\xc0") + 5
+    return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_a_header_that_claims_more_pixels_than_the_file_can_hold_is_refused(suffix, tmp_path):
+    path = save(tmp_path / f"a.{suffix}")
+    path.write_bytes(with_size(path.read_bytes(), 12_000, 12_000))
+    with pytest.raises(UserError, match=r"cut short(?s:.*)12000 x 12000(?s:.*)to do"):
+        read_header(path)
+
+
+def test_the_largest_sizes_that_files_hold_pass(tmp_path):
+    # One colour compresses as far as the formats allow.
+    Image.new("1", (6000, 4000)).save(tmp_path / "a.png", compress_level=9)
+    assert read_header(tmp_path / "a.png").width == 6000
+    for progressive in (False, True):
+        grey = Image.new("L", (6000, 4000))
+        grey.save(tmp_path / "a.jpg", quality=1, optimize=True, progressive=progressive)
+        assert read_header(tmp_path / "a.jpg").width == 6000
+
+
+@pytest.mark.parametrize(
+    "error", [KeyError("x"), struct.error("x"), IndexError(), NotImplementedError("x")]
+)
+def test_whatever_a_decoder_raises_is_one_error(error, tmp_path, monkeypatch):
+    def fail(*args, **kwargs):
+        raise error
+
+    path = save(tmp_path / "a.jpg")
+    monkeypatch.setattr(Image, "open", fail)
+    for read in (read_header, read_quarter_turn):
+        with pytest.raises(UserError, match=r"cannot be read(?s:.*)a\.jpg(?s:.*)to do"):
+            read(path)
+
+
+def test_only_formats_of_photos_are_opened(tmp_path):
+    # Pillow would hand a PostScript file to Ghostscript.
+    (tmp_path / "a.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EOF\n")
+    with pytest.raises(UserError, match="not a photo"):
+        read_header(tmp_path / "a.jpg")
+
+
+def test_pillow_keeps_its_own_bound(tmp_path):
+    bound = Image.MAX_IMAGE_PIXELS
+    read_header(save(tmp_path / "a.png"))
+    assert bound == Image.MAX_IMAGE_PIXELS == 89_478_485

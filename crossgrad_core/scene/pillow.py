@@ -1,0 +1,72 @@
+"""Photo files through Pillow: which formats, how many pixels, and every fault as one error."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+from crossgrad_core.errors import UserError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+#: More pixels are not decoded at once: as much as Pillow allows by default, 0.5 GB of RGB.
+MOST_PIXELS: Final = 178_956_970
+
+# What cameras and tools for masks write. Pillow knows more, among them formats that run programs.
+_FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
+_LOCK = Lock()
+
+
+@contextmanager
+def opened(path: Path, what: str) -> Iterator["Image"]:
+    """A photo whose pixels are not decoded yet; what goes wrong with it inside becomes one error.
+
+    Args:
+        path: The file.
+        what: The error in words, should there be one.
+
+    Raises:
+        UserError: The file is missing, not a photo, without pixels, or damaged.
+    """
+    from PIL import UnidentifiedImageError
+
+    try:
+        with path.open("rb") as file, _identified(file) as image:
+            _check_pixels(image, path)
+            yield image
+    except (UserError, MemoryError):
+        raise
+    except UnidentifiedImageError as error:
+        found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
+        raise UserError(
+            "the file is not a photo", where=path, found=found, todo="replace or remove it"
+        ) from error
+    except Exception as error:
+        # Decoders raise whatever a damaged file leads them into: KeyError, struct.error ...
+        raise UserError(
+            what,
+            where=path,
+            found=str(error) or type(error).__name__,
+            todo="copy or download it again, or remove it",
+        ) from error
+
+
+def _check_pixels(image: "Image", path: Path) -> None:
+    if 0 in image.size:
+        raise UserError("the photo has no pixels", where=path, todo="replace or remove it")
+
+
+def _identified(file: BinaryIO) -> "Image":
+    """As `Image.open`, but without a bound on the size: ours depends on how it is decoded."""
+    from PIL import Image
+
+    Image.init()
+    formats = [name for name in _FORMATS if name in Image.OPEN]
+    with _LOCK:  # Pillow's bound is a global, and photos are decoded in several threads.
+        bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(file, formats=formats)
+        finally:
+            Image.MAX_IMAGE_PIXELS = bound

@@ -1,0 +1,194 @@
+"""The guided search: inputs that reach new lines are kept, and changed further."""
+
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from crossgrad_fuzz.case import MOST_BYTES, Case, digest
+from crossgrad_fuzz.guide import Guide, Reach
+from crossgrad_fuzz.law import Bench, Finding
+from crossgrad_fuzz.mutate import BLIND, exchanger, inserter
+from crossgrad_fuzz.target import Mutator, Target
+
+_MEMORY = Path("/dev/shm")  # noqa: S108 - a file system in memory
+#: Share of mutations that know the format, where there are any.
+_KNOWING = 0.6
+_SHRINKING = 400
+
+
+@dataclass
+class Search:
+    """What a search has found.
+
+    Attributes:
+        executions: Inputs parsed.
+        seconds: Wall-clock seconds.
+        corpus: The inputs that reached something new, valid ones first.
+        findings: Kind -> what was wrong, and the input.
+        reach: What was reached of the parser; None while the search goes on.
+    """
+
+    executions: int = 0
+    seconds: float = 0.0
+    corpus: list[Case] = field(default_factory=list)
+    findings: dict[str, tuple[Finding, Case]] = field(default_factory=dict)
+    reach: Reach | None = None
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When a search ends: after so many seconds *and* so many executions, or at a finding.
+
+    Attributes:
+        seconds: Least wall-clock seconds.
+        executions: Least number of executions.
+        findings: Enough findings.
+    """
+
+    seconds: float = 0.0
+    executions: int = 0
+    findings: int = 20
+
+    def left(self, search: Search) -> bool:
+        """Whether the search goes on."""
+        ended = search.seconds >= self.seconds and search.executions >= self.executions
+        return not ended and len(search.findings) < self.findings
+
+
+@contextmanager
+def bench_for(target: Target) -> Iterator[Bench]:
+    """A bench in a temporary folder, in memory where the system allows it."""
+    place = _MEMORY if _MEMORY.is_dir() else None
+    with tempfile.TemporaryDirectory(prefix="crossgrad-fuzz-", dir=place) as folder:
+        yield Bench(target, Path(folder))
+
+
+def search(  # noqa: PLR0913 - a search, its bounds and who watches it
+    target: Target,
+    budget: Budget,
+    seed: int,
+    *,
+    known: Iterable[Case] = (),
+    beat: Callable[[Search], None] = lambda search: None,
+    bench: Bench | None = None,
+) -> Search:
+    """Looks for inputs on which a parser breaks the law.
+
+    Args:
+        target: The parser.
+        budget: How long.
+        seed: Of the mutations; the same seed and number of executions give the same inputs.
+        known: Inputs to begin with besides the valid ones.
+        beat: Called before each execution.
+        bench: Where to parse; a new one where none is given.
+    """
+    if bench is None:
+        with bench_for(target) as made:
+            return search(target, budget, seed, known=known, beat=beat, bench=made)
+    state, rng, guide = Search(), random.Random(seed), Guide(target.parser)
+    started = time.monotonic()
+    inputs = _inputs(target, state, rng, [*target.seeds(), *known])
+    with guide.watching():
+        for case, given in inputs:
+            beat(state)
+            finding = bench.execute(case)
+            state.executions += 1
+            state.seconds = time.monotonic() - started
+            if guide.news() or given:
+                state.corpus.append(case)
+            if finding is not None and finding.kind not in state.findings:
+                state.findings[finding.kind] = (finding, shrunk(bench, case, finding))
+            if not given and not budget.left(state):
+                break
+    state.reach = guide.reach()
+    return state
+
+
+def _inputs(
+    target: Target, state: Search, rng: random.Random, given: Sequence[Case]
+) -> Iterator[tuple[Case, bool]]:
+    """The given inputs, then mutated ones without an end; and whether it is a given one."""
+    for case in given:
+        yield case, True
+    mutators = _knowing(target)
+    while True:
+        yield _mutated(target, state.corpus, mutators, rng), False
+
+
+def _knowing(target: Target) -> tuple[Mutator, ...]:
+    if not target.words:
+        return target.mutators
+    return (*target.mutators, inserter(target.words), exchanger(target.words))
+
+
+def _mutated(
+    target: Target, corpus: Sequence[Case], mutators: Sequence[Mutator], rng: random.Random
+) -> Case:
+    """One of the corpus, changed a few times; the latest ones are taken more often."""
+    index = max(rng.randrange(len(corpus)), rng.randrange(len(corpus)))
+    case = dict(corpus[index] or corpus[0])
+    count = min(8, 1 + int(rng.expovariate(0.7)))
+    for _ in range(count):
+        if target.case_mutators and rng.random() < 0.15:
+            case = rng.choice(target.case_mutators)(case, rng)
+            continue
+        name = rng.choice(sorted(case))
+        content = _changed(case[name], mutators, rng)
+        if rng.random() < 0.03:
+            content = _spliced(content, rng.choice(corpus).get(name, b""), rng)
+        case[name] = content[:MOST_BYTES]
+    if rng.random() < 0.01:
+        _exchange(case, rng)
+    return target.repair(case, rng)
+
+
+def _changed(content: bytes, mutators: Sequence[Mutator], rng: random.Random) -> bytes:
+    pool = mutators if mutators and rng.random() < _KNOWING else BLIND
+    return rng.choice(pool)(content, rng)
+
+
+def _spliced(content: bytes, other: bytes, rng: random.Random) -> bytes:
+    return content[: rng.randrange(len(content) + 1)] + other[rng.randrange(len(other) + 1) :]
+
+
+def _exchange(case: dict[str, bytes], rng: random.Random) -> None:
+    """A file goes, or holds what another one should."""
+    a, b = rng.choice(sorted(case)), rng.choice(sorted(case))
+    if rng.random() < 0.5:
+        del case[a]
+    else:
+        case[a] = case[b]
+
+
+def shrunk(bench: Bench, case: Case, finding: Finding) -> Case:
+    """A smaller input with the same finding, as far as a few hundred executions lead."""
+    small = dict(case)
+    attempts = _SHRINKING if finding.kind != "slow" else 0
+    for name in sorted(small):
+        size = max(1, len(small[name]) // 2)
+        at = 0
+        while attempts > 0 and size >= 1:
+            content = small[name]
+            shorter = content[:at] + content[at + size :]
+            attempts -= 1
+            if shorter != content and _still(bench, {**small, name: shorter}, finding):
+                small[name] = shorter
+            else:
+                at += size
+            if at >= len(small[name]):
+                at, size = 0, size // 2
+    return small
+
+
+def _still(bench: Bench, case: Case, finding: Finding) -> bool:
+    found = bench.execute(case)
+    return found is not None and found.kind == finding.kind
+
+
+def unique(cases: Iterable[Case]) -> Mapping[str, Case]:
+    """Digest -> case."""
+    return {digest(case): case for case in cases}

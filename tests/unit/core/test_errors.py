@@ -1,0 +1,29 @@
+"""How the one error that users see is worded."""
+
+from crossgrad_core.errors import LONGEST, UserError
+
+
+def test_parts_stand_in_lines_of_their_own():
+    error = UserError("wrong", where="a.ply", expected="x", found="y", todo="do z")
+    assert str(error).splitlines() == [
+        "wrong",
+        "  where:    a.ply",
+        "  expected: x",
+        "  found:    y",
+        "  to do:    do z",
+    ]
+
+
+def test_what_a_file_holds_cannot_fill_or_move_the_terminal():
+    error = UserError("wrong", where="a\x1b[2J\udcff.ply", found="9" * 10_000, todo="a\tb")
+    message = str(error)
+    assert r"a\x1b[2J\udcff.ply" in message
+    assert r"a\tb" in message
+    assert len(message) < LONGEST + 200
+    assert "999 ... 999" in message
+    message.encode()
+
+
+def test_a_long_path_is_not_cut():
+    path = "/".join(["folder"] * 300)
+    assert path in str(UserError("wrong", where=path))
