@@ -8,7 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
-import yaml
 from pydantic import ValidationError
 
 from crossgrad_core.checkpoint import latest, load
@@ -42,6 +41,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.validation import as_user_error
+from crossgrad_core.yaml_values import read_mapping, write_yaml
 
 CONFIG = "config.yaml"
 #: Exit code of a run that the user interrupted.
@@ -249,7 +249,7 @@ def opened(
             where=", ".join(f"--{name.replace('_', '-')}" for name in frozen),
             todo="leave them out, or start a new run",
         )
-    stored = yaml.safe_load(path.read_text(encoding="utf-8"))
+    stored = read_mapping(path, "the configuration of the run", "start a new run")
     stored.pop("stop_after", None)
     # The degree that a run started with is written down; where it is not, it was 0.
     stored["sh_from"] = stored.get("sh_from") or 0
@@ -342,4 +342,4 @@ def _write_config(folder: Path, config: RunConfig) -> None:
 
 
 def _as_yaml(config: RunConfig) -> str:
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    return write_yaml(config.model_dump(mode="json"))

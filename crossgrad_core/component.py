@@ -24,7 +24,9 @@ class Component(BaseModel):
         slot: The slot that the component fills; set by the slot's base class.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
     slot: ClassVar[str]
 

@@ -31,7 +31,7 @@ class RunConfig(BaseModel):
     `None` means "decided at the start of the run": `run` writes the decision into config.yaml.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scene: Path | None = Field(
         None, description="scene folder; the bundled one where none is given"

@@ -3,8 +3,9 @@
 import re
 from typing import Final
 
-#: Longest part of a message besides the place; the middle of a longer one is left out.
+#: Longest part of a message, and longest place; the middle of what is longer is left out.
 LONGEST: Final = 500
+LONGEST_PLACE: Final = 1000
 # Control characters could move the cursor or recolour the terminal; lone surrogates stand for bytes
 # that are not UTF-8, and cannot be written to a file.
 _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -34,7 +35,7 @@ class UserError(Exception):
     def message(self) -> str:
         """The error as indented lines: what, where, expected, found, what to do."""
         rows = (
-            ("where", self.where),
+            ("where", _shortened(self.where, LONGEST_PLACE)),
             ("expected", _shortened(self.expected)),
             ("found", _shortened(self.found)),
             ("to do", _shortened(self.todo)),
@@ -43,10 +44,10 @@ class UserError(Exception):
         return _showable("\n".join([_shortened(self.what), *lines]))
 
 
-def _shortened(text: str) -> str:
-    if len(text) <= LONGEST:
+def _shortened(text: str, longest: int = LONGEST) -> str:
+    if len(text) <= longest:
         return text
-    return f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    return f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
 
 
 def _showable(text: str) -> str:

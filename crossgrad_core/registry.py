@@ -94,6 +94,7 @@ def find(slot: str, name: str) -> Entry:
     if len(found) > 1:
         raise UserError(
             f"{len(found)} installed packages offer a {singular(slot)} named {name!r}",
+            where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in found),
             todo="uninstall all but one of them",
@@ -184,6 +185,7 @@ def _unknown(slot: str, name: str) -> UserError:
     hint = f"{name} is a {singular(elsewhere[0])}" if elsewhere else did_you_mean(name, names)
     return UserError(
         f"there is no {singular(slot)} named {name!r}",
+        where=singular(slot),
         expected=f"one of {listed(names)}" if names else "an installed plugin; there is none",
         todo=sentences(hint, f"`crossgrad plugins list --slot {slot}` lists them"),
     )

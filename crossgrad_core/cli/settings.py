@@ -10,11 +10,11 @@ from typing import Any, Final, TypeAlias
 
 import yaml
 
-from crossgrad_core.cli.yaml_values import read_yaml
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.slots import GROUPS
 from crossgrad_core.wording import listed, singular
+from crossgrad_core.yaml_values import described, read_mapping, read_yaml
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -23,6 +23,7 @@ OBSERVERS: Final = "observers"
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
 #: Settings that say how long a run is.
 LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
+_FILE: Final = ("the configuration file", "mend it: `crossgrad run --dry-run` prints a whole one")
 #: Options of the command line whose setting has another name.
 _PLACES: Final[dict[str, tuple[str, ...]]] = {
     "observe": (OBSERVERS,),
@@ -46,7 +47,7 @@ def merged(
     Raises:
         UserError: The file cannot be read, or an assignment makes no sense.
     """
-    settings = _normalized(_from_file(config)) if config is not None else {}
+    settings = {} if config is None else _normalized(read_mapping(config, *_FILE))
     chosen = {
         _PLACES.get(name, (name,)): _plain(value)
         for name, value in options.items()
@@ -62,36 +63,6 @@ def merged(
     for path, value in sorted(assigned, key=lambda each: not _is_name(each[0])):
         _assign(settings, path, value)
     return {key: _with_default_name(key, value) for key, value in settings.items()}
-
-
-def _from_file(path: Path) -> Settings:
-    try:
-        found = read_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            "the configuration file cannot be read",
-            where=path,
-            found=str(error),
-            todo="check the path and its permissions; it must be a text file in UTF-8",
-        ) from error
-    except yaml.YAMLError as error:
-        raise UserError(
-            "the configuration file is not valid YAML",
-            where=path,
-            found=" ".join(str(error).split()),
-            todo="repair that line, or start from the config.yaml of a run",
-        ) from error
-    if found is None:
-        return {}
-    if not isinstance(found, dict):
-        raise UserError(
-            "the configuration file holds no settings",
-            where=path,
-            expected="lines such as `steps: 3000`",
-            found=f"a {type(found).__name__}",
-            todo="write `setting: value` lines; the config.yaml of a run is an example",
-        )
-    return {str(key): value for key, value in found.items()}
 
 
 def _with_default_name(key: str, value: object) -> object:
@@ -129,9 +100,16 @@ def _items(value: object) -> Iterable[object]:
         case list() | tuple():
             return value
         case dict() if "name" not in value:
-            return [{"name": name, **(options or {})} for name, options in value.items()]
+            return [_with_name(name, options) for name, options in value.items()]
         case _:
             return [value]
+
+
+def _with_name(name: str, options: object) -> object:
+    """The choice `name` with its options; options that are none are left for the validation."""
+    if options is None:
+        return {"name": name}
+    return {"name": name, **options} if isinstance(options, dict) else {name: options}
 
 
 def _named(value: object) -> object:
@@ -149,17 +127,19 @@ def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:
     if not equals or not all(path):
         raise UserError(
             "--set does not say which setting has which value",
-            expected="KEY=VALUE, for example --set operator.c=0.4",
+            where="--set",
+            expected="KEY=VALUE",
             found=repr(assignment),
-            todo="put an equals sign between the setting and its value",
+            todo="write for example --set operator.c=0.4",
         )
     try:
         return path, read_yaml(text)
     except yaml.YAMLError as error:
         raise UserError(
             f"the value of --set {key} is not valid YAML",
+            where=f"--set {key}",
             expected="a number, a word, or a quoted text",
-            found=repr(text),
+            found=f"{text!r}: {described(error)}",
             todo="put quotes around texts with special characters",
         ) from error
 

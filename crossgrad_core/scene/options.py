@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class SceneOptions(BaseModel):
     """Options of reading, splitting and resizing."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     max_size: int | None = Field(
         None, ge=16, description="longest image side in pixels; larger photos are resized"

@@ -14,7 +14,7 @@ from crossgrad_fuzz.law import Bench, Finding
 from crossgrad_fuzz.mutate import BLIND, exchanger, inserter
 from crossgrad_fuzz.target import Mutator, Target
 
-_MEMORY = Path("/dev/shm")  # noqa: S108 - a file system in memory
+_MEMORY = Path("/dev/shm")
 #: Share of mutations that know the format, where there are any.
 _KNOWING = 0.6
 _SHRINKING = 400
@@ -67,7 +67,7 @@ def bench_for(target: Target) -> Iterator[Bench]:
         yield Bench(target, Path(folder))
 
 
-def search(  # noqa: PLR0913 - a search, its bounds and who watches it
+def search(
     target: Target,
     budget: Budget,
     seed: int,

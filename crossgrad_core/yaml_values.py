@@ -1,0 +1,235 @@
+"""YAML as users mean it: `1e-3` is a number, `no` is a word, a key that occurs twice is an error.
+
+PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. It also builds
+whatever a text asks for: numbers without an end, lists within lists until the stack is full, and,
+through aliases, a billion copies of one list in a few hundred bytes. Here the values are built from
+its parse tree, in bounded number and depth.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from math import isnan
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+from typing_extensions import override
+from yaml.error import Mark
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from crossgrad_core.errors import UserError
+
+#: Bounds of a text: bytes, values (each alias counts as what it stands for), lists within lists,
+#: digits of a number.
+MOST_BYTES: Final = 1 << 18
+MOST_VALUES: Final = 10_000
+DEEPEST: Final = 32
+MOST_DIGITS: Final = 300
+
+_TAG = "tag:yaml.org,2002:"
+_DIGITS = list("-+0123456789.")
+_REPLACED = {f"{_TAG}{name}" for name in ("bool", "int", "float", "timestamp", "merge", "value")}
+_BOOL = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+_INT = re.compile(r"^[-+]?[0-9]+$")
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+_NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
+_LINE_ENDS = re.compile("[\r\n\x85\u2028\u2029]")
+_IMPOSSIBLE = re.compile("[\0\ud800-\udfff]")
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads scalars by the core schema of YAML 1.2 and does not follow a text without bounds."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = 0
+        self._values = 0
+
+    @override
+    def compose_node(self, parent: Node | None, index: int) -> Node | None:
+        """The next node; raises where there are too many, within each other or in all."""
+        mark: Mark | None = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        self._depth += 1
+        self._values += 1
+        if self._depth > DEEPEST:
+            raise _error(f"more than {DEEPEST} lists or mappings within each other", mark)
+        if self._values > MOST_VALUES:
+            raise _error(f"more than {MOST_VALUES:,} values", mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts quotes around words that YAML 1.1 or 1.2 takes for something else."""
+
+    @override
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _represented(dumper: _Dumper, text: str) -> ScalarNode:
+    # In other styles PyYAML writes line ends of Unicode as they are, and reads them as spaces.
+    style = '"' if _LINE_ENDS.search(text) else None
+    return dumper.represent_scalar(f"{_TAG}str", text, style)
+
+
+_Dumper.add_representer(str, _represented)
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _REPLACED]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _class in (_Loader, _Dumper):
+    _class.add_implicit_resolver(f"{_TAG}bool", _BOOL, list("tTfF"))
+    _class.add_implicit_resolver(f"{_TAG}int", _INT, _DIGITS)
+    _class.add_implicit_resolver(f"{_TAG}float", _FLOAT, _DIGITS)
+
+
+def read_yaml(text: str) -> object:
+    """The value that a YAML text describes: plain data, of which no two parts are one object.
+
+    Raises:
+        yaml.YAMLError: The text is not YAML, is larger than a run's settings can be, a key occurs
+            twice, or a value is none that a setting can have.
+    """
+    if len(text) > MOST_BYTES:
+        raise yaml.YAMLError(f"more than {MOST_BYTES // 1024} KiB")
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        return None if node is None else _Values().of(node, 0)
+    except (ValueError, OverflowError) as error:
+        # PyYAML's own, for escapes beyond Unicode and endless version numbers.
+        raise yaml.YAMLError(f"an escape or number that does not exist ({error})") from error
+    finally:
+        loader.dispose()
+
+
+def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
+    """The settings in a YAML file; none where it is empty.
+
+    Args:
+        path: The file.
+        what: What cannot be read, should it be so, such as `the configuration file`.
+        todo: What to do about it.
+
+    Raises:
+        UserError: The file is missing, not YAML, or holds something else than settings.
+    """
+    try:
+        settings = read_yaml(path.read_bytes()[: MOST_BYTES + 1].decode("utf-8-sig"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"{what} cannot be read", where=path, found=str(error), todo=todo
+        ) from error
+    except yaml.YAMLError as error:
+        found = described(error)
+        raise UserError(f"{what} is not valid YAML", where=path, found=found, todo=todo) from error
+    if settings is None:
+        return {}
+    if not isinstance(settings, dict):
+        raise UserError(
+            f"{what} holds no settings",
+            where=path,
+            expected="lines such as `steps: 3000`",
+            found=f"a {type(settings).__name__}",
+            todo=todo,
+        )
+    return settings
+
+
+def described(error: yaml.YAMLError) -> str:
+    """What is wrong with a YAML text, in one line with its place."""
+    if not isinstance(error, yaml.MarkedYAMLError):
+        return " ".join(str(error).split())
+    text = ", ".join(part for part in (error.context, error.problem) if part)
+    mark = error.problem_mark or error.context_mark
+    return f"{text} (line {mark.line + 1}, column {mark.column + 1})" if mark else text
+
+
+def write_yaml(settings: Mapping[str, Any]) -> str:
+    """The text from which `read_yaml` gets plain data back."""
+    text: str = yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    return text
+
+
+class _Values:
+    """Builds plain data from nodes; aliases are copied, and every copy counts."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def of(self, node: Node, depth: int) -> object:
+        """The value of a node."""
+        self._count += 1
+        if self._count > MOST_VALUES:
+            raise _error(f"more than {MOST_VALUES:,} values, counting aliases", node.start_mark)
+        if depth > DEEPEST:
+            raise _error(f"more than {DEEPEST} values within each other", node.start_mark)
+        name = node.tag.removeprefix(_TAG)
+        match node:
+            case MappingNode() if name == "map":
+                return dict(self._items(node, depth))
+            case SequenceNode() if name == "seq":
+                return [self.of(item, depth + 1) for item in node.value]
+            case ScalarNode() if name in _SCALARS:
+                return _scalar(node, name)
+        raise _error(f"the tag {node.tag} has no meaning here", node.start_mark)
+
+    def _items(self, node: MappingNode, depth: int) -> Iterator[tuple[str, object]]:
+        seen: set[str] = set()
+        for key, value in node.value:
+            if not isinstance(key, ScalarNode):
+                raise _error("a key that is not a word", key.start_mark)
+            name = _scalar(key, "str")
+            if name in seen:
+                raise _error(f"the key {name!r} occurs twice", key.start_mark)
+            seen.add(str(name))
+            yield str(name), self.of(value, depth + 1)
+
+
+def _word(text: str) -> str:
+    if _IMPOSSIBLE.search(text):
+        raise ValueError("a character that no file can hold")
+    return text
+
+
+def _integer(text: str) -> int:
+    if len(text) > MOST_DIGITS:
+        raise ValueError("a number with too many digits")
+    return int(text)
+
+
+def _float(text: str) -> float:
+    # `.inf` is `inf` to Python.
+    value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
+    if isnan(value):
+        raise ValueError("not a number, which no setting can be")
+    return value
+
+
+#: Name of a tag -> what its values look like, and how they are built.
+_SCALARS: Final[dict[str, tuple[re.Pattern[str], Callable[[str], object]]]] = {
+    "str": (re.compile("", re.DOTALL), _word),
+    "null": (_NULL, lambda _: None),
+    "bool": (_BOOL, lambda text: text.lower() == "true"),
+    "int": (_INT, _integer),
+    "float": (_FLOAT, _float),
+}
+
+
+def _scalar(node: ScalarNode, name: str) -> object:
+    pattern, build = _SCALARS[name]
+    try:
+        if not pattern.match(node.value):
+            raise _error(f"{node.value!r} is not of the type {name}", node.start_mark)
+        return build(node.value)
+    except ValueError as error:
+        raise _error(str(error), node.start_mark) from error
+
+
+def _error(problem: str, mark: Mark | None) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
