@@ -23,7 +23,7 @@ OBSERVERS: Final = "observers"
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
 #: Settings that say how long a run is.
 LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
-_FILE: Final = ("the configuration file", "mend it: `crossgrad run --dry-run` prints a whole one")
+_FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")
 #: Options of the command line whose setting has another name.
 _PLACES: Final[dict[str, tuple[str, ...]]] = {
     "observe": (OBSERVERS,),

@@ -1,0 +1,85 @@
+"""What a run wrote and reads again: metrics.csv, tables of diagnostics, summary.json."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from crossgrad_core.diagnostics import report
+from crossgrad_core.diagnostics.report import read_csv
+from crossgrad_core.results import metrics_csv, summary
+from crossgrad_core.results.metrics_csv import MetricsCsv, read_metrics
+from crossgrad_core.results.summary import read_summary
+from crossgrad_fuzz.case import Case
+from crossgrad_fuzz.mutate import NUMBERS, matcher
+from crossgrad_fuzz.target import Target
+
+_METRICS, _SUMMARY, _TABLE = metrics_csv.FILE, summary.FILE, "table.csv"
+_REGIMES = ("far", "near")
+
+
+def _metrics() -> bytes:
+    columns = metrics_csv.columns_for(_REGIMES)
+    rows = [
+        [str(100 * (i + 1)), "200", "200", "1.234", "21.5", "0.8", "0.81", *[""] * 8]
+        for i in range(2)
+    ]
+    return "\n".join(",".join(row[: len(columns)]) for row in [list(columns), *rows]).encode()
+
+
+def _parse_metrics(folder: Path) -> None:
+    if not (folder / _METRICS).is_file():
+        MetricsCsv.resume(folder, _REGIMES, 100)
+        return
+    rows = read_metrics(folder)
+    assert all(row.keys() == rows[0].keys() for row in rows)
+    assert all(
+        value is None or isinstance(value, int | float) for row in rows for value in row.values()
+    )
+    MetricsCsv.resume(folder, _REGIMES, 100)
+    again = read_metrics(folder)
+    assert all(0 <= (row["step"] or 0) <= 100 for row in again)
+
+
+def _parse_table(folder: Path) -> None:
+    rows = read_csv(folder / _TABLE)
+    for row in rows:
+        assert all(isinstance(name, str) for name in row)
+        assert all(isinstance(value, str | int | float) for value in row.values())
+
+
+def _parse_summary(folder: Path) -> None:
+    assert isinstance(read_summary(folder), dict)
+
+
+def _summaries() -> Sequence[Case]:
+    text = b'{"status": "finished", "psnr": 21.5, "notes": ["\xc3\xa4", null, true]}'
+    return [{_SUMMARY: text}, {_SUMMARY: b"{}"}]
+
+
+METRICS = Target(
+    name="metrics",
+    seeds=lambda: [{_METRICS: _metrics()}, {_METRICS: _metrics() + b"\n"}],
+    parse=_parse_metrics,
+    parser={metrics_csv: ("metrics_row", "MetricsCsv.append", "regimes_of")},
+    words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
+    mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
+    writes=frozenset({_METRICS}),
+)
+TABLE = Target(
+    name="diagnostics-table",
+    seeds=lambda: [{_TABLE: b"step,block,value\n3,means,0.5\n4,scales,\n"}],
+    parse=_parse_table,
+    parser={
+        report: tuple(name for name in vars(report) if name not in {"read_csv", "_value"}),
+    },
+    words=(b",", b"\n", b'"', b"step", b",x", b"nan"),
+    mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
+)
+SUMMARY = Target(
+    name="summary",
+    seeds=_summaries,
+    parse=_parse_summary,
+    parser={summary: ("write_summary", "_as_data", "_metrics", "_best", "_finite")},
+    words=(b"{", b"}", b"[" * 5000, b"]", b'"a": ', b",", b"NaN", b"Infinity", b"1e999"),
+    mutators=(matcher(rb"([\d.]+)", NUMBERS),),
+)
+TARGETS = (METRICS, TABLE, SUMMARY)
