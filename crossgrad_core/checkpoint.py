@@ -32,7 +32,7 @@ from crossgrad_core.checkpoint_tensors import (
     write_tensors,
 )
 from crossgrad_core.errors import UserError
-from crossgrad_core.files import disk_errors, sync_file
+from crossgrad_core.files import disk_errors, is_full, sync_file
 from crossgrad_core.state import Json, PluginState
 
 
@@ -83,16 +83,49 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     for name, plugin in checkpoint.plugins.items():
         check_json(plugin.values, f"plugin {name}")
     final = run / CHECKPOINTS / f"step-{checkpoint.step:06d}"
+    keep = keep or Keep()
     with disk_errors(final, packed_bytes(tensors)):
-        with scratch_folder(final) as scratch:
-            write_tensors(scratch / TENSORS, tensors)
-            text = state_text({"sha256": _digest(scratch / TENSORS), **state})
-            (scratch / STATE).write_text(text, encoding="utf-8")
-            sync_file(scratch / STATE)
-        steps = complete_checkpoints(final.parent)
-        for step in (keep or Keep()).drops(list(steps)):
-            discard(steps[step])
+        try:
+            _write(final, tensors, state)
+        except OSError as error:
+            # Those that would go afterwards may make the room; the newest of them all stays.
+            if not is_full(error) or not _drop(final.parent, keep, checkpoint.step):
+                raise
+            _write(final, tensors, state)
+        _drop(final.parent, keep)
     return final
+
+
+def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
+    with scratch_folder(final) as scratch:
+        write_tensors(scratch / TENSORS, tensors)
+        text = state_text({"sha256": _digest(scratch / TENSORS), **state})
+        (scratch / STATE).write_text(text, encoding="utf-8")
+        sync_file(scratch / STATE)
+
+
+def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
+    """Deletes the checkpoints not worth keeping beside those that are coming; whether any was."""
+    steps = complete_checkpoints(folder)
+    doomed = [steps[step] for step in keep.drops([*steps, *coming]) if step in steps]
+    for each in doomed:
+        discard(each)
+    return bool(doomed)
+
+
+def load_latest(run: Path) -> Checkpoint:
+    """Reads the newest checkpoint of a run, which may be training and deletes old ones meanwhile.
+
+    Raises:
+        UserError: There is none, or it is damaged.
+    """
+    while True:
+        folder = latest(run)
+        try:
+            return load(folder)
+        except (UserError, OSError):
+            if is_complete(folder):
+                raise
 
 
 def latest(run: Path) -> Path:

@@ -58,7 +58,9 @@ def damaged(folder: Path, found: str) -> UserError:
         "damaged checkpoint",
         where=folder,
         found=found,
-        todo=f"continue from {others[-1]}" if others else "start the run again",
+        todo=f"remove it; the run then goes on from {others[-1].name}"
+        if others
+        else "start the run again",
     )
 
 

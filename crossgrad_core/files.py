@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.interrupts import UNFINISHED
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 _FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 
 
@@ -51,6 +53,11 @@ def read_only(path: Path) -> UserError:
     )
 
 
+def is_full(error: OSError) -> bool:
+    """Whether there is no room for what should have been written."""
+    return error.errno in _FULL
+
+
 @contextmanager
 def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
     """Turns a full disk or missing permission inside the block into a `UserError`.
@@ -62,7 +69,7 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        if is_full(error):
             raise disk_full(path, needed) from error
         if error.errno in _FORBIDDEN:
             raise read_only(path) from error
@@ -92,6 +99,18 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
         finally:
             temporary.unlink(missing_ok=True)
             UNFINISHED.discard(str(temporary))
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether `atomic_file` left this behind in a process that was killed, or is writing it now."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Deletes what killed processes left half-written in a folder that nobody else writes into."""
+    for path in folder.rglob(".*.tmp"):
+        if is_leftover(path):
+            path.unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -5,7 +5,6 @@ from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.files import disk_errors
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.results.lines import Pace, evaluation_line, length_lines, progress_line
 
@@ -31,18 +30,24 @@ class RunLog:
         self._clock = clock
         self._pace = Pace(1)
         self._interval = 1
+        self._missing = ""
 
     def write(self, text: str) -> None:
         """Appends a text of one or more lines, each with the time of day.
 
-        Raises:
-            UserError: The disk is full.
+        A log that cannot be written (a full disk) ends no run: lines are left out, and the next one
+        that can be written says so.
         """
         stamp = self._clock().strftime("%H:%M:%S")
-        lines = "".join(f"{stamp}  {line}".rstrip() + "\n" for line in text.splitlines())
-        # Opened for every entry, so that the file is complete whenever the run is interrupted.
-        with disk_errors(self._path, len(lines)), self._path.open("a", encoding="utf-8") as file:
-            file.write(lines)
+        gap = [f"(lines are missing here: {self._missing})"] if self._missing else []
+        lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *text.splitlines())]
+        try:
+            # Opened for every entry, so that the file is complete whenever the run is interrupted.
+            with self._path.open("a", encoding="utf-8", errors="backslashreplace") as file:
+                file.write("\n".join([*lines, ""]))
+            self._missing = ""
+        except OSError as error:
+            self._missing = error.strerror or str(error)
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:

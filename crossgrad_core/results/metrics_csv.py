@@ -97,7 +97,7 @@ class MetricsCsv:
         return table
 
     def append(self, row: Mapping[str, int | float | str | None]) -> None:
-        """Writes a row and waits until it is on the disk.
+        """Writes a row and waits until it is on the disk; a row that does not fit leaves nothing.
 
         Raises:
             ValueError: The row has a column that the table lacks.
@@ -108,10 +108,8 @@ class MetricsCsv:
             message = f"{FILE} has no columns {sorted(unknown)}"
             raise ValueError(message)
         text = _csv_text([[_cell(row.get(name)) for name in self.columns]])
-        with disk_errors(self.path, len(text)), self.path.open("a", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        with disk_errors(self.path, len(text)):
+            _append(self.path, text.encode())
 
     def rewrite(self, lines: Sequence[Sequence[str]]) -> None:
         """Replaces the whole table by the header and these rows."""
@@ -146,8 +144,23 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
         ) from error
 
 
+def _append(path: Path, content: bytes) -> None:
+    with path.open("ab", buffering=0) as file:
+        size = file.tell()
+        try:
+            left = memoryview(content)
+            while left:  # The system may take a part of it only.
+                left = left[file.write(left) :]
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(size)
+            raise
+
+
 def _lines(path: Path) -> list[list[str]]:
-    return list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+    """All whole lines: one that a crash cut short has no end."""
+    whole, end, _ = path.read_text(encoding="utf-8").rpartition("\n")
+    return list(csv.reader(io.StringIO(whole + end)))
 
 
 def _csv_text(lines: Sequence[Sequence[str]]) -> str:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from crossgrad_core import checkpoint_tensors
-from crossgrad_core.checkpoint import Checkpoint, drop_later, latest, load, save
+from crossgrad_core import checkpoint, checkpoint_tensors
+from crossgrad_core.checkpoint import Checkpoint, drop_later, latest, load, load_latest, save
 from crossgrad_core.checkpoint_folders import Keep
 from crossgrad_core.errors import UserError
 from crossgrad_core.state import PluginState
@@ -185,6 +186,48 @@ def test_a_full_disk_is_explained_with_what_is_needed(
         save(tmp_path, big)
 
 
+@pytest.mark.parametrize(
+    ("keep", "left"), [(Keep(), [200, 300]), (Keep(every=100), [100, 200]), (Keep(3), [100, 200])]
+)
+def test_where_the_disk_is_full_what_would_be_deleted_anyway_makes_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: Keep, left: list[int]
+):
+    for step in (100, 200):
+        save(tmp_path, make_checkpoint(step), keep)
+    write = checkpoint_tensors.write_tensors
+
+    def with_room_for_two(path: Path, packed: dict[str, Tensor]) -> None:
+        if len(list(path.parents[1].glob("step-*"))) > 1:
+            full_disk(path, packed)
+        write(path, packed)
+
+    monkeypatch.setattr("crossgrad_core.checkpoint.write_tensors", with_room_for_two)
+    with nullcontext() if 300 in left else pytest.raises(UserError, match="not enough disk space"):
+        save(tmp_path, make_checkpoint(300), keep)
+    assert steps_in(tmp_path) == left
+
+
+def test_a_reader_finds_the_newer_one_where_its_own_is_deleted_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    save(tmp_path, make_checkpoint(100))
+    read_state = checkpoint.read_state
+
+    def slowly(folder: Path) -> dict[str, object]:
+        if folder.name == "step-000100":
+            save(tmp_path, make_checkpoint(200), Keep(last=1))
+        return read_state(folder)
+
+    monkeypatch.setattr(checkpoint, "read_state", slowly)
+    assert load_latest(tmp_path).step == 200
+
+
+def test_a_damaged_checkpoint_is_not_read_again_and_again(tmp_path: Path):
+    flip_byte(save(tmp_path, make_checkpoint(100)))
+    with pytest.raises(UserError, match="SHA-256 differs"):
+        load_latest(tmp_path)
+
+
 def test_the_library_reports_a_full_disk_as_an_os_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -266,7 +309,7 @@ def test_damage_is_found_and_the_earlier_checkpoint_named(tmp_path: Path, name: 
     damage(newer)
     with pytest.raises(UserError, match=message) as told:
         load(newer)
-    assert f"continue from {older}" in str(told.value)
+    assert f"remove it; the run then goes on from {older.name}" in str(told.value)
 
 
 def test_another_format_version_is_refused(tmp_path: Path):

@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.files import atomic_file, disk_errors, free_bytes, size_text, write_atomically
+from crossgrad_core.files import (
+    atomic_file,
+    clear_leftovers,
+    disk_errors,
+    free_bytes,
+    is_leftover,
+    size_text,
+    write_atomically,
+)
 
 
 def test_replaces_the_whole_file(tmp_path: Path):
@@ -61,3 +69,16 @@ def test_sizes_are_readable(count: int, text: str):
 
 def test_free_space_of_a_folder_that_does_not_exist_yet(tmp_path: Path):
     assert free_bytes(tmp_path / "a" / "b") > 0
+
+
+def test_what_a_killed_process_left_half_written_is_cleared(tmp_path: Path):
+    for folder in (tmp_path, tmp_path / "renders" / "000100"):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_file(folder / "a.png") as file:
+            left = folder / Path(file.name).name
+            assert is_leftover(left)
+        left.write_bytes(b"half")
+        (folder / ".my.tmp").write_text("not ours")
+    clear_leftovers(tmp_path)
+    files = sorted(path.name for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [".my.tmp", ".my.tmp", "a.png", "a.png"]

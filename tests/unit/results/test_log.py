@@ -113,3 +113,25 @@ def test_a_resumed_run_continues_its_log(tmp_path: Path):
     RunLog(tmp_path).write("second session")
     lines = (tmp_path / "log.txt").read_text().splitlines()
     assert [line[10:] for line in lines] == ["first session", "second session"]
+
+
+def test_a_log_that_cannot_be_written_ends_no_run_and_shows_its_gap(tmp_path: Path, monkeypatch):
+    log = RunLog(tmp_path)
+    log.write("first")
+
+    def full(self, *args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "open", full)
+        log.write("lost")
+    log.write("third")
+    lines = (tmp_path / "log.txt").read_text().splitlines()
+    assert [line[10:] for line in lines] == [
+        "first", "(lines are missing here: No space left on device)", "third",
+    ]  # fmt: skip
+
+
+def test_any_text_can_be_logged(tmp_path: Path):
+    RunLog(tmp_path).write("a photo named \udcff.jpg")
+    assert (tmp_path / "log.txt").read_text().rstrip().endswith("a photo named \\udcff.jpg")

@@ -1,6 +1,8 @@
 """metrics.csv: columns, exact numbers, and continuing after a resume or a crash."""
 
+import errno
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 
 import pytest
@@ -113,3 +115,57 @@ def test_unreadable_tables_are_explained(tmp_path: Path, line: str):
 def test_a_missing_table_is_explained(tmp_path: Path):
     with pytest.raises(UserError, match=r"no metrics\.csv"):
         read_metrics(tmp_path)
+
+
+def test_a_row_that_was_cut_within_its_last_number_is_dropped(tmp_path: Path, result, totals):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table.append(metrics_row(totals, result))
+    whole = table.path.read_bytes()
+    table.append(metrics_row(replace(totals, step=800), result))
+    cut = table.path.read_bytes()[:-3]
+    assert cut.count(b",") == table.path.read_bytes().count(b",")
+    table.path.write_bytes(cut)
+    assert [row["step"] for row in read_metrics(tmp_path)] == [totals.step]
+    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=800)
+    assert resumed.path.read_bytes() == whole
+
+
+class Nearly:
+    """A file on a disk that is full after some bytes."""
+
+    def __init__(self, file: FileIO, room: int) -> None:
+        self._file, self._room = file, room
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._file.close()
+
+    def write(self, content: bytes) -> int:
+        if self._room == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = self._file.write(bytes(content)[: self._room])
+        self._room -= written
+        return written
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
+
+
+@pytest.mark.parametrize("room", [0, 1, 20, 10**6])
+def test_a_full_disk_leaves_no_half_of_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, *, result, totals
+):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table.append(metrics_row(totals, result))
+    before = table.path.read_bytes()
+    opened = Path.open
+    monkeypatch.setattr(Path, "open", lambda *a, **k: Nearly(opened(*a, **k), room))
+    if room < 10**6:
+        with pytest.raises(UserError, match="not enough disk space"):
+            table.append(metrics_row(totals, result))
+        assert table.path.read_bytes() == before
+    else:
+        table.append(metrics_row(totals, result))
+        assert table.path.read_bytes().startswith(before)
