@@ -1,7 +1,9 @@
 """What the commands do: run, resume, evaluate, render, export."""
 
+import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -10,14 +12,15 @@ from typing import Any, cast
 
 from pydantic import ValidationError
 
-from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.checkpoint import load_latest
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contexts import RunInfo
 from crossgrad_core.errors import UserError
-from crossgrad_core.files import write_atomically
+from crossgrad_core.files import clear_leftovers
+from crossgrad_core.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.results.folder import RunName, check_out, create_run_folder, expected_bytes
+from crossgrad_core.results.lock import locked
 from crossgrad_core.results.log import RunLog
-from crossgrad_core.results.summary import Status
+from crossgrad_core.results.summary import read_summary
 from crossgrad_core.results.table import final_table
 from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import (
@@ -30,23 +33,24 @@ from crossgrad_core.training.assemble import (
 )
 from crossgrad_core.training.budget import Length, Planned, Timed, caught_up, steps_for
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
+from crossgrad_core.training.ending import Course, last_words
 from crossgrad_core.training.export import described, export_ply, renderer
-from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.forecast import Forecast
-from crossgrad_core.training.loop import Stopper, train
 from crossgrad_core.training.persist import from_checkpoint
 from crossgrad_core.training.resolve import resolved
-from crossgrad_core.training.session import PANELS, Session, totals
+from crossgrad_core.training.session import Session, totals
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.validation import as_user_error
-from crossgrad_core.yaml_values import read_mapping, write_yaml
 
-CONFIG = "config.yaml"
-#: Exit code of a run that the user interrupted.
-INTERRUPTED = 130
+_LOG = logging.getLogger(__name__)
+#: Exit code of a run that failed; what it has is kept.
 FAILED = 1
+#: A run that a signal stopped ends with this plus the signal's number, as shells expect: 130 after
+#: Ctrl-C, 143 after SIGTERM.
+BY_SIGNAL = 128
 
 
 def run(
@@ -65,7 +69,8 @@ def run(
         verbosity: -1 quiet, 0 normal, 1 verbose.
 
     Returns:
-        The exit code: 0, 130 where the user interrupted the run, 1 where training failed.
+        The exit code: 0, 1 where training failed, 130 where the user interrupted the run (128 and
+        the number of the signal).
 
     Raises:
         UserError: The input is bad; nothing was written.
@@ -86,10 +91,10 @@ def run(
     setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds, compile_seconds
-    folder = _new_folder(setup, state)
-    setup = replace(setup, config=resolved(setup))
-    _write_config(folder, setup.config)
-    return _train(setup, state, Session.fresh(folder, setup), length)
+    with _new_folder(setup, state) as folder:
+        setup = replace(setup, config=resolved(setup))
+        write_config(folder, setup.config)
+        return _train(setup, state, Session.fresh(folder, setup), length)
 
 
 def parsed(settings: Mapping[str, Any]) -> RunConfig:
@@ -147,7 +152,9 @@ def _within(setup: Setup, seconds: float) -> Setup:
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
 
 
-def _new_folder(setup: Setup, state: TrainState) -> Path:
+@contextmanager
+def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
+    """A folder for a new run, which nobody else writes into meanwhile."""
     names = setup.selection.names
     name = RunName(
         setup.scene.name,
@@ -157,67 +164,70 @@ def _new_folder(setup: Setup, state: TrainState) -> Path:
         datetime.now().astimezone(),
     )
     needed = expected_bytes(state.primitives(setup), 2)
-    return create_run_folder(name, setup.config.out, needed=needed)
+    folder = create_run_folder(name, setup.config.out, needed=needed)
+    with _held(folder):
+        # Another run may have begun and ended here meanwhile.
+        check_out(folder)
+        yield folder
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    with locked(folder, "training") as held:
+        if not held:
+            _LOG.warning(
+                "the file system of %s has no locks; nothing keeps a second process from writing "
+                "into it",
+                folder,
+            )
+        clear_leftovers(folder)
+        yield
 
 
 def _train(setup: Setup, state: TrainState, session: Session, length: Length) -> int:
     """Trains from `state` on and finishes the run's folder whatever happens."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
-    hook = setup.hook
-    info = RunInfo(
-        folder=session.folder,
-        scene=setup.scene,
-        config=setup.config.model_dump(mode="json"),
-        schedule=setup.schedule,
-        blocks=setup.blocks,
-        notes=setup.notes,
-    )
-    hook.crossgrad_run_start(run=info)
     stopper = Stopper()
-    status: Status
     with stopper.installed():
-        try:
-            while (ended := train(setup, state, session, stopper, length.due)) == "paused":
-                revised = length.revised(setup, state)
-                if revised.config is not setup.config:  # A planned length is written already.
-                    _write_config(session.folder, revised.config)
-                setup = revised
-            status, error = ended, None
-            session.save(setup, state)
-        except TrainingFailedError as failure:
-            status, error = "failed", str(failure)
-        session.evaluate(setup, state, panels=PANELS)
-        session.finish(setup, state, status, error)
-    hook.crossgrad_run_end(status=status)
-    table = final_table(session.result, totals(setup, state))
-    log.write(table)
-    print(table)  # noqa: T201 - the result of the command
-    print(f"results in {session.folder}")  # noqa: T201
-    return _exit_code(status, error, stopper, session.folder)
-
-
-def _exit_code(status: Status, error: str | None, stopper: Stopper, folder: Path) -> int:
-    if status == "failed":
-        print(f"training failed: {error}", file=sys.stderr)  # noqa: T201
+        course = Course(setup, state, session, log, stopper)
+        ending = course.to_the_end(length)
+        table = final_table(session.result(state.step), totals(course.setup, state))
+        log.write(table)
+        print(table)  # noqa: T201 - the result of the command
+        print(f"results in {session.folder}")  # noqa: T201
+        for line in last_words(course):
+            log.write(line)
+            print(line, file=sys.stderr)  # noqa: T201
+    if ending.status == "failed":
         return FAILED
-    if status == "stopped":
-        print(f"continue with: crossgrad run --resume {folder}", file=sys.stderr)  # noqa: T201
-    return INTERRUPTED if stopper.requested else 0
+    return 0 if stopper.signal is None else BY_SIGNAL + stopper.signal
 
 
 def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
-    setup, state = opened(folder, settings, verbosity)
-    if state.step >= setup.schedule.total:
-        raise UserError(
-            "the run is finished",
-            where=folder,
-            found=f"all {setup.schedule.total} steps done",
-            todo="start a new run; --init point_cloud.ply starts from its Gaussians",
-        )
-    state.clock.compile += warm_up(setup, state)
-    session = Session.resumed(folder, setup, state.step)
-    return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+    read_config(folder)  # Before a lock is laid into a folder that is no run's.
+    with _held(folder):
+        setup, state = opened(folder, settings, verbosity)
+        if state.step >= setup.schedule.total and _is_described(folder, state.step):
+            raise UserError(
+                "the run is finished",
+                where=folder,
+                found=f"all {setup.schedule.total} steps done",
+                todo="start a new run; --init point_cloud.ply starts from its Gaussians",
+            )
+        if state.step < setup.schedule.total:
+            state.clock.compile += warm_up(setup, state)
+        session = Session.resumed(folder, setup, state.step)
+        return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+
+
+def _is_described(folder: Path, step: int) -> bool:
+    """Whether nothing is missing of a run that did all its steps, `step` in number."""
+    try:
+        summary = read_summary(folder)
+    except UserError:
+        return False
+    return summary.get("status") == "finished" and summary.get("step") == step
 
 
 def opened(
@@ -233,15 +243,8 @@ def opened(
     Raises:
         UserError: It is no run, it has no checkpoint, or a setting would change the training.
     """
-    path = folder / CONFIG
-    if not path.is_file():
-        raise UserError(
-            "this is not the folder of a run",
-            where=folder,
-            expected=f"a folder with {CONFIG}",
-            todo="name the folder that `crossgrad run` printed",
-        )
-    checkpoint = load(latest(folder))
+    stored = read_config(folder)
+    checkpoint = load_latest(folder)
     frozen = sorted(set(settings) - {"device", "threads", "stop_after"})
     if frozen:
         raise UserError(
@@ -249,7 +252,6 @@ def opened(
             where=", ".join(f"--{name.replace('_', '-')}" for name in frozen),
             todo="leave them out, or start a new run",
         )
-    stored = read_mapping(path, "the configuration of the run", "start a new run")
     stored.pop("stop_after", None)
     # The degree that a run started with is written down; where it is not, it was 0.
     stored["sh_from"] = stored.get("sh_from") or 0
@@ -329,17 +331,8 @@ def _machine(device: str | None, threads: int | None) -> dict[str, Any]:
 
 
 def _print_dry_run(setup: Setup) -> None:
-    print(_as_yaml(resolved(setup)), end="")  # noqa: T201
+    print(as_yaml(resolved(setup)), end="")  # noqa: T201
     for note in setup.notes:
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
     print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
-
-
-def _write_config(folder: Path, config: RunConfig) -> None:
-    """Writes what repeats the run; a run that follows the clock renews it as it goes."""
-    write_atomically(folder / CONFIG, _as_yaml(config).encode())
-
-
-def _as_yaml(config: RunConfig) -> str:
-    return write_yaml(config.model_dump(mode="json"))

@@ -27,10 +27,11 @@ from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import assemble, read_scene
 from crossgrad_core.training.budget import steps_for
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-from crossgrad_core.training.loop import Stopper, train
+from crossgrad_core.training.loop import train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, warm_up
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.views import model_of
 
 

@@ -7,7 +7,9 @@ from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.files import disk_errors, disk_full, free_bytes
+from crossgrad_core.files import disk_errors, disk_full, free_bytes, is_leftover
+from crossgrad_core.results.lock import FILE as LOCK
+from crossgrad_core.results.lock import writer_of
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
@@ -70,6 +72,8 @@ def create_run_folder(
 def check_out(out: Path | None) -> None:
     """Refuses a folder that holds something; makes nothing, so that it can be asked at once.
 
+    What a run leaves that was killed before it wrote anything does not count.
+
     Raises:
         UserError: `out` is a file or is not empty.
     """
@@ -79,12 +83,14 @@ def check_out(out: Path | None) -> None:
         raise UserError(
             "the output folder is a file", where=out, todo="choose another --out, or remove it"
         )
-    if any(out.iterdir()):
+    there = sorted(p.name for p in out.iterdir() if p.name != LOCK and not is_leftover(p))
+    if there:
+        writer = writer_of(out)
         raise UserError(
             "the output folder is not empty, and results are never overwritten",
             where=out,
             expected="a new or empty folder",
-            found=", ".join(sorted(path.name for path in out.iterdir())[:4]),
+            found=", ".join(there[:4]) + (f" of {writer}" if writer else ""),
             todo="choose another --out, or continue that run with --resume",
         )
 

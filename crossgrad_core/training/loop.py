@@ -1,20 +1,19 @@
 """The loop around the step: evaluation, checkpoints, interruption, rewinding."""
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
-from types import FrameType
 from typing import Literal, Protocol
 
 import torch
 
 from crossgrad_core.contexts import StepRecord
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Snapshot, TrainState
 from crossgrad_core.training.step import take_step
+from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.views import model_of
 
 Status = Literal["finished", "stopped", "paused"]
@@ -42,32 +41,6 @@ class Sink(Protocol):
         ...
 
 
-@dataclass
-class Stopper:
-    """Turns the first interrupt into a request to stop after the step; the second one is final."""
-
-    requested: bool = field(default=False)
-
-    @contextmanager
-    def installed(self) -> Iterator["Stopper"]:
-        """Handles SIGINT and SIGTERM inside the block; does nothing outside the main thread."""
-        try:
-            before = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
-        except ValueError:  # Signals can be handled in the main thread only.
-            yield self
-            return
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-
-
 def train(
     setup: Setup,
     state: TrainState,
@@ -78,22 +51,44 @@ def train(
     """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
 
     Raises:
-        TrainingFailedError: Something was not finite twice; names step, views and block. `state`
-            is then the last good one.
+        TrainingFailedError: Something was not finite twice; names step, views and block.
+        BaseException: Whatever a plugin, a photo, the memory or the disk raised, with the step as a
+            note. After any exception `state` is the last good one.
     """
+    keeper = Keeper(state)
+    try:
+        return _steps(setup, state, sink, stopper, pauses, keeper)
+    except TrainingFailedError:
+        raise
+    except BaseException as error:
+        error.add_note(f"in step {state.step}")
+        keeper.restore(state)
+        raise
+
+
+def _steps(
+    setup: Setup,
+    state: TrainState,
+    sink: Sink,
+    stopper: Stopper,
+    pauses: Callable[[TrainState], bool] | None,
+    keeper: Keeper,
+) -> Status:
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
-    snapshot = Snapshot.of(state)
     while state.step < last and not stopper.requested:
         try:
             record = timed_step(setup, state)
+            saves = saves_after(setup, state.step)
             leaves = state.step == last or stopper.requested
-            if state.step % CHECK_EVERY == 0 or leaves:
+            if state.step % CHECK_EVERY == 0 or leaves or saves:
                 check_parameters(state, record)
-            if state.step % SNAPSHOT_EVERY == 0:
-                snapshot = Snapshot.of(state)
+            keeper.settle(state)
+            if state.step % SNAPSHOT_EVERY == 0 or saves:
+                keeper.snapshot = Snapshot.of(state)
         except NonFiniteError as error:
-            _rewind(setup, state, snapshot, error)
+            _rewind(setup, state, keeper.snapshot, error)
+            keeper.settle(state)
             sink.rewind(setup, state.step)
             continue
         check_dropped(setup, state, record)
@@ -104,6 +99,8 @@ def train(
         _record(setup, state, sink)
         if pauses is not None and state.step < last and pauses(state):
             return "paused"
+    if stopper.error is not None:
+        raise stopper.error
     return "finished" if state.step >= total else "stopped"
 
 
@@ -153,13 +150,25 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
         )
 
 
+def saves_after(setup: Setup, step: int) -> bool:
+    """Whether a checkpoint is written after this step of a run that goes on."""
+    every = setup.config.save_every or max(1, _planned(setup) // 5)
+    return step % every == 0 and step < setup.schedule.total
+
+
+def evaluates_after(setup: Setup, step: int) -> bool:
+    """Whether the held-out views are evaluated after this step of a run that goes on."""
+    every = setup.config.eval_every or max(1, _planned(setup) // 10)
+    return step % every == 0 and 0 < step < setup.schedule.total
+
+
 def _record(setup: Setup, state: TrainState, sink: Sink) -> None:
-    total, step = setup.schedule.total, state.step
-    # What the run was planned with: its length may follow the clock, the interval does not.
-    planned = setup.config.steps or total
-    eval_every = setup.config.eval_every or max(1, planned // 10)
-    save_every = setup.config.save_every or max(1, planned // 5)
-    if step % eval_every == 0 and step < total:
+    if evaluates_after(setup, state.step):
         sink.evaluate(setup, state)
-    if step % save_every == 0 and step < total:
+    if saves_after(setup, state.step):
         sink.save(setup, state)
+
+
+def _planned(setup: Setup) -> int:
+    """Steps that the run was planned with: its length may follow the clock, intervals do not."""
+    return setup.config.steps or setup.schedule.total

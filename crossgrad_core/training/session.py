@@ -1,5 +1,7 @@
 """Where the results of a run go while it trains and when it ends."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
@@ -15,7 +17,7 @@ from crossgrad_core.results.panels import PanelWriter
 from crossgrad_core.results.per_view import write_per_view
 from crossgrad_core.results.summary import Status, Summary, write_summary
 from crossgrad_core.results.totals import Seconds, Totals
-from crossgrad_core.training.export import described, export_ply, renderer
+from crossgrad_core.training.export import Exported, described, export_ply, renderer
 from crossgrad_core.training.memory import peak_mebibytes
 from crossgrad_core.training.persist import to_checkpoint
 from crossgrad_core.training.setup import Setup
@@ -38,7 +40,8 @@ class Session:
     def __init__(self, folder: Path, table: MetricsCsv) -> None:
         self.folder = folder
         self._table = table
-        self.result: EvaluationResult | None = None
+        self._result: tuple[int, EvaluationResult] | None = None
+        self._exported: Exported | None = None
         self._saved_step = -1
         self._evaluated_step = -1
 
@@ -57,6 +60,14 @@ class Session:
             session._evaluated_step = int(rows[-1]["step"] or 0)
         return session
 
+    def has_row(self, step: int) -> bool:
+        """Whether metrics.csv has a row of that step or a later one."""
+        return self._evaluated_step >= step
+
+    def result(self, step: int) -> EvaluationResult | None:
+        """What the evaluation after that step found; None where there was none."""
+        return self._result[1] if self._result is not None and self._result[0] == step else None
+
     def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
         """Evaluates the held-out views and records a row; draws `panels` of them."""
         start = perf_counter()
@@ -70,22 +81,21 @@ class Session:
             on_view=None if writer is None else writer.write,
         )
         state.clock.evaluate += perf_counter() - start
-        self.result = result
+        self._result = (state.step, result)
         if self._evaluated_step == state.step:
             return
-        self._evaluated_step = state.step
         row = metrics_row(totals(setup, state), result)
         self._table.append(row)
+        self._evaluated_step = state.step
         setup.hook.crossgrad_evaluation(report=EvaluationReport(state.step, row))
 
     def save(self, setup: Setup, state: TrainState) -> None:
         """Writes a checkpoint."""
         if self._saved_step == state.step:
             return
-        start = perf_counter()
-        save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
+        with reporting(state):
+            save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
         self._saved_step = state.step
-        state.clock.report += perf_counter() - start
 
     def rewind(self, setup: Setup, step: int) -> None:
         """Drops rows and checkpoints of steps that training went back behind."""
@@ -93,28 +103,43 @@ class Session:
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1
 
-    def finish(
+    def align(self, setup: Setup, state: TrainState) -> None:
+        """Drops what was recorded after the state's step, if anything was."""
+        if max(self._saved_step, self._evaluated_step) > state.step:
+            self.rewind(setup, state.step)
+
+    def write_views(self, state: TrainState) -> None:
+        """Writes per_view.csv, where the state was evaluated."""
+        result = self.result(state.step)
+        if result is not None:
+            write_per_view(self.folder, result)
+
+    def draw(self, setup: Setup, state: TrainState) -> None:
+        """Draws curve.png, where there is anything to draw."""
+        rows = read_metrics(self.folder)
+        if rows:
+            with reporting(state):
+                draw_curve(self.folder, rows, title(setup), view_counts(setup))
+
+    def export(self, setup: Setup, state: TrainState) -> None:
+        """Writes the trained scene and says what the file is."""
+        path = self.folder / PLY
+        with reporting(state):
+            self._exported = export_ply(setup, state, path)
+        for line in described(self._exported, path):
+            setup.hook.crossgrad_message(text=line)
+
+    def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None
     ) -> None:
-        """Writes everything that describes the run as a whole."""
-        start = perf_counter()
-        rows = read_metrics(self.folder)
-        if self.result is not None:
-            write_per_view(self.folder, self.result)
-        if rows:
-            draw_curve(self.folder, rows, title(setup), view_counts(setup))
-        path = self.folder / PLY
-        exported = export_ply(setup, state, path)
-        for line in described(exported, path):
-            setup.hook.crossgrad_message(text=line)
-        state.clock.report += perf_counter() - start
+        """Writes what describes the run as a whole."""
         summary = Summary(
             status=status,
             scene=setup.scene.name,
             totals=totals(setup, state),
-            result=self.result,
-            ply=exported.as_data(),
-            rows=rows,
+            result=self.result(state.step),
+            ply=None if self._exported is None else self._exported.as_data(),
+            rows=read_metrics(self.folder),
             seconds=Seconds(**asdict(state.clock)),
             config=setup.config.model_dump(mode="json"),
             environment=environment(str(setup.device)),
@@ -122,6 +147,14 @@ class Session:
             error=error,
         )
         write_summary(self.folder, summary)
+
+
+@contextmanager
+def reporting(state: TrainState) -> Iterator[None]:
+    """Counts the seconds of the block as reporting."""
+    start = perf_counter()
+    yield
+    state.clock.report += perf_counter() - start
 
 
 def totals(setup: Setup, state: TrainState) -> Totals:

@@ -1,7 +1,8 @@
 """The running state of the loop: all that changes, and all that a checkpoint holds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from crossgrad_core.blocks import Parameters, primitives_of
 from crossgrad_core.contexts import StepRecord
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.state import PluginState
-from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 
 
@@ -41,7 +42,20 @@ class Clock:
 
 @dataclass
 class TrainState:
-    """Everything that a step reads and writes."""
+    """Everything that a step reads and writes.
+
+    Attributes:
+        parameters: Tensor name -> parameter.
+        adam: The optimizer's moments.
+        rngs: Stream name -> its generator.
+        states: Plugin name -> its state.
+        step: Steps done, the one under way included.
+        last: Record of the last complete step.
+        counters: What was done so far.
+        clock: Seconds so far.
+        rewinds: How often training went back to the last good state.
+        touched: Whether a step that is not complete has begun to change parameters or moments.
+    """
 
     parameters: Parameters
     adam: AdamState
@@ -52,6 +66,7 @@ class TrainState:
     counters: Counters = field(default_factory=Counters)
     clock: Clock = field(default_factory=Clock)
     rewinds: int = 0
+    touched: bool = False
 
     def primitives(self, setup: Setup) -> int:
         """Number of primitives."""
@@ -63,38 +78,81 @@ class TrainState:
 
 
 @dataclass(frozen=True, eq=False)
+class Mark:
+    """All that a step changes besides parameters and moments, as it was at one moment.
+
+    Plugin states and records are values and need no copy.
+    """
+
+    step: int
+    last: StepRecord | None
+    states: dict[str, PluginState]
+    streams: dict[str, dict[str, Any]]
+    counters: Counters
+    clock: Clock
+    rewinds: int
+
+    @classmethod
+    def of(cls, state: TrainState) -> "Mark":
+        """The mark of this moment."""
+        return cls(
+            step=state.step,
+            last=state.last,
+            states=dict(state.states),
+            streams=stream_states(state.rngs),
+            counters=replace(state.counters),
+            clock=replace(state.clock),
+            rewinds=state.rewinds,
+        )
+
+    def restore(self, state: TrainState) -> None:
+        """Puts all that back, the random streams to where they were included."""
+        state.step = self.step
+        state.last = self.last
+        state.states = dict(self.states)
+        state.rngs = restored_streams(self.streams)
+        state.counters = replace(self.counters)
+        state.clock = replace(self.clock)
+        state.rewinds = self.rewinds
+
+
+@dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of the last good state, to rewind to."""
+    """A copy of the last good state, to go back to."""
 
     parameters: Parameters
     adam: AdamState
-    states: dict[str, PluginState]
-    step: int
-    last: StepRecord | None
+    mark: Mark
 
     @classmethod
     def of(cls, state: TrainState) -> "Snapshot":
-        """A deep copy of what training changes. Plugin states are values and need no copy."""
+        """A deep copy of what training changes."""
         return cls(
             parameters={name: t.detach().clone() for name, t in state.parameters.items()},
             adam=copied_moments(state.adam),
-            states=dict(state.states),
-            step=state.step,
-            last=state.last,
+            mark=Mark.of(state),
         )
 
     def restore(self, state: TrainState, seed: int) -> None:
         """Puts `state` back, with fresh random streams so that the same draw does not recur."""
+        self._restore_tensors(state)
+        state.states = dict(self.mark.states)
+        state.step = self.mark.step
+        state.last = self.mark.last
+        state.rewinds += 1
+        state.rngs = make_streams(seed, state.rewinds)
+
+    def put_back(self, state: TrainState) -> None:
+        """Puts `state` back as it was, so that it goes on as if nothing had happened since."""
+        self._restore_tensors(state)
+        self.mark.restore(state)
+
+    def _restore_tensors(self, state: TrainState) -> None:
         state.parameters = {
             name: t.clone().requires_grad_(state.parameters[name].requires_grad)
             for name, t in self.parameters.items()
         }
         state.adam = copied_moments(self.adam)
-        state.states = dict(self.states)
-        state.step = self.step
-        state.last = self.last
-        state.rewinds += 1
-        state.rngs = make_streams(seed, state.rewinds)
 
 
 def copied_moments(adam: AdamState) -> AdamState:

@@ -98,6 +98,7 @@ def _finish(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: Gradients
 ) -> Mapping[str, int]:
     """Optimizer, density control and `after_step` in the order of the preset."""
+    state.touched = True
     if not setup.densify_first:
         _optimize(setup, state, gradients)
         edit, edited = _densify(setup, state, rendered)

@@ -254,7 +254,7 @@ def poisoned(monkeypatch, poison):
 
 def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
-    assert run(scene, tmp_path / "run") == 0
+    assert run(scene, tmp_path / "run", save_every=100) == 0
     assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
     # The evaluation of step 6 was before the rewind and is there once, from after it.
     assert [row["step"] for row in quality(tmp_path / "run")] == ["6", "12"]
@@ -266,7 +266,7 @@ def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
 ):
     # Found at the next look at all parameters, in steps 10 and 20.
     poisoned(monkeypatch, Poison([5, 17]))
-    assert run(scene, tmp_path / "run", steps=30) == 1
+    assert run(scene, tmp_path / "run", steps=30, save_every=100) == 1
     message = capsys.readouterr().err
     assert "block f_dc is not finite in step 20" in message
     assert ".png" in message

@@ -1,5 +1,6 @@
 """The output folder: named after the run, new, and checked before any work is done."""
 
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.results.folder import RunName, create_run_folder, expected_bytes
+from crossgrad_core.results.lock import locked
 
 STARTED = datetime(2026, 3, 5, 9, 8, 7).astimezone()
 NAME = RunName("boruszyn", "vanilla", "near-far", "pcgrad", STARTED)
@@ -46,6 +48,22 @@ def test_results_are_never_overwritten(tmp_path: Path):
     with pytest.raises(UserError, match=r"never overwritten(.|\n)*metrics\.csv(.|\n)*--resume"):
         create_run_folder(NAME, out=tmp_path)
     assert (tmp_path / "metrics.csv").read_text() == "precious"
+
+
+def test_who_writes_into_the_folder_is_told(tmp_path: Path):
+    (tmp_path / "metrics.csv").write_text("precious")
+    with (
+        locked(tmp_path, "training"),
+        pytest.raises(UserError, match=rf"metrics\.csv of process {os.getpid()}, training since"),
+    ):
+        create_run_folder(NAME, out=tmp_path)
+
+
+def test_what_a_run_leaves_that_was_killed_at_once_does_not_count(tmp_path: Path):
+    (tmp_path / ".config.yaml.4711.tmp").write_text("backb")
+    with locked(tmp_path, "training"):
+        pass
+    assert create_run_folder(NAME, out=tmp_path) == tmp_path
 
 
 def test_out_that_is_a_file_is_refused(tmp_path: Path):

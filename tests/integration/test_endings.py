@@ -1,0 +1,282 @@
+"""However a run ends, what it has is kept, it says why, and it goes on to the undisturbed bits."""
+
+import csv
+import json
+import os
+import signal
+
+import pytest
+import torch
+
+from crossgrad_core import app
+from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.errors import UserError
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.training import assemble, session
+
+STEPS, FAILS_IN = 8, 5
+RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9)
+
+
+def run(scene, out):
+    settings = {"scene": str(scene), "out": str(out), "steps": STEPS, "eval_every": 4, "threads": 1}
+    return app.run(settings, verbosity=-1)
+
+
+def resumed(out):
+    return app.run({}, resume=out, verbosity=-1)
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    """A run that nothing disturbs."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert run(scene, out) == 0
+    return out
+
+
+@pytest.fixture
+def with_plugin(monkeypatch):
+    """Adds a plugin to the runs of a test, until it is taken out again."""
+    original = assemble._plugins
+    plugins = {}
+    monkeypatch.setattr(assemble, "_plugins", lambda *args: {**original(*args), **plugins})
+    return plugins
+
+
+def summary(out):
+    return json.loads((out / "summary.json").read_text())
+
+
+def rows(out):
+    with (out / "metrics.csv").open() as file:
+        return {row["step"]: (row["psnr"], row["loss"]) for row in csv.DictReader(file)}
+
+
+def assert_same(out, whole):
+    """Equal states and, at the steps of the undisturbed run, equal rows."""
+    ours, theirs = load(latest(out)), load(latest(whole))
+    assert ours.step == theirs.step == STEPS
+    assert ours.generators == theirs.generators
+    for kind in ("parameters", "exp_avg", "exp_avg_sq"):
+        first, second = getattr(ours, kind), getattr(theirs, kind)
+        assert all(torch.equal(first[name], second[name]) for name in second)
+    assert {step: row for step, row in rows(out).items() if step in rows(whole)} == rows(whole)
+    assert summary(out)["status"] == "finished" and summary(out)["error"] is None
+    assert {path.name for path in out.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+class Broken:
+    """An operator's wrapper that raises in one step."""
+
+    def __init__(self, error):
+        self._error = error
+
+    @hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        answer = yield
+        if context.step == FAILS_IN:
+            raise self._error
+        return answer
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        (ZeroDivisionError("by zero"), "ZeroDivisionError: by zero (test_endings.py, line "),
+        (MemoryError(), "out of memory (MemoryError); try --max-gaussians"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out of memory (RuntimeError"),
+        (SystemExit("enough"), "SystemExit: enough"),
+    ],
+)
+def test_an_unexpected_error_keeps_everything(scene, whole, tmp_path, with_plugin, capsys, case):
+    error, words = case
+    out = tmp_path / "run"
+    with_plugin["broken"] = Broken(error)
+    assert run(scene, out) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"training failed: in step {FAILS_IN}: {words}")
+    assert "Traceback" not in told and f"the traceback is in {out / 'log.txt'}" in told
+    assert told.rstrip().endswith(f"continue with: crossgrad run --resume {out}")
+    log = (out / "log.txt").read_text()
+    assert "Traceback (most recent call last)" in log and type(error).__name__ in log
+    found = summary(out)
+    assert (found["status"], found["step"]) == ("failed", FAILS_IN - 1)
+    assert words in found["error"] and found["overall"]["psnr"] > 5
+    assert {path.name for path in out.iterdir()} >= RESULTS
+    with_plugin.clear()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+
+
+def test_a_photo_that_cannot_be_read_at_an_evaluation(scene, whole, tmp_path, monkeypatch, capsys):
+    def unreadable(*args, **kwargs):
+        raise UserError("the photo cannot be decoded", where="0003.png", todo="copy it again")
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as rot:
+        rot.setattr(session, "evaluate", unreadable)
+        assert run(scene, out) == 1
+    told = capsys.readouterr().err
+    assert told.count("the photo cannot be decoded") == told.count("copy it again") == 1
+    assert "traceback" not in told.lower()
+    assert load(latest(out)).step == summary(out)["step"] == 4
+    assert summary(out)["overall"] is None and (out / "point_cloud.ply").is_file()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("save", "checkpoints"), ("write_per_view", "per_view.csv"), ("draw_curve", "curve.png"),
+        ("export_ply", "point_cloud.ply"), ("write_summary", "summary.json"),
+    ],
+)  # fmt: skip
+def test_no_part_of_the_end_that_fails_costs_another(
+    scene, whole, tmp_path, monkeypatch, capsys, case
+):
+    function, missing = case
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as disk:
+        disk.setattr(session, function, full)
+        assert run(scene, out) == 1
+    told = capsys.readouterr().err
+    assert "No space left on device" in told and "continue with" in told
+    names = {path.name for path in out.iterdir()}
+    assert {"config.yaml", "metrics.csv", "log.txt", *RESULTS, "checkpoints"} - names == {missing}
+    if missing != "summary.json":
+        assert summary(out)["status"] == "failed"
+        assert "No space left on device" in summary(out)["error"]
+    if missing != "checkpoints":
+        assert resumed(out) == 0
+        assert_same(out, whole)
+
+
+class Unkind:
+    """Raises when the run starts or ends."""
+
+    def __init__(self, when):
+        self._when = when
+
+    @hookimpl
+    def crossgrad_run_start(self, run):
+        if self._when == "start":
+            raise ValueError("no start")
+
+    @hookimpl
+    def crossgrad_run_end(self, status):
+        if self._when == "end":
+            raise ValueError("no end")
+
+
+def test_an_observer_that_raises_when_the_run_ends(scene, tmp_path, with_plugin, capsys):
+    with_plugin["unkind"] = Unkind("end")
+    assert run(scene, tmp_path / "run") == 1
+    assert "ValueError: no end" in capsys.readouterr().err
+    found = summary(tmp_path / "run")
+    assert found["status"] == "failed" and "no end" in found["error"]
+    assert found["step"] == STEPS and found["overall"]["psnr"] > 5
+
+
+def test_an_observer_that_raises_when_the_run_starts(scene, tmp_path, with_plugin, capsys):
+    with_plugin["unkind"] = Unkind("start")
+    assert run(scene, tmp_path / "run") == 1
+    assert "ValueError: no start" in capsys.readouterr().err
+    found = summary(tmp_path / "run")
+    assert (found["status"], found["step"], found["overall"]) == ("failed", 0, None)
+    assert found["ply"] is None
+
+
+class Signals:
+    """Sends this process signals after a step, or in the evaluation after it."""
+
+    def __init__(self, step, *numbers, evaluation=False):
+        self._step, self._numbers, self._evaluation = step, numbers, evaluation
+
+    def _send(self, step):
+        if step == self._step:
+            for number in self._numbers:
+                os.kill(os.getpid(), number)
+
+    @hookimpl
+    def crossgrad_step_end(self, record):
+        if not self._evaluation:
+            self._send(record.step)
+
+    @hookimpl
+    def crossgrad_evaluation(self, report):
+        if self._evaluation:
+            self._send(report.step)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_run_after_its_step(scene, whole, tmp_path, with_plugin, capsys, number):
+    out = tmp_path / "run"
+    with_plugin["signals"] = Signals(3, number)
+    assert run(scene, out) == 128 + number
+    assert capsys.readouterr().err == f"continue with: crossgrad run --resume {out}\n"
+    assert (summary(out)["status"], summary(out)["step"]) == ("stopped", 3)
+    assert summary(out)["overall"]["psnr"] > 5
+    with_plugin.clear()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+
+
+@pytest.mark.parametrize("evaluation", [False, True])
+def test_a_second_signal_leaves_out_what_takes_time(
+    scene, whole, tmp_path, with_plugin, capsys, evaluation
+):
+    out = tmp_path / "run"
+    # Further ones change nothing any more.
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGINT)
+    with_plugin["signals"] = Signals(4, *numbers, evaluation=evaluation)
+    assert run(scene, out) == 130
+    assert capsys.readouterr().err.endswith(f"continue with: crossgrad run --resume {out}\n")
+    found = summary(out)
+    assert (found["status"], found["step"]) == ("stopped", 4)
+    assert load(latest(out)).step == 4
+    assert found["ply"] is None and not (out / "point_cloud.ply").exists()
+    with_plugin.clear()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+
+
+def test_a_second_signal_while_the_finished_run_is_evaluated(scene, whole, tmp_path, with_plugin):
+    out = tmp_path / "run"
+    with_plugin["signals"] = Signals(STEPS, signal.SIGINT, signal.SIGINT, evaluation=True)
+    assert run(scene, out) == 130
+    assert (summary(out)["status"], summary(out)["step"]) == ("stopped", STEPS)
+    with_plugin.clear()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+
+
+def test_signals_that_the_process_ignores_stay_ignored(scene, tmp_path, with_plugin):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with_plugin["signals"] = Signals(3, signal.SIGHUP)
+        assert run(scene, tmp_path / "run") == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_that_was_killed_at_its_very_end_is_completed(scene, whole, tmp_path):
+    out = tmp_path / "run"
+    assert run(scene, out) == 0
+    for name in ("summary.json", "per_view.csv", "point_cloud.ply"):
+        (out / name).unlink()
+    assert resumed(out) == 0
+    assert_same(out, whole)
+    with pytest.raises(UserError, match="the run is finished"):
+        resumed(out)
