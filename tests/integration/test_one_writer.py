@@ -68,7 +68,7 @@ def test_a_folder_that_is_no_run_gets_no_lock_file(tmp_path):
     assert content(tmp_path) == {}
 
 
-def test_where_there_are_no_locks_the_run_says_so(stopped, monkeypatch, capsys):
+def test_where_there_are_no_locks_the_run_says_so(stopped, monkeypatch, caplog):
     import fcntl
 
     def unsupported(file, operation):
@@ -76,4 +76,4 @@ def test_where_there_are_no_locks_the_run_says_so(stopped, monkeypatch, capsys):
 
     monkeypatch.setattr(fcntl, "flock", unsupported)
     assert app.run({}, resume=stopped, verbosity=-1) == 0
-    assert "has no locks" in capsys.readouterr().err
+    assert "has no locks" in caplog.text
