@@ -13,6 +13,7 @@ from typing import Final
 from typing_extensions import override
 
 from crossgrad_core import __version__
+from crossgrad_core.terminal import is_live
 
 #: The logger that speaks of kernels, and how its messages begin.
 KERNELS: Final = "crossgrad_core.kernel_cache"
@@ -118,7 +119,7 @@ class _Kernels:
         self._thread, self._count, self._seconds = None, 0, 0.0
 
     def _tell(self) -> None:
-        terminal = sys.stderr.isatty()
+        terminal = is_live(sys.stderr)
         while not self._over.wait(TERMINAL_INTERVAL if terminal else PLAIN_INTERVAL):
             if names := self._names:
                 seconds = self._seconds + monotonic() - self._began
@@ -128,7 +129,7 @@ class _Kernels:
 
 def _say(text: str, *, stays: bool = True) -> None:
     """Writes a line; one that does not stay is overwritten by the next."""
-    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    clear = "\r\x1b[K" if is_live(sys.stderr) else ""
     try:
         sys.stderr.write(f"{clear}{text}" + ("\n" if stays else ""))
         sys.stderr.flush()

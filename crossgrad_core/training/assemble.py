@@ -79,13 +79,6 @@ def choose_device(name: str) -> torch.device:
             expected="cpu, cuda or cuda:N",
             todo="leave --device out to run on the CPU",
         ) from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(
-            "CUDA was asked for, but torch sees no CUDA device",
-            where="--device",
-            found=f"torch {torch.__version__}",
-            todo="use --device cpu, or install a CUDA build of torch",
-        )
     if device.type not in {"cpu", "cuda"}:
         raise UserError(
             f"device type {device.type!r} is not supported",
@@ -93,7 +86,30 @@ def choose_device(name: str) -> torch.device:
             expected="cpu or cuda",
             todo="use --device cpu",
         )
+    if device.type == "cuda":
+        _require_cuda(device)
     return device
+
+
+def _require_cuda(device: torch.device) -> None:
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if (device.index or 0) < count:
+        return
+    # A build of torch for AMD's GPUs calls them CUDA devices, too.
+    built_for = torch.version.cuda or torch.version.hip
+    if built_for is None:
+        found, todo = "a build for CPUs only", "install a CUDA build of torch"
+    elif count == 0:
+        found = f"a build for CUDA {built_for}, but no GPU that it can use"
+        todo = "run nvidia-smi: it tells whether there is a GPU and whether its driver works"
+    else:
+        found, todo = f"devices cuda:0 to cuda:{count - 1}", "choose one of them"
+    raise UserError(
+        f"torch sees no device {str(device)!r}",
+        where="--device",
+        found=f"torch {torch.__version__}: {found}",
+        todo=f"use --device cpu, or {todo}",
+    )
 
 
 def choose_rasterizer(choice: ComponentChoice, device: torch.device) -> tuple[str, str]:

@@ -16,6 +16,7 @@ from crossgrad_core.results.lines import (
     length_lines,
     progress_line,
 )
+from crossgrad_core.terminal import is_live
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -68,7 +69,7 @@ class Progress(Observer):
         if self.level == "quiet":
             return
         self._pace = self._pace.after(record)
-        if sys.stderr.isatty():
+        if is_live(sys.stderr):
             self._move_bar(record)
         elif self._line_is_due(record.step):
             self._last_line = monotonic()

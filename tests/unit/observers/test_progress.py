@@ -1,7 +1,9 @@
 """Progress: plain lines without a terminal, a bar with one, nothing when quiet."""
 
 import io
+import os
 from pathlib import Path
+from select import select
 from types import SimpleNamespace
 
 import pytest
@@ -124,3 +126,16 @@ def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
     assert len(capsys.readouterr().err.splitlines()) == 1
     hook.crossgrad_run_end(status="finished")
     assert capsys.readouterr().err.splitlines() == said
+
+
+def test_a_terminal_without_columns_gets_plain_lines(monkeypatch: pytest.MonkeyPatch):
+    pty = pytest.importorskip("pty")
+    ours, theirs = pty.openpty()  # Its size is 0 x 0 until somebody sets it.
+    with os.fdopen(theirs, "w") as stderr:
+        monkeypatch.setattr("sys.stderr", stderr)
+        run_with(Progress())
+        shown = b""
+        while select([ours], [], [], 0.0)[0]:
+            shown += os.read(ours, 1 << 16)
+    os.close(ours)
+    assert b"step 2/20 (10 %)" in shown and b"step 20/20 (100 %)" in shown
