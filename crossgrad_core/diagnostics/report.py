@@ -8,7 +8,9 @@ from math import isnan
 from pathlib import Path
 
 from crossgrad_core.diagnostics.table import ALL, Row, rows_of, touched
+from crossgrad_core.errors import UserError
 from crossgrad_core.files import write_atomically
+from crossgrad_core.text_files import parse_number, read_rows
 
 PROBES = "diagnostics.csv"
 CAMERAS = "cameras.csv"
@@ -150,12 +152,27 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     write_atomically(path, text.getvalue().encode())
 
 
-def read_csv(path: Path) -> list[Row]:
-    """Rows that `write_csv` wrote, empty cells as NaN; none where there is no file."""
+def read_probes(path: Path) -> list[Row]:
+    """Rows that `write_csv` wrote of probes, empty cells as NaN; none where there is no file.
+
+    Raises:
+        UserError: The file cannot be read, or a row lacks cells or a step.
+    """
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return [{name: _value(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+    todo = "remove the file; the rows of earlier steps are then missing from it"
+    header, *lines = read_rows(path, "the table of probes", todo) or [[]]
+    rows: list[Row] = [dict(zip(header, map(_value, line), strict=False)) for line in lines]
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != len(line) or len(row) != len(header) or not isinstance(row.get("step"), int):
+            raise UserError(
+                "the table of probes cannot be read",
+                where=path,
+                expected=f"{len(header)} cells, one of them a step",
+                found=",".join(line),
+                todo=todo,
+            )
+    return rows
 
 
 def _cell(value: float | str) -> str:
@@ -167,9 +184,7 @@ def _cell(value: float | str) -> str:
 def _value(cell: str) -> str | int | float:
     if cell == "":
         return float("nan")
-    for convert in (int, float):
-        try:
-            return convert(cell)
-        except ValueError:
-            continue
-    return cell
+    try:
+        return parse_number(cell)
+    except ValueError:
+        return cell

@@ -12,6 +12,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation import EvaluationResult
 from crossgrad_core.files import disk_errors, write_atomically
 from crossgrad_core.results.totals import Totals
+from crossgrad_core.text_files import parse_number, read_rows
 
 FILE = "metrics.csv"
 
@@ -22,6 +23,7 @@ _FIRST = ("step", "views", "backward_passes", "train_seconds")
 _METRICS = ("psnr", "ssim", "ssim_skimage", "lpips")
 _LAST = ("primitives", "peak_memory_mib", "loss")
 _MILLISECONDS = 3
+_TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 
 
 def columns_for(regimes: Sequence[str]) -> tuple[str, ...]:
@@ -75,7 +77,7 @@ class MetricsCsv:
         """The table of a run that continues after `step`: rows beyond it are dropped.
 
         Raises:
-            UserError: The table has other columns, so it belongs to another run.
+            UserError: The table cannot be read, or has other columns, so it belongs to another run.
         """
         path = folder / FILE
         if not path.is_file():
@@ -90,10 +92,11 @@ class MetricsCsv:
                 found=",".join(lines[0]) if lines else "an empty file",
                 todo="resume with the scene and split of that run",
             )
-        at = table.columns.index("step")
         # A row that a crash cut short has fewer cells; the resumed run writes it again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
-        table.rewrite([line for line in whole if int(line[at]) <= step])
+        steps = [row["step"] for row in _rows(path, lines[0], whole)]
+        known = zip(whole, steps, strict=True)
+        table.rewrite([line for line, at in known if at is not None and at <= step])
         return table
 
     def append(self, row: Mapping[str, int | float | str | None]) -> None:
@@ -131,17 +134,22 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
             todo="name the folder that `crossgrad run` printed",
         )
     header, *lines = _lines(path) or [[]]
+    if len(set(header)) < len(header):
+        raise _unreadable(path, "a column that occurs twice")
+    return _rows(path, header, lines)
+
+
+def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> tuple[Row, ...]:
     try:
         return tuple(
             {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
         )
     except ValueError as error:
-        raise UserError(
-            f"unreadable {FILE}",
-            where=path,
-            found=str(error),
-            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
-        ) from error
+        raise _unreadable(path, str(error)) from error
+
+
+def _unreadable(path: Path, found: str) -> UserError:
+    return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
 
 
 def _append(path: Path, content: bytes) -> None:
@@ -159,8 +167,7 @@ def _append(path: Path, content: bytes) -> None:
 
 def _lines(path: Path) -> list[list[str]]:
     """All whole lines: one that a crash cut short has no end."""
-    whole, end, _ = path.read_text(encoding="utf-8").rpartition("\n")
-    return list(csv.reader(io.StringIO(whole + end)))
+    return read_rows(path, FILE, _TODO, whole=True)
 
 
 def _csv_text(lines: Sequence[Sequence[str]]) -> str:
@@ -174,9 +181,4 @@ def _cell(value: float | str | None) -> str:
 
 
 def _number(cell: str) -> int | float | None:
-    if cell == "":
-        return None
-    try:
-        return int(cell)
-    except ValueError:
-        return float(cell)
+    return None if cell == "" else parse_number(cell)

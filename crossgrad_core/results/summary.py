@@ -13,6 +13,7 @@ from crossgrad_core.files import write_atomically
 from crossgrad_core.results.metrics_csv import Row
 from crossgrad_core.results.totals import Seconds, Totals
 from crossgrad_core.state import Json
+from crossgrad_core.text_files import read_json
 
 FILE = "summary.json"
 
@@ -83,15 +84,17 @@ def read_summary(folder: Path) -> dict[str, Any]:
             todo="name the folder of a run that has ended",
         )
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content, found = read_json(path), "something else than an object"
     except ValueError as error:
-        raise UserError(
-            f"unreadable {FILE}",
-            where=path,
-            found=str(error),
-            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
-        ) from error
-    return content
+        content, found = None, str(error)
+    if isinstance(content, dict):
+        return content
+    raise UserError(
+        f"unreadable {FILE}",
+        where=path,
+        found=found,
+        todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+    )
 
 
 def _as_data(summary: Summary) -> dict[str, Any]:

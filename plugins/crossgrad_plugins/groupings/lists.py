@@ -1,6 +1,5 @@
 """Groups that the user names: folders of images, or lists of views."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -12,6 +11,7 @@ from typing_extensions import override
 from crossgrad_core.errors import UserError
 from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
 from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.text_files import read_rows
 from crossgrad_plugins.groupings.split import require_training_views
 
 
@@ -54,18 +54,12 @@ def read_labels(path: Path) -> dict[str, str]:
     Raises:
         UserError: The file is missing, a row has not two columns, or a name has two labels.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            "the list of labels cannot be read",
-            where=path,
-            found=str(error),
-            todo="check the path; the file is text in UTF-8 with rows `name,label`",
-        ) from None
+    todo = "check the path; the file is text in UTF-8 with rows `name,label`"
+    rows = [row for row in read_rows(path, "the list of labels", todo) if row]
     table: dict[str, str] = {}
     for row in rows:
+        if row[0].startswith("#"):
+            continue
         cells = [cell.strip() for cell in row]
         if len(cells) != 2 or not all(cells):  # noqa: PLR2004 - a name and a label
             raise UserError(

@@ -76,7 +76,7 @@ class Diagnostics(Observer):
             labelled,
             plan_probe,
         )
-        from crossgrad_core.diagnostics.report import PROBES, read_csv
+        from crossgrad_core.diagnostics.report import PROBES, read_probes
         from crossgrad_core.diagnostics.watch import Watch
 
         if self.grouping is None and model.groups is not None:
@@ -89,6 +89,6 @@ class Diagnostics(Observer):
         watch = Watch(plan, self.every or max(1, total // _PROBES), total, self.seed)
         folder = self._folder()
         if folder is not None:
-            rows = read_csv(folder / PROBES)
+            rows = read_probes(folder / PROBES)
             watch.rows += [row for row in rows if int(row["step"]) < model.phase.step]
         return watch

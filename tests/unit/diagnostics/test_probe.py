@@ -9,7 +9,7 @@ from crossgrad_core.diagnostics import probe
 from crossgrad_core.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_core.diagnostics.plan import labelled, plan_probe
 from crossgrad_core.diagnostics.probe import ModelProbe, measure
-from crossgrad_core.diagnostics.report import read_csv, write_csv
+from crossgrad_core.diagnostics.report import read_probes, write_csv
 from crossgrad_core.diagnostics.table import ALL, table
 from crossgrad_core.diagnostics.watch import Watch
 from crossgrad_core.errors import UserError
@@ -224,12 +224,19 @@ def test_a_watch_that_saw_nothing_has_no_report():
 
 
 def test_tables_survive_the_file(tmp_path):
-    rows = [{"a": 1, "b": 0.25, "c": "x"}, {"a": 2, "b": float("inf"), "d": "y"}]
+    rows = [{"step": 1, "b": 0.25, "c": "x"}, {"step": 2, "b": float("inf"), "d": "y"}]
     write_csv(tmp_path / "t.csv", rows)
-    found = read_csv(tmp_path / "t.csv")
+    found = read_probes(tmp_path / "t.csv")
     assert found[0] == {**rows[0], "d": pytest.approx(float("nan"), nan_ok=True)}
     assert found[1]["b"] == float("inf")
-    assert read_csv(tmp_path / "none.csv") == []
+    assert read_probes(tmp_path / "none.csv") == []
+
+
+@pytest.mark.parametrize("line", ["1,2,3", "1", "x,2", ",2", '1,"2', "\0"])
+def test_a_damaged_table_of_probes_is_one_error(line, tmp_path):
+    (tmp_path / "t.csv").write_text(f"step,a\n{line}\n")
+    with pytest.raises(UserError, match=r"table of probes cannot be read(?s:.*)to do"):
+        read_probes(tmp_path / "t.csv")
 
 
 def test_a_report_is_drawn_whatever_is_missing(model, monkeypatch, tmp_path):

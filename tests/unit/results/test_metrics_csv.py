@@ -105,11 +105,45 @@ def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
     assert read_metrics(tmp_path)[0]['psnr_a,"b"'] == 30.0
 
 
-@pytest.mark.parametrize("line", ["1,2", "a,b,c"])
-def test_unreadable_tables_are_explained(tmp_path: Path, line: str):
-    (tmp_path / "metrics.csv").write_text(f"step,psnr,ssim\n{line}\n")
-    with pytest.raises(UserError, match=r"unreadable metrics\.csv"):
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"step,psnr,ssim\n1,2\n",
+        b"step,psnr,ssim\na,b,c\n",
+        b"step,psnr,ssim\n1,1_0,3\n",
+        "step,psnr,ssim\n1,٣,3\n".encode(),
+        b"step,psnr,psnr\n1,2,3\n",
+        b"step,psnr,ssim\n1,2," + b"9" * 5000 + b"\n",
+        b'step,psnr,ssim\n1,"2\n',
+        b"step,psnr,ssim\n1,2,\xff\n",
+        b"step,psnr,ssim\n1,2," + b"3" * 200_000 + b"\n",
+        b"step,psnr,ssim\n1,2,3\n\n",
+    ],
+)
+def test_unreadable_tables_are_explained(tmp_path: Path, content: bytes):
+    (tmp_path / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.csv(?s:.*)to do"):
         read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("cell", ["x", "1e", "٣", "inf3"])
+@pytest.mark.parametrize("column", ["step", "psnr"])
+def test_a_damaged_table_is_refused_when_the_run_resumes_and_not_when_it_ends(
+    tmp_path: Path, totals, result, cell: str, column: str
+):
+    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table.append({**metrics_row(replace(totals, step=100), result), column: cell})
+    before = table.path.read_bytes()
+    with pytest.raises(UserError, match=r"unreadable metrics\.csv"):
+        MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+    assert table.path.read_bytes() == before
+
+
+def test_figures_that_are_not_finite_are_read(tmp_path: Path):
+    (tmp_path / "metrics.csv").write_text("step,psnr,ssim\n1,inf,nan\n")
+    (row,) = read_metrics(tmp_path)
+    assert row["psnr"] == float("inf")
+    assert row["ssim"] != row["ssim"]
 
 
 def test_a_missing_table_is_explained(tmp_path: Path):

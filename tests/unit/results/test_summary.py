@@ -167,3 +167,10 @@ def test_final_table_without_held_out_views(empty, totals):
     assert "no psnr: no held-out views" in text
     assert "38.2 s training" in text
     assert final_table(None, totals).startswith("38.2 s training")
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"[1]", b"null", b"\xff", b"", b"9" * 9999])
+def test_an_unreadable_summary_is_explained(tmp_path: Path, content: bytes):
+    (tmp_path / "summary.json").write_bytes(content)
+    with pytest.raises(UserError, match=r"unreadable summary\.json(?s:.*)to do"):
+        read_summary(tmp_path)

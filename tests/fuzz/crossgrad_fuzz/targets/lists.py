@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from crossgrad_core import text_files
 from crossgrad_core.scene import split
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST, split_views
@@ -65,7 +66,7 @@ LABELS = Target(
     name="labels",
     seeds=_label_seeds,
     parse=_parse_labels,
-    parser={lists: ("Lists",)},
+    parser={text_files: ("read_json", "parse_number"), lists: ("Lists",)},
     words=(*(name.encode() for name in _NAMES), b"far/", b",", b'"', b"\n", b"#", b'""', b",,"),
 )
 TARGETS = (SPLIT, LABELS)

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from crossgrad_core import text_files
 from crossgrad_core.diagnostics import report
-from crossgrad_core.diagnostics.report import read_csv
+from crossgrad_core.diagnostics.report import read_probes
 from crossgrad_core.results import metrics_csv, summary
 from crossgrad_core.results.metrics_csv import MetricsCsv, read_metrics
 from crossgrad_core.results.summary import read_summary
@@ -40,9 +41,10 @@ def _parse_metrics(folder: Path) -> None:
 
 
 def _parse_table(folder: Path) -> None:
-    rows = read_csv(folder / _TABLE)
+    rows = read_probes(folder / _TABLE)
     for row in rows:
         assert all(isinstance(name, str) for name in row)
+        assert isinstance(row["step"], int)
         assert all(isinstance(value, str | int | float) for value in row.values())
 
 
@@ -59,7 +61,10 @@ METRICS = Target(
     name="metrics",
     seeds=lambda: [{_METRICS: _metrics()}, {_METRICS: _metrics() + b"\n"}],
     parse=_parse_metrics,
-    parser={metrics_csv: ("metrics_row", "MetricsCsv.append", "regimes_of")},
+    parser={
+        text_files: ("read_json",),
+        metrics_csv: ("metrics_row", "MetricsCsv.append", "regimes_of"),
+    },
     words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
     writes=frozenset({_METRICS}),
@@ -69,7 +74,8 @@ TABLE = Target(
     seeds=lambda: [{_TABLE: b"step,block,value\n3,means,0.5\n4,scales,\n"}],
     parse=_parse_table,
     parser={
-        report: tuple(name for name in vars(report) if name not in {"read_csv", "_value"}),
+        text_files: ("read_json",),
+        report: tuple(name for name in vars(report) if name not in {"read_probes", "_value"}),
     },
     words=(b",", b"\n", b'"', b"step", b",x", b"nan"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
@@ -78,7 +84,10 @@ SUMMARY = Target(
     name="summary",
     seeds=_summaries,
     parse=_parse_summary,
-    parser={summary: ("write_summary", "_as_data", "_metrics", "_best", "_finite")},
+    parser={
+        text_files: ("read_rows", "parse_number"),
+        summary: ("write_summary", "_as_data", "_metrics", "_best", "_finite"),
+    },
     words=(b"{", b"}", b"[" * 5000, b"]", b'"a": ', b",", b"NaN", b"Infinity", b"1e999"),
     mutators=(matcher(rb"([\d.]+)", NUMBERS),),
 )

@@ -1,0 +1,67 @@
+"""CSV and JSON files, read so that whatever is in them ends in rows and values or in one error."""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+
+# `int` and `float` also take digits of other scripts, digit groups and spaces.
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
+_LONGEST_NUMBER = 400
+
+
+def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[list[str]]:
+    """The rows of a CSV file in UTF-8; empty lines are rows without cells.
+
+    Args:
+        path: The file.
+        what: What cannot be read, should it be so, such as `the list of labels`.
+        todo: What to do about it.
+        whole: Leave out a last line that has no end.
+
+    Raises:
+        UserError: The file is missing or is not CSV.
+    """
+    try:
+        content = path.read_bytes()
+        text = (content[: content.rfind(b"\n") + 1] if whole else content).decode("utf-8-sig")
+        return list(csv.reader(io.StringIO(text, newline=""), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(
+            f"{what} cannot be read", where=path, found=str(error), todo=todo
+        ) from error
+
+
+def read_json(path: Path) -> object:
+    """The value in a JSON file in UTF-8.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or is not JSON.
+    """
+    try:
+        value: object = json.loads(path.read_bytes().decode("utf-8"))
+    except RecursionError as error:
+        raise ValueError("lists or objects within each other without an end") from error
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(str(error)) from error
+    return value
+
+
+def parse_number(text: str) -> int | float:
+    """A whole number as int, any other as float.
+
+    Raises:
+        ValueError: The text is no number, or has more digits than one can have.
+    """
+    if len(text) > _LONGEST_NUMBER or not _NUMBER.fullmatch(text):
+        raise ValueError(f"not a number: {text!r}")
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
