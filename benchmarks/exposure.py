@@ -14,7 +14,7 @@ from statistics import mean
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.app import opened
+from crossgrad_core.opening import opened
 from crossgrad_core.training.export import renderer
 
 

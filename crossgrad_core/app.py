@@ -1,4 +1,4 @@
-"""What the commands do: run, resume, evaluate, render, export."""
+"""What `crossgrad run` does: a new run, or one that goes on."""
 
 import logging
 import sys
@@ -7,43 +7,33 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from time import perf_counter
-from typing import Any, cast
+from typing import Any
 
-from pydantic import ValidationError
-
-from crossgrad_core.checkpoint import load_latest
-from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import clear_leftovers
+from crossgrad_core.opening import continued, parsed, set_up
 from crossgrad_core.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.results.folder import RunName, check_out, create_run_folder, expected_bytes
 from crossgrad_core.results.lock import locked
 from crossgrad_core.results.log import RunLog
 from crossgrad_core.results.summary import read_summary
 from crossgrad_core.results.table import final_table
-from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import (
     DEFAULT_STEPS,
-    assemble,
-    check_names,
     growth_note,
-    read_scene,
     schedule_of,
 )
-from crossgrad_core.training.budget import Length, Planned, Timed, caught_up, steps_for
+from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.training.ending import Course, last_words
-from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.forecast import Forecast
-from crossgrad_core.training.persist import from_checkpoint
 from crossgrad_core.training.resolve import resolved
 from crossgrad_core.training.session import Session, totals
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
-from crossgrad_core.validation import as_user_error
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -79,7 +69,7 @@ def run(
         return _resume(resume, settings, verbosity)
     config = with_defaults(parsed(settings))
     check_out(config.out)
-    setup, load_seconds = _setup(config, verbosity)
+    setup, load_seconds = set_up(config, verbosity)
     if dry_run:
         _print_dry_run(setup)
         return 0
@@ -95,20 +85,6 @@ def run(
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config)
         return _train(setup, state, Session.fresh(folder, setup), length)
-
-
-def parsed(settings: Mapping[str, Any]) -> RunConfig:
-    """The validated configuration.
-
-    Raises:
-        UserError: A setting does not exist or has a wrong value.
-    """
-    try:
-        return RunConfig.model_validate(settings)
-    except ValidationError as error:
-        raise as_user_error(
-            error, RunConfig, subject="a run", todo="crossgrad run --help lists every setting"
-        ) from error
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -127,20 +103,6 @@ def with_defaults(config: RunConfig) -> RunConfig:
     elif config.steps is None and config.seconds is None:
         config = config.model_copy(update={"steps": DEFAULT_STEPS})
     return config
-
-
-def _setup(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
-    """The assembled run and the seconds that reading the scene took."""
-    check_names(config)
-    configure_threads(config.threads)
-    start = perf_counter()
-    scene, reader = read_scene(config, cast("Path", config.scene))
-    seconds = perf_counter() - start
-    level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
-    if not any(choice.name == "progress" for choice in config.observers):
-        progress = ComponentChoice.model_validate({"name": "progress", "level": level})
-        config = config.model_copy(update={"observers": (*config.observers, progress)})
-    return assemble(config, scene, reader), seconds
 
 
 def _within(setup: Setup, seconds: float) -> Setup:
@@ -207,7 +169,7 @@ def _train(setup: Setup, state: TrainState, session: Session, length: Length) ->
 def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
     with _held(folder):
-        setup, state = opened(folder, settings, verbosity)
+        setup, state = continued(folder, settings, verbosity)
         if state.step >= setup.schedule.total and _is_described(folder, state.step):
             raise UserError(
                 "the run is finished",
@@ -228,106 +190,6 @@ def _is_described(folder: Path, step: int) -> bool:
     except UserError:
         return False
     return summary.get("status") == "finished" and summary.get("step") == step
-
-
-def opened(
-    folder: Path, settings: Mapping[str, Any], verbosity: int = 0
-) -> tuple[Setup, TrainState]:
-    """A run's setup and its newest state.
-
-    Args:
-        folder: The run's folder.
-        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
-        verbosity: -1 quiet, 0 normal, 1 verbose.
-
-    Raises:
-        UserError: It is no run, it has no checkpoint, or a setting would change the training.
-    """
-    stored = read_config(folder)
-    checkpoint = load_latest(folder)
-    frozen = sorted(set(settings) - {"device", "threads", "stop_after"})
-    if frozen:
-        raise UserError(
-            "a resumed run keeps its settings",
-            where=", ".join(f"--{name.replace('_', '-')}" for name in frozen),
-            todo="leave them out, or start a new run",
-        )
-    stored.pop("stop_after", None)
-    # The degree that a run started with is written down; where it is not, it was 0.
-    stored["sh_from"] = stored.get("sh_from") or 0
-    config = parsed({**stored, **settings})
-    setup, seconds = _setup(config, verbosity)
-    state = from_checkpoint(setup, checkpoint)
-    setup = caught_up(setup, state.step)
-    state.clock.load += seconds
-    return setup, state
-
-
-def evaluate(folder: Path, *, device: str | None = None, threads: int | None = None) -> None:
-    """Evaluates the held-out views of a run again; prints the table and renews per_view.csv.
-
-    Raises:
-        UserError: It is no run, or it has no checkpoint.
-    """
-    from crossgrad_core.evaluation import evaluate as measured
-    from crossgrad_core.results.per_view import write_per_view
-
-    setup, state = opened(folder, _machine(device, threads), -1)
-    result = measured(setup.scene.test_views, renderer(setup, state))
-    write_per_view(folder, result)
-    print(final_table(result, totals(setup, state)))  # noqa: T201
-
-
-def render(folder: Path, *, split: str, out: Path | None, device: str | None = None) -> None:
-    """Draws photo | render | error of the views of a run.
-
-    Raises:
-        UserError: It is no run, it has no checkpoint, or the split is empty.
-    """
-    from crossgrad_core.evaluation import evaluate as measured
-    from crossgrad_core.results.panels import PanelWriter
-
-    setup, state = opened(folder, _machine(device, None), -1)
-    scene = setup.scene
-    views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
-    if not views:
-        raise UserError(
-            "there are no views to render",
-            where=f"--split {split}",
-            todo="choose another --split: train, test or all",
-        )
-    writer = PanelWriter.of(folder, state.step, views, len(views))
-    if out is not None:
-        writer = replace(writer, folder=out)
-    measured(views, renderer(setup, state), on_view=writer.write)
-    print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
-
-
-def export(folder: Path, *, file_format: str, out: Path | None, camera: str | None = None) -> None:
-    """Writes the trained scene to a file that viewers open.
-
-    Args:
-        folder: The run's folder.
-        file_format: `ply`.
-        out: The file; by default `point_cloud.ply` in the run's folder.
-        camera: Name of the view to bake for; by default the average over the training views.
-
-    Raises:
-        UserError: It is no run, it has no checkpoint, the file exists, or there is no such view.
-    """
-    path = out or folder / f"point_cloud.{file_format}"
-    if out is not None and out.exists():
-        raise UserError("the file exists", where=out, todo="choose another --out, or remove it")
-    setup, state = opened(folder, {}, -1)
-    exported = export_ply(setup, state, path, camera)
-    for line in described(exported, path):
-        print(line)  # noqa: T201
-    print(f"{exported.gaussians:,} Gaussians in {path}")  # noqa: T201
-
-
-def _machine(device: str | None, threads: int | None) -> dict[str, Any]:
-    given = {"device": device, "threads": threads}
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def _print_dry_run(setup: Setup) -> None:

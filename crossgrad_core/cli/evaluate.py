@@ -22,6 +22,6 @@ def evaluate(
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()
-    from crossgrad_core import app
+    from crossgrad_core import afterwards
 
-    app.evaluate(run, device=device, threads=threads)
+    afterwards.evaluate(run, device=device, threads=threads)

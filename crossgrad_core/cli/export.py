@@ -30,12 +30,27 @@ def export(
         str | None,
         typer.Option(
             metavar="VIEW",
-            help="Bake what depends on the view for this one. Default: mean of the training views.",
+            help="Bake what depends on the view for this one, into RUN/point_cloud_VIEW.ply. "
+            "Default: mean of the training views.",
         ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()
-    from crossgrad_core import app
+    from crossgrad_core import afterwards
 
-    app.export(run, file_format=file_format.value, out=out, camera=camera)
+    afterwards.export(
+        run,
+        file_format=file_format.value,
+        out=out,
+        camera=camera,
+        device=device,
+        threads=threads,
+    )

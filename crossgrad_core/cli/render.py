@@ -30,9 +30,12 @@ def render(
         str | None,
         typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
     ] = None,
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
+    ] = None,
 ) -> None:
     """Draw the views of a run as PNG files."""
     announce()
-    from crossgrad_core import app
+    from crossgrad_core import afterwards
 
-    app.render(run, split=split.value, out=out, device=device)
+    afterwards.render(run, split=split.value, out=out, device=device, threads=threads)

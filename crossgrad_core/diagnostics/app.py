@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from crossgrad_core.app import FAILED, opened, parsed, with_defaults
+from crossgrad_core.app import FAILED, with_defaults
 from crossgrad_core.diagnostics.command import Options, diagnose_run, diagnose_scene
 from crossgrad_core.diagnostics.report import PICTURE, PROBES, Report
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import disk_errors
+from crossgrad_core.opening import opened, parsed
 from crossgrad_core.training.failure import TrainingFailedError
 
 

@@ -11,7 +11,7 @@ from crossgrad_core.files import write_atomically
 FILE = "per_view.csv"
 
 
-def write_per_view(folder: Path, result: EvaluationResult) -> None:
+def write_per_view(folder: Path, result: EvaluationResult, name: str = FILE) -> None:
     """Writes one line per view: name, regime, metrics; an empty cell where one is not known.
 
     Raises:
@@ -22,4 +22,4 @@ def write_per_view(folder: Path, result: EvaluationResult) -> None:
     table = csv.DictWriter(text, columns, lineterminator="\n")
     table.writeheader()
     table.writerows(asdict(view) for view in result.views)
-    write_atomically(folder / FILE, text.getvalue().encode())
+    write_atomically(folder / name, text.getvalue().encode())

@@ -97,6 +97,15 @@ def read_summary(folder: Path) -> dict[str, Any]:
     )
 
 
+def summarised_step(folder: Path) -> int | None:
+    """The step that a run's summary.json and the files beside it describe; None without one."""
+    try:
+        step = read_summary(folder).get("step")
+    except UserError:
+        return None
+    return step if isinstance(step, int) else None
+
+
 def _as_data(summary: Summary) -> dict[str, Any]:
     return {
         "status": summary.status,

@@ -1,0 +1,152 @@
+"""What is done with a run afterwards: nothing that its summary describes is replaced."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from crossgrad_core import afterwards, app
+from crossgrad_core.errors import UserError
+from crossgrad_core.ply import read_ply
+from crossgrad_core.results.lock import locked
+from crossgrad_core.testing.scenes import write_tiny_scene
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    return write_tiny_scene(folder, views=5, folders=("street", "aerial"))
+
+
+def run(scene, out, **settings):
+    given = {"scene": str(scene), "out": str(out), "steps": STEPS, "threads": 1}
+    return app.run({**given, **settings}, verbosity=-1)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A run of a backbone that has to be baked."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    assert run(scene, out, backbone={"name": "scaffold"}, stop_after=3) == 0
+    return out
+
+
+@pytest.fixture
+def finished(trained, tmp_path):
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
+    """Files that were not there before; no other file may have changed."""
+    now = content(folder)
+    assert {name: now[name] for name in before} == before
+    return set(now) - set(before)
+
+
+def export(folder, **options):
+    afterwards.export(folder, **{"file_format": "ply", "out": None, **options})
+
+
+def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys):
+    before = content(finished)
+    export(finished, camera="street/0002.png")
+    assert new_files(finished, before) == {"point_cloud_street__0002.ply"}
+    assert str(finished / "point_cloud_street__0002.ply") in capsys.readouterr().out
+    files = (finished / name for name in ("point_cloud.ply", "point_cloud_street__0002.ply"))
+    own, baked = (read_ply(file).logit_opacities for file in files)
+    assert own.shape != baked.shape or (own != baked).any()
+    with pytest.raises(UserError, match="the file exists"):
+        export(finished, camera="street/0002.png")
+    with pytest.raises(UserError, match="no view 'nobody'"):
+        export(finished, camera="nobody")
+
+
+def test_the_same_export_writes_the_same_file(finished):
+    before = content(finished)
+    export(finished)
+    assert new_files(finished, before) == set()
+
+
+def test_a_backbone_that_is_not_baked_has_no_file_for_a_view(scene, tmp_path):
+    run(scene, tmp_path / "run", stop_after=1)
+    with pytest.raises(UserError, match="vanilla has nothing to bake"):
+        export(tmp_path / "run", camera="street/0002.png")
+
+
+def test_results_of_another_step_than_the_summary_get_names_of_their_own(finished):
+    """A run that went on and was killed has a checkpoint that is newer than its summary."""
+    path = finished / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "step": 2}))
+    before = content(finished)
+    export(finished)
+    afterwards.evaluate(finished)
+    expected = {"point_cloud_step-000003.ply", "per_view_step-000003.csv"}
+    assert new_files(finished, before) == expected
+    assert content(finished)["per_view_step-000003.csv"] == before["per_view.csv"]
+
+
+def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys):
+    with locked(finished, "training"):
+        before = content(finished)
+        afterwards.evaluate(finished)
+        assert "overall" in capsys.readouterr().out
+        assert "another process writes" in caplog.text and "none is written there" in caplog.text
+        for write in (
+            lambda: export(finished),
+            lambda: export(finished, camera="street/0002.png"),
+            lambda: afterwards.render(finished, split="test", out=None),
+        ):
+            with pytest.raises(UserError, match=r"training since(.|\n)*another place with --out"):
+                write()
+        export(finished, out=tmp_path / "mine.ply")
+        afterwards.render(finished, split="test", out=tmp_path / "renders")
+        assert content(finished) == before
+    assert (tmp_path / "mine.ply").read_bytes() == before["point_cloud.ply"]
+    assert len(list((tmp_path / "renders").iterdir())) == 2
+
+
+def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
+    for look in (afterwards.evaluate, export):
+        with pytest.raises(UserError, match="not the folder of a run"):
+            look(tmp_path)
+    assert content(tmp_path) == {}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")
+def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path, capsys):
+    path = finished / "config.yaml"
+    stored = {**yaml.safe_load(path.read_text()), "device": "cuda", "rasterizer": {"name": "torch"}}
+    path.write_text(yaml.safe_dump(stored))
+    looks = (
+        lambda **options: export(finished, out=tmp_path / "a.ply", **options),
+        lambda **options: afterwards.evaluate(finished, **options),
+        lambda **options: afterwards.render(
+            finished, split="test", out=tmp_path / "renders", **options
+        ),
+    )
+    for look in looks:
+        with pytest.raises(UserError, match=r"config.yaml, device: cuda(.|\n)*--device cpu"):
+            look()
+        look(device="cpu", threads=1)
+    assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
+    assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
+
+
+def test_the_command_line_has_these_options():
+    from typer.testing import CliRunner
+
+    from crossgrad_core.cli.main import app as command
+
+    for name in ("eval", "render", "export"):
+        text = CliRunner().invoke(command, [name, "--help"]).output
+        assert "--device" in text and "--threads" in text

@@ -1,0 +1,91 @@
+"""A run that was killed before its first checkpoint begins again from its configuration."""
+
+import json
+import os
+import shutil
+
+import pytest
+import torch
+
+from crossgrad_core import afterwards, app
+from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.errors import UserError
+from crossgrad_core.results.lock import locked
+from crossgrad_core.results.metrics_csv import read_metrics
+from crossgrad_core.testing.scenes import write_tiny_scene
+
+MEASURED = {"psnr", "ssim", "ssim_skimage", "primitives", "loss", "views"}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nothing disturbs."""
+    root = tmp_path_factory.mktemp("whole")
+    scene = write_tiny_scene(root / "tiny", views=9)
+    settings = {
+        "scene": str(scene), "out": str(root / "run"), "steps": 6, "eval_every": 2, "seed": 3,
+        "sampler": {"name": "near-far"}, "background": "random",
+    }  # fmt: skip
+    assert app.run(settings, verbosity=-1) == 0
+    return root / "run"
+
+
+@pytest.fixture
+def killed(whole, tmp_path):
+    """The same, killed after its first evaluation and before its first checkpoint."""
+    out = tmp_path / "run"
+    out.mkdir()
+    shutil.copy(whole / "config.yaml", out)
+    lines = (whole / "metrics.csv").read_text().splitlines(keepends=True)
+    (out / "metrics.csv").write_text("".join(lines[:2]))
+    (out / "checkpoints" / ".scratch-step-000002").mkdir(parents=True)
+    (out / ".log.txt.123.tmp").write_text("half")
+    return out
+
+
+def measured(out):
+    return [{name: row[name] for name in MEASURED} for row in read_metrics(out)]
+
+
+def test_it_begins_again_and_says_so(whole, killed):
+    assert app.run({}, resume=killed, verbosity=-1) == 0
+    ours, theirs = load(latest(killed)), load(latest(whole))
+    assert all(torch.equal(ours.parameters[name], theirs.parameters[name])
+               for name in theirs.parameters)  # fmt: skip
+    assert ours.generators == theirs.generators
+    assert measured(killed) == measured(whole)
+    words = "no checkpoint yet: the run begins again from its configuration"
+    assert words in (killed / "log.txt").read_text()
+    assert words in json.loads((killed / "summary.json").read_text())["notes"]
+    assert {path.name for path in killed.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+def test_a_run_that_was_killed_before_its_table(whole, killed):
+    (killed / "metrics.csv").unlink()
+    assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
+    assert measured(killed) == measured(whole)[:1]
+
+
+def test_its_settings_stay(killed):
+    with pytest.raises(UserError, match="keeps its settings"):
+        app.run({"seed": 4}, resume=killed, verbosity=-1)
+
+
+def test_until_then_there_is_nothing_to_look_at(killed):
+    for look in (
+        afterwards.evaluate,
+        lambda run: afterwards.export(run, file_format="ply", out=None),
+    ):
+        with pytest.raises(UserError, match=rf"no checkpoint yet(.|\n)*--resume {killed} begins"):
+            look(killed)
+    with (
+        locked(killed, "training"),
+        pytest.raises(UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first one"),
+    ):
+        afterwards.evaluate(killed)
+
+
+def test_a_new_run_into_its_folder_is_told_to_resume(killed):
+    settings = {"scene": "nowhere", "out": str(killed), "steps": 2}
+    with pytest.raises(UserError, match="continue that run with --resume"):
+        app.run(settings, verbosity=-1)
