@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from crossgrad_core.optimizer.state import AdamState
 
+#: Added to the root of the second moment (3DGS).
+EPS = 1e-15
 # Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
 # less than 1e-14 of its learning rate, but as they decay they would become subnormal.
 TINY = 1e-30
@@ -31,6 +33,7 @@ class Coefficients:
         root_scale: 1 / sqrt(1 - beta2^t).
         eps: Added to the root of the corrected second moment.
         square_floor: Gradients below it would give a subnormal contribution to the second moment.
+        scale: What the gradient is multiplied by.
     """
 
     beta1: float
@@ -39,6 +42,7 @@ class Coefficients:
     root_scale: float
     eps: float
     square_floor: float
+    scale: float = 1.0
 
 
 @torch.no_grad()
@@ -48,7 +52,7 @@ def adam_step(
     state: AdamState,
     lrs: Mapping[str, float],
     betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
+    scales: Mapping[str, float] | None = None,
 ) -> None:
     """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
 
@@ -63,14 +67,14 @@ def adam_step(
         state: Moments and step counts; missing ones start at zero.
         lrs: Learning rate of every tensor that has a gradient.
         betas: Decay of the first and the second moment, each in [0, 1).
-        eps: Positive; added to the root of the second moment.
+        scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not fit its tensor.
 
     Source: Kingma and Ba 2015, algorithm 1.
     """
-    _check(params, grads, betas, eps)
+    _check(params, grads, betas)
     for name, param in params.items():
         grad = grads.get(name)
         if grad is None:
@@ -80,7 +84,9 @@ def adam_step(
             state.exp_avg_sq[name] = torch.zeros_like(state.exp_avg[name])
             state.steps[name] = 0
         state.steps[name] += 1
-        coefficients = _coefficients(state.steps[name], lrs[name], betas, eps)
+        coefficients = _coefficients(state.steps[name], lrs[name], betas)
+        if scales is not None:
+            coefficients = replace(coefficients, scale=scales[name])
         update_tensor(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
 
 
@@ -106,6 +112,7 @@ def update_reference(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
     """The same step in plain torch; any device and floating type."""
+    grad = grad if step.scale == 1.0 else grad * step.scale
     grad = _without(grad.clamp(-LARGEST, LARGEST), TINY)
     exp_avg.mul_(step.beta1).add_(grad, alpha=1 - step.beta1)
     exp_avg.copy_(_without(exp_avg, TINY))
@@ -121,14 +128,14 @@ def _without(values: Tensor, floor: float) -> Tensor:
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 
-def _coefficients(count: int, lr: float, betas: tuple[float, float], eps: float) -> Coefficients:
+def _coefficients(count: int, lr: float, betas: tuple[float, float]) -> Coefficients:
     beta1, beta2 = betas
     return Coefficients(
         beta1=beta1,
         beta2=beta2,
         step_size=lr / (1 - beta1**count),
         root_scale=1 / math.sqrt(1 - beta2**count),
-        eps=eps,
+        eps=EPS,
         square_floor=math.sqrt(SMALLEST_NORMAL / (1 - beta2)),
     )
 
@@ -137,12 +144,9 @@ def _check(
     params: Mapping[str, Tensor],
     grads: Mapping[str, Tensor | None],
     betas: tuple[float, float],
-    eps: float,
 ) -> None:
     if not all(0 <= beta < 1 for beta in betas):
         raise ValueError(f"`betas` must lie in [0, 1); found {betas}")
-    if not eps > 0:
-        raise ValueError(f"`eps` must be positive; found {eps}")
     for name, param in params.items():
         grad = grads.get(name)
         if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):

@@ -15,8 +15,9 @@ _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
 
 _Floats: TypeAlias = NDArray[np.float32]
+_Number: TypeAlias = np.float32
 _Numbers: TypeAlias = tuple[
-    np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32
+    _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number
 ]
 
 
@@ -24,9 +25,9 @@ _Numbers: TypeAlias = tuple[
 def _update(
     param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
 ) -> None:
-    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor = numbers
+    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
-        g = grad[i]
+        g = scale * grad[i]
         g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
@@ -65,6 +66,7 @@ def update_arrays(
         np.float32(step.root_scale),
         np.float32(step.eps),
         np.float32(step.square_floor),
+        np.float32(step.scale),
     )
     # A single chunk is not worth waking other threads for.
     update = _update if len(param) <= _CHUNK else _update_chunks

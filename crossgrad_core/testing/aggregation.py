@@ -21,6 +21,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import step_fields
+from crossgrad_core.training.operator_scale import OperatorScale
 
 _RATE = LearningRate(0.01)
 BLOCKS = (
@@ -145,8 +146,20 @@ def same_seed_same_aggregation(make: Make[Operator]) -> None:
             require(same_state(revived(state), other.states[name]), f"K = {views}: states differ")
 
 
+def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
+    """K equal gradients in a neutral context get finite weights, the same ones each time.
+
+    Regularisers and the optimizer follow their sum.
+    """
+    for views in admitted(make().views):
+        context = aggregate_context(sample_gradients(views))
+        one, other = (OperatorScale(make()).of(context).per_step for _ in range(2))
+        require(one == other, f"K = {views}: equal gradients get other weights each time")
+
+
 AGGREGATION_CHECKS: tuple[Check[Operator], ...] = (
     every_tensor_is_answered,
+    equal_gradients_have_a_scale,
     absent_views_have_no_weight,
     gradients_stay_untouched,
     same_seed_same_aggregation,

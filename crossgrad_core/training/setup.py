@@ -19,6 +19,7 @@ from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_core.schedule import Phase, Schedule
+from crossgrad_core.training.operator_scale import OperatorScale
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,11 @@ class Setup:
     def separate(self) -> bool:
         """Whether the views' gradients are kept apart."""
         return self.operator.separate or bool(self.watchers)
+
+    @cached_property
+    def operator_scale(self) -> OperatorScale:
+        """What the operator makes of equal gradients."""
+        return OperatorScale(self.operator)
 
     @cached_property
     def joint(self) -> bool:

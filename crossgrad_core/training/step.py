@@ -26,6 +26,7 @@ from crossgrad_core.topology import Edit, NoEdit
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import room_for_primitives
+from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import (
@@ -47,12 +48,15 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     state.step += 1
     draw = _sample(setup, state)
     rendered = render_views(setup, state, draw)
-    aggregated = _aggregate(setup, state, draw, rendered)
+    context = _aggregate_context(setup, state, draw, rendered)
+    aggregated = _aggregate(setup, state, context)
+    of_step: Gradients = {}
     if setup.regularizes:
-        add_regularization(setup, state, rendered.regular)
-    gradients = joined(aggregated.gradients, rendered.regular)
+        add_regularization(setup, state, of_step)
+    scale = setup.operator_scale.of(context)
+    gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     _check_finite(state, rendered, gradients)
-    counts = _finish(setup, state, rendered, gradients)
+    counts = _finish(setup, state, rendered, gradients, scale)
     return StepRecord(
         step=state.step,
         views=draw.views,
@@ -78,8 +82,10 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     return answer.draw
 
 
-def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) -> Aggregated:
-    context = AggregateContext(
+def _aggregate_context(
+    setup: Setup, state: TrainState, draw: Draw, rendered: Rendered
+) -> AggregateContext:
+    return AggregateContext(
         **_common(setup, state, "operator"),
         gradients=rendered.gradients,
         losses=np.array([record.loss for record in rendered.records]),
@@ -88,6 +94,9 @@ def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) 
         reference_distance=float(np.median(setup.distances)),
         blocks=setup.trained_blocks,
     )
+
+
+def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Aggregated:
     answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
     state.commit(answer.states)
     state.counters.dropped += answer.counts.get("dropped", 0)
@@ -95,29 +104,30 @@ def _aggregate(setup: Setup, state: TrainState, draw: Draw, rendered: Rendered) 
 
 
 def _finish(
-    setup: Setup, state: TrainState, rendered: Rendered, gradients: Gradients
+    setup: Setup, state: TrainState, rendered: Rendered, gradients: Gradients, scale: Scale
 ) -> Mapping[str, int]:
     """Optimizer, density control and `after_step` in the order of the preset."""
     state.touched = True
     if not setup.densify_first:
-        _optimize(setup, state, gradients)
+        _optimize(setup, state, gradients, scale)
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
         # In the published order an edit replaces tensors, whose gradients are then gone.
         gone = set(gradients) if edited else set(edit.values if isinstance(edit, Edit) else ())
         if state.step < setup.schedule.total:
-            _optimize(setup, state, {n: g for n, g in gradients.items() if n not in gone})
+            left = {name: g for name, g in gradients.items() if name not in gone}
+            _optimize(setup, state, left, scale)
     if setup.acts_after_step:
         _after_step(setup, state, edited=edited)
     return edit.counts if isinstance(edit, Edit) else {}
 
 
-def _optimize(setup: Setup, state: TrainState, gradients: Gradients) -> None:
+def _optimize(setup: Setup, state: TrainState, gradients: Gradients, scale: Scale) -> None:
     progress = state.step / setup.schedule.lr_steps
     blocks = setup.trained_blocks
     rates = {name: block.lr.at(progress) for block in blocks for name in block.tensors}
-    adam_step(state.parameters, gradients, state.adam, rates)
+    adam_step(state.parameters, gradients, state.adam, rates, scales=scale.to_sum)
 
 
 def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit | NoEdit, bool]:

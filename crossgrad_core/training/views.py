@@ -17,6 +17,7 @@ from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.photometric import photometric_loss
 from crossgrad_core.scene.types import View
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -31,7 +32,7 @@ class Rendered:
     Attributes:
         records: One record per view.
         gradients: Their gradients, apart or summed up as the operator needs them.
-        regular: Gradients of regularisation terms of the views, to join after aggregation.
+        regular: Sum of the gradients of the views' regularisation terms, apart from the above.
     """
 
     records: tuple[ViewRecord, ...]
@@ -205,11 +206,34 @@ def _add(into: Gradients, more: Mapping[str, Tensor | None]) -> None:
             into[name] = gradient if have is None else have + gradient
 
 
-def joined(gradients: Mapping[str, Tensor | None], regular: Gradients) -> Gradients:
-    """The aggregated gradients with those of the regularisation terms added."""
+def joined(
+    gradients: Mapping[str, Tensor | None], of_views: Gradients, of_step: Gradients, scale: Scale
+) -> Gradients:
+    """The aggregated gradients with those of the regularisation terms added.
+
+    They follow the operator's scale c(K), so that the terms weigh as much against the photometric
+    loss whatever the operator: a term of the step joins c(K) times, each view's c(K) / K times.
+
+    Args:
+        gradients: The aggregated gradients.
+        of_views: The sum of the gradients of the views' terms.
+        of_step: The sum of the gradients of the step's terms.
+        scale: What the operator makes of K equal gradients.
+    """
+    regular = _times(of_views, scale.per_view)
+    _add(regular, _times(of_step, scale.per_step))
     result = dict(gradients)
     _add(result, regular)
     return result
+
+
+def _times(gradients: Gradients, factors: Mapping[str, float]) -> Gradients:
+    """The gradients by their tensors' factors; none where the factor is 0."""
+    return {
+        name: gradient if factors[name] == 1.0 else gradient * factors[name]
+        for name, gradient in gradients.items()
+        if gradient is not None and factors[name]
+    }
 
 
 def _backward(loss: Tensor) -> None:

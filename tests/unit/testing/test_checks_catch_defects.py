@@ -462,6 +462,7 @@ DEFECTS = [
     (components.options_are_described, Silent),
     (components.hooks_exist, Misspelt),
     (aggregation.every_tensor_is_answered, ForgetsATensor),
+    (aggregation.equal_gradients_have_a_scale, HiddenCounter),
     (aggregation.absent_views_have_no_weight, CountsViewsThatAreNotThere),
     (aggregation.gradients_stay_untouched, ChangesGradients),
     (aggregation.same_seed_same_aggregation, GlobalRandomness),

@@ -1,0 +1,190 @@
+"""What regularisers and the optimizer follow: c(K), the weight of K equal gradients."""
+
+from math import nan, sqrt
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.component import ViewCounts
+from crossgrad_core.contexts import Aggregated
+from crossgrad_core.errors import UserError
+from crossgrad_core.operator import Operator
+from crossgrad_core.registry import build, entries
+from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
+from crossgrad_core.testing.contract import admitted
+from crossgrad_core.training.operator_scale import OperatorScale, Scale, neutral
+from crossgrad_core.training.views import joined
+
+TENSORS = ("means", "f_dc", "net.weight", "net.bias")
+#: methods.md 8 and 11.11.
+EXPECTED = {
+    "sum": lambda k: k,
+    "mean": lambda k: 1,
+    "upgrad": lambda k: 1,
+    "dualproj": lambda k: 1,
+    "gradnorm": lambda k: k,
+    "preconditioner": lambda k: k,
+    "graddrop": lambda k: k,
+    "pcgrad": lambda k: k,
+    "confgate": lambda k: k,
+    "mgda": lambda k: 1,
+    "imtl-g": lambda k: 1,
+    "nash": sqrt,
+    "cagrad": lambda k: 1 if k == 1 else 1.5,
+    "aligned": lambda k: 1,
+}
+
+
+def scale_of(operator, views):
+    return OperatorScale(operator).of(aggregate_context(sample_gradients(views)))
+
+
+class Fivefold(Operator):
+    """A third party's: the sum times five, in one row."""
+
+    asked: ClassVar[list] = []
+
+    def transform(self, gramians, context, state, rng):
+        self.asked.append(context)
+        return np.full((len(gramians), 1, gramians.shape[1]), 5.0), state
+
+
+class Halves(Operator):
+    """A third party's that works on elements and freezes the network."""
+
+    def transform(self, gramians, context, state, rng):
+        raise AssertionError
+
+    def aggregate(self, context, state):
+        def half(name, views):
+            if name.startswith("net"):
+                return None
+            return sum(views[1:], views[0]) / 2
+
+        return Aggregated(context.gradients.elementwise(half)), state
+
+
+class Broken(Operator):
+    def transform(self, gramians, context, state, rng):
+        return np.full(gramians.shape, nan if gramians[0, 0, -1] > 0.999 else 1.0), state
+
+
+class Labelled(Operator):
+    """Needs one view of each label."""
+
+    views: ClassVar[ViewCounts] = ViewCounts(2, 2)
+
+    def transform(self, gramians, context, state, rng):
+        near, far = context.labels.index("near"), context.labels.index("far")
+        matrix = np.zeros(gramians.shape)
+        matrix[:, 0, near], matrix[:, 0, far] = 0.5, 0.75
+        return matrix, state
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 5])
+@pytest.mark.parametrize("name", EXPECTED)
+def test_known_operators_have_the_sums_of_the_specification(name, views):
+    scale = scale_of(build("operators", name, {}), views)
+    assert scale.per_step == pytest.approx(dict.fromkeys(TENSORS, EXPECTED[name](views)))
+    assert scale.per_view == pytest.approx(dict.fromkeys(TENSORS, EXPECTED[name](views) / views))
+
+
+@pytest.mark.parametrize("granularity", ["group", "global", "gaussian"])
+def test_every_granularity_has_the_same_sum(granularity):
+    operator = build("operators", "nash", {"granularity": granularity})
+    assert scale_of(operator, 3).per_step == pytest.approx(dict.fromkeys(TENSORS, sqrt(3)))
+
+
+@pytest.mark.parametrize("name", entries("operators"))
+def test_one_view_changes_no_bit(name):
+    operator = build("operators", name, {})
+    if 1 in admitted(operator.views):
+        scale = scale_of(operator, 1)
+        ones = dict.fromkeys(TENSORS, 1.0)
+        assert (scale.per_step, scale.per_view) == (ones, ones)
+        assert scale.to_sum == ones
+
+
+def test_chains_follow_their_links():
+    chain = build("operators", "chain", {"links": ["symmetric", "preconditioner", "mean"]})
+    assert scale_of(chain, 4).per_step == pytest.approx(dict.fromkeys(TENSORS, 1))
+
+
+def test_each_block_follows_its_own_operator():
+    rules = {"geometry": "mean", "appearance": "sum", "net": "nash"}
+    scale = scale_of(build("operators", "dispatch", {"rules": rules}), 2)
+    expected = {"means": 1, "f_dc": 2, "net.weight": sqrt(2), "net.bias": sqrt(2)}
+    assert scale.per_step == pytest.approx(expected)
+    assert scale.to_sum == pytest.approx({name: 2 / value for name, value in expected.items()})
+
+
+def test_a_third_party_operator_is_asked_once_for_each_number_of_views():
+    scale = OperatorScale(Fivefold())
+    Fivefold.asked.clear()
+    for views in (2, 3, 2, 3, 2):
+        found = scale.of(aggregate_context(sample_gradients(views)))
+        assert found.per_step == dict.fromkeys(TENSORS, 5.0 * views)
+    assert [len(context.losses) for context in Fivefold.asked] == [2, 3]
+
+
+def test_nothing_but_labels_tells_the_views_apart():
+    Fivefold.asked.clear()
+    scale_of(Fivefold(), 3)
+    (seen,) = Fivefold.asked
+    assert seen.present.all() and seen.step == 1
+    assert len(set(seen.losses)) == 1
+    assert set(seen.distances) == {seen.reference_distance}
+    assert seen.labels == ("near", "far", "near")
+
+
+def test_an_operator_that_needs_labels_gets_those_of_the_step():
+    assert scale_of(Labelled(), 2).per_step == dict.fromkeys(TENSORS, 1.25)
+
+
+def test_operators_with_their_own_aggregation_are_asked_for_it():
+    scale = scale_of(Halves(), 3)
+    expected = {"means": 1.5, "f_dc": 1.5, "net.weight": 0.0, "net.bias": 0.0}
+    assert scale.per_step == expected
+    # What the operator freezes has no scale to follow, and no term joins.
+    assert scale.to_sum == {"means": 2.0, "f_dc": 2.0, "net.weight": 1.0, "net.bias": 1.0}
+
+
+def test_asking_leaves_the_step_alone():
+    context = aggregate_context(sample_gradients(2))
+    drawn = np.random.default_rng(0).bit_generator.state
+    OperatorScale(build("operators", "graddrop", {})).of(context)
+    assert context.rng.bit_generator.state == drawn
+    assert context.gradients.present("tensor").any()
+    assert neutral(context).rng is not context.rng
+
+
+def test_weights_that_are_not_finite_are_refused_by_name():
+    with pytest.raises(UserError, match="Broken gave weights that are not finite"):
+        scale_of(Broken(), 2)
+
+
+class Overflowing(Operator):
+    def transform(self, gramians, context, state, rng):
+        raise AssertionError
+
+    def aggregate(self, context, state):
+        return Aggregated({name: torch.tensor([torch.inf]) for name in TENSORS}), state
+
+
+def test_answers_that_are_not_finite_are_refused_by_name():
+    with pytest.raises(UserError) as caught:
+        scale_of(Overflowing(), 2)
+    assert "Overflowing" in str(caught.value) and "means" in str(caught.value)
+
+
+def test_terms_join_as_often_as_equal_gradients():
+    scale = Scale.of({"a": 3.0, "b": 1.5, "c": 0.0}, 3)
+    one = torch.ones(2)
+    of_views = {"a": 10 * one, "b": 10 * one, "c": 10 * one}
+    of_step = {"b": one, "a": None, "c": one}
+    result = joined({"a": one, "b": None, "c": None}, of_views, of_step, scale)
+    assert torch.equal(result["a"], 11 * one)
+    assert torch.equal(result["b"], (10 * 0.5 + 1.5) * one)
+    assert result["c"] is None
