@@ -63,11 +63,7 @@ class Trained:
 
 def trained(setup, dtype=torch.float32):
     state = first_state(setup)
-    state.parameters = {
-        name: tensor.detach().to(dtype if tensor.dtype == torch.float32 else tensor.dtype)
-        .requires_grad_(tensor.requires_grad)
-        for name, tensor in state.parameters.items()
-    }  # fmt: skip
+    state.parameters = {name: cast(tensor, dtype) for name, tensor in state.parameters.items()}
     sizes, edited = [], []
     since = copied(state)
     for step in range(1, STEPS + 1):
@@ -80,11 +76,15 @@ def trained(setup, dtype=torch.float32):
     return Trained(after, {name: after[name] - since[name] for name in after}, sizes, edited)
 
 
+def cast(tensor, dtype):
+    """The tensor as one of floats of that type; integers and float64 stay."""
+    kept = dtype if tensor.dtype == torch.float32 else tensor.dtype
+    return tensor.detach().to(kept).requires_grad_(tensor.requires_grad)
+
+
 def copied(state):
-    return {
-        name: tensor.detach().double() for name, tensor in state.parameters.items()
-        if tensor.requires_grad
-    }  # fmt: skip
+    trained = {name: t for name, t in state.parameters.items() if t.requires_grad}
+    return {name: tensor.detach().double().clone() for name, tensor in trained.items()}
 
 
 def differences(of_sum, of_mean):
