@@ -12,6 +12,7 @@ from typing import Any
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.files import clear_leftovers
+from crossgrad_core.interrupts import exit_code, way_on
 from crossgrad_core.opening import continued, parsed, set_up
 from crossgrad_core.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.results.folder import RunName, check_out, create_run_folder, expected_bytes
@@ -26,7 +27,7 @@ from crossgrad_core.training.assemble import (
 )
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
 from crossgrad_core.training.bundled import BUNDLED_SECONDS, bundled_scene
-from crossgrad_core.training.ending import Course, last_words
+from crossgrad_core.training.ending import Course, last_words, resume_line
 from crossgrad_core.training.forecast import Forecast
 from crossgrad_core.training.resolve import resolved
 from crossgrad_core.training.session import Session, totals
@@ -38,9 +39,6 @@ from crossgrad_core.training.stopper import Stopper
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
 FAILED = 1
-#: A run that a signal stopped ends with this plus the signal's number, as shells expect: 130 after
-#: Ctrl-C, 143 after SIGTERM.
-BY_SIGNAL = 128
 
 
 def run(
@@ -84,7 +82,8 @@ def run(
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config)
-        return _train(setup, state, Session.fresh(folder, setup), length)
+        with way_on(resume_line(folder)):
+            return _train(setup, state, Session.fresh(folder, setup), length)
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -163,12 +162,12 @@ def _train(setup: Setup, state: TrainState, session: Session, length: Length) ->
             print(line, file=sys.stderr)  # noqa: T201
     if ending.status == "failed":
         return FAILED
-    return 0 if stopper.signal is None else BY_SIGNAL + stopper.signal
+    return 0 if stopper.signal is None else exit_code(stopper.signal)
 
 
 def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
-    with _held(folder):
+    with way_on(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, verbosity)
         if state.step >= setup.schedule.total and _is_described(folder, state.step):
             raise UserError(

@@ -15,6 +15,8 @@ from types import FrameType
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
+#: How to go on after an end at once: lines for the user, the newest last.
+_WAYS_ON: list[str] = []
 #: Files that are being written; they are deleted where the process ends at once.
 UNFINISHED: set[str] = set()
 
@@ -29,10 +31,14 @@ def listened_to() -> list[int]:
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
-def tell(text: str) -> None:
-    """Writes one line to stderr, from a signal handler too."""
-    # On a terminal the cursor stands behind "^C" or a progress bar.
-    line = f"\n{text}\n" if sys.stderr.isatty() else f"{text}\n"
+def tell(text: str, *, alone: bool = True) -> None:
+    """Writes one line to stderr, from a signal handler too.
+
+    Args:
+        text: The line.
+        alone: Whether the cursor of a terminal may stand behind "^C" or a progress bar.
+    """
+    line = f"\n{text}\n" if alone and sys.stderr.isatty() else f"{text}\n"
     try:
         sys.stderr.write(line)
         sys.stderr.flush()
@@ -46,12 +52,24 @@ def tell(text: str) -> None:
 def end_at_once(number: int, _frame: FrameType | None) -> None:
     """Ends the process without unwinding: an exception may be lost in a callback of a library."""
     tell("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
+    for line in _WAYS_ON[-1:]:
+        tell(line, alone=False)
     with suppress(Exception):
         sys.stdout.flush()
     for path in UNFINISHED:
         with suppress(OSError):
             os.unlink(path)
     os._exit(exit_code(number))
+
+
+@contextmanager
+def way_on(text: str) -> Iterator[None]:
+    """Inside the block an end at once is followed by this line."""
+    _WAYS_ON.append(text)
+    try:
+        yield
+    finally:
+        _WAYS_ON.remove(text)
 
 
 @contextmanager

@@ -73,8 +73,8 @@ class _Startup(logging.Handler):
 
     @override
     def close(self) -> None:
-        """Says what is left to say."""
-        self._kernels.end()
+        """Says nothing more."""
+        self._kernels.stop()
         super().close()
 
 
@@ -110,13 +110,20 @@ class _Kernels:
 
     def end(self) -> None:
         """Says what all of them took."""
-        if self._thread is None:
+        if not self.stop():
             return
-        self._over.set()
-        self._thread.join()
         kernels = "kernel" if self._count == 1 else "kernels"
         _say(f"compiled {self._count} {kernels} in {self._seconds:.0f} s")
-        self._thread, self._count, self._seconds = None, 0, 0.0
+        self._count, self._seconds = 0, 0.0
+
+    def stop(self) -> bool:
+        """Ends the clock; whether there was one."""
+        if self._thread is None:
+            return False
+        self._over.set()
+        self._thread.join()
+        self._thread = None
+        return True
 
     def _tell(self) -> None:
         terminal = is_live(sys.stderr)

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from shlex import quote
 
 from crossgrad_core.checkpoint_folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.contexts import RunInfo
@@ -163,8 +165,13 @@ def last_words(course: Course) -> list[str]:
         lines.append(f"the traceback is in {folder / LOG}")
     lines += _kept(course)
     if ending.status != "finished":
-        lines.append(f"continue with: crossgrad run --resume {folder}")
+        lines.append(resume_line(folder))
     return lines
+
+
+def resume_line(folder: Path) -> str:
+    """How a run goes on."""
+    return f"continue with: crossgrad run --resume {quote(str(folder))}"
 
 
 def _kept(course: Course) -> list[str]:

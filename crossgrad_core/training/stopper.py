@@ -1,13 +1,19 @@
-"""Signals as requests: the first one stops a run after its step, the second one at once."""
+"""Signals as requests: stop after the step, then without what takes time, then at once."""
 
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
+from typing import Any
 
-#: What asks a run to stop: the keyboard, a batch system, a terminal that closes.
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+from crossgrad_core.interrupts import end_at_once, listened_to, tell
+
+#: What the user is told at the first and at the second signal; the third one ends the process.
+_WORDS = (
+    "stopping after this step; what is there is saved and evaluated (once more: only saved)",
+    "stopping now; what is there is saved (once more: ends at once)",
+)
 
 
 @dataclass
@@ -24,6 +30,8 @@ class Stopper:
     at_once: bool = False
     error: Exception | None = None
     _interruptible: bool = field(default=False, repr=False)
+    _count: int = field(default=0, repr=False)
+    _before: dict[int, Any] = field(default_factory=dict, repr=False)
 
     @property
     def requested(self) -> bool:
@@ -36,9 +44,9 @@ class Stopper:
 
         A signal that the process was told to ignore (`nohup`, a job in the background) stays so.
         """
-        before = {}
+        before = self._before
         try:
-            for number in _signals():
+            for number in listened_to():
                 before[number] = signal.signal(number, self._handle)
         except ValueError:  # Signals can be handled in the main thread only.
             yield self
@@ -59,6 +67,10 @@ class Stopper:
             self._interruptible = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._count += 1
+        if self._count > len(_WORDS):
+            self._end(number, frame)
+        tell(_WORDS[self._count - 1])
         if self.signal is None:
             self.signal = number
             return
@@ -67,7 +79,8 @@ class Stopper:
             self._interruptible = False
             raise KeyboardInterrupt
 
-
-def _signals() -> list[int]:
-    known = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    return [number for number in known if signal.getsignal(number) is not signal.SIG_IGN]
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        """Leaves the end to whoever handled signals before; in Python itself an exception."""
+        before = self._before.get(number)
+        (before if callable(before) else end_at_once)(number, frame)
+        raise KeyboardInterrupt

@@ -1,11 +1,15 @@
 """Signals end a command with one line and 128 plus their number, whatever is going on."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 
 import pytest
+
+from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.training.stopper import _WORDS
 
 #: Sends itself a signal when a module is about to be imported, or when a line has been written.
 PROGRAM = """
@@ -106,3 +110,94 @@ def test_a_reader_that_is_gone_changes_neither_end_nor_code(tmp_path):
     done = subprocess.run(command, stderr=writing, check=False, timeout=60, cwd=tmp_path)
     os.close(writing)
     assert done.returncode == 128 + signal.SIGINT
+
+
+#: Runs the command once for each case, in processes that are forked off when all is imported, and
+#: sends a signal when functions are called, one after the other. Compiling takes no part.
+FORKING = """
+import importlib, json, os, signal, sys, threading
+
+from crossgrad_core import __main__ as command, app, evaluation
+
+def trap(number, moments):
+    def sprung(place, function):
+        def call(*args, **kwargs):
+            if moments and moments[0] == place:
+                del moments[0]
+                os.kill(os.getpid(), number)
+            return function(*args, **kwargs)
+        return call
+    for place in moments:
+        path, _, name = place.rpartition(".")
+        module, _, kind = path.partition(":")
+        holder = importlib.import_module(module)
+        holder = getattr(holder, kind) if kind else holder
+        setattr(holder, name, sprung(place, getattr(holder, name)))
+
+app.warm_up = lambda *_: 0.0
+assert threading.active_count() == 1
+for folder, number, moments, arguments in json.loads(sys.argv[1]):
+    if (child := os.fork()) == 0:
+        os.chdir(folder)
+        for stream, name in ((1, "out.txt"), (2, "err.txt")):
+            os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY), stream)
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.SIG_DFL)
+        trap(number, moments)
+        sys.argv[1:] = arguments
+        command.main()
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+OPTIONS = ["--steps", "4", "--eval-every", "2", "--rasterizer", "torch", "--out", "a run"]
+WAY_ON = "continue with: crossgrad run --resume 'a run'"
+STOPPING, SAVING = _WORDS
+STEP = "crossgrad_core.training.loop.take_step"
+OPTIMIZE = "crossgrad_core.training.step._optimize"
+SESSION = "crossgrad_core.training.session:Session."
+#: Signal, calls at which it is sent, what is said, steps in the summary, whether there are results.
+CASES = {
+    "before the folder": (signal.SIGINT, ["crossgrad_core.app._new_folder"],
+                          ["interrupted"], None, False),
+    "before the first step": (signal.SIGINT, [SESSION + "__init__"],
+                              ["interrupted", WAY_ON], None, False),
+    "in a step": (signal.SIGTERM, [STEP],
+                  [STOPPING, "run stopped", WAY_ON], 1, True),
+    "twice in a step": (signal.SIGINT, [STEP, OPTIMIZE],
+                        [STOPPING, SAVING, "run stopped", WAY_ON], 0, False),
+    "in the evaluation": (signal.SIGINT, [STEP, SESSION + "evaluate"],
+                          [STOPPING, SAVING, "run stopped", WAY_ON], 1, False),
+    "thrice": (signal.SIGINT, [STEP, OPTIMIZE, SESSION + "align"],
+               [STOPPING, SAVING, "interrupted", WAY_ON], None, False),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Folder and exit code of each case."""
+    scene = tmp_path_factory.mktemp("scene") / "tiny"
+    write_tiny_scene(scene, views=5)
+    folders = [tmp_path_factory.mktemp("run") for _ in CASES]
+    arguments = ["run", str(scene), *OPTIONS]
+    cases = [
+        (str(folder), int(number), moments, arguments)
+        for folder, (number, moments, *_) in zip(folders, CASES.values(), strict=True)
+    ]
+    command = [sys.executable, "-c", FORKING, json.dumps(cases)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=250)
+    return dict(zip(CASES, zip(folders, map(int, done.stdout.split()), strict=True), strict=True))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_in_a_run(runs, case):
+    number, _, words, step, results = CASES[case]
+    folder, code = runs[case]
+    lines = (folder / "err.txt").read_text().splitlines()
+    said = {STOPPING, SAVING, "run stopped", "interrupted", WAY_ON}
+    assert code == 128 + number
+    assert [line for line in lines if line in said] == words
+    assert lines[-1] == words[-1] and "Traceback" not in "".join(lines)
+    if step is not None:
+        summary = json.loads((folder / "a run" / "summary.json").read_text())
+        assert (summary["status"], summary["step"]) == ("stopped", step)
+    assert (folder / "a run" / "point_cloud.ply").exists() == results
+    assert not list(folder.rglob("*.tmp"))

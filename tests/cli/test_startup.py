@@ -85,7 +85,7 @@ def test_on_a_terminal_the_clock_stays_on_its_line(announced, capsys, monkeypatc
     announced()
     LOG.info("compiling %s", "one")
     time.sleep(0.1)
-    startup.finish()
+    STAGES.debug("loaded")
     lines = capsys.readouterr().err.split("\n")
     assert len(lines) == 4 and lines[-1] == ""
     assert lines[2].count("\r\x1b[K  0 s, kernel 1: one") > 1
