@@ -1,0 +1,100 @@
+"""Makes the case file on which rasterizers are timed and checked.
+
+    python benchmarks/make_case.py CASE.npz --garden test_garden.npz
+    python benchmarks/make_case.py CASE.npz
+
+With --garden it is the case of docs/benchmarks.md: positions, colours and the first camera of a
+photo set of a garden, as gsplat ships them for its tests (file assets/test_garden.npz of the public
+repository nerfstudio-project/gsplat, Apache-2.0; from Mip-NeRF 360), with random sizes, rotations
+and opacities. Without it, positions and colours are made up: a case of the same kind and size for
+which nothing needs to be fetched; its figures are others.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import normalize
+
+Arrays = dict[str, NDArray[np.generic]]
+
+#: Gaussians of the garden within [-2, 2] on every axis.
+GAUSSIANS = 111_785
+WIDTH, HEIGHT, FOCAL = 648, 420, 481.0
+LEAST_SCALE, LARGEST_SCALE = 1e-4, 0.02
+SEED = 42
+
+
+def garden(path: Path) -> Arrays:
+    """Points, colours and the first camera of gsplat's test data, cut to [-2, 2] on each axis."""
+    with np.load(path) as archive:
+        means = archive["means3d"].astype(np.float32)
+        inside = (np.abs(means) <= 2.0).all(axis=1)
+        return {
+            "means": means[inside],
+            "colors": (archive["colors"][inside] / 255.0).astype(np.float32),
+            "viewmat": archive["viewmats"][0].astype(np.float32),
+            "K": archive["Ks"][0].astype(np.float32),
+            "width": archive["width"],
+            "height": archive["height"],
+        }
+
+
+def made_up(gaussians: int) -> Arrays:
+    """A table on a lawn: two thirds of the points on a plane, a third in a ball, seen obliquely."""
+    rng = np.random.default_rng(SEED)
+    ball = gaussians // 3
+    lawn = np.column_stack([rng.uniform(-2, 2, (gaussians - ball, 2)), np.zeros(gaussians - ball)])
+    direction = rng.normal(size=(ball, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    means = np.concatenate([lawn, [0.0, 0.0, 0.6] + 0.6 * direction])
+    return {
+        "means": means.astype(np.float32),
+        "colors": rng.uniform(size=(gaussians, 3)).astype(np.float32),
+        "viewmat": oblique_camera(),
+        "K": np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=np.float32),
+        "width": np.array(WIDTH),
+        "height": np.array(HEIGHT),
+    }
+
+
+def oblique_camera() -> NDArray[np.float32]:
+    """[4, 4] world to camera: from 2.6 units away, 35 degrees above the plane, to the middle."""
+    angle = np.deg2rad(35.0)
+    down, forward = np.sin(angle), np.cos(angle)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = [[1, 0, 0], [0, -down, -forward], [0, forward, -down]]
+    pose[:3, 3] = [0, 0.2, 2.6]
+    return pose
+
+
+def with_attributes(arrays: Arrays) -> Arrays:
+    """The case with random sizes, rotations, opacities and gradient of the image."""
+    count = len(arrays["means"])
+    shape = (int(arrays["height"]), int(arrays["width"]), 3)
+    torch.manual_seed(SEED)
+    attributes = {
+        "scales": torch.empty((count, 3)).uniform_(LEAST_SCALE, LARGEST_SCALE),
+        "quats": normalize(torch.randn((count, 4)), dim=-1),
+        "opacities": torch.rand(count),
+        "v_image": torch.randn(shape),
+    }
+    return {**arrays, **{name: tensor.numpy() for name, tensor in attributes.items()}}
+
+
+def main() -> None:
+    """Reads the command line and writes the case."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("case", type=Path, help="the file to write")
+    parser.add_argument("--garden", type=Path, help="test_garden.npz of gsplat")
+    parser.add_argument("--gaussians", type=int, default=GAUSSIANS, help="number without --garden")
+    arguments = parser.parse_args()
+    arrays = garden(arguments.garden) if arguments.garden else made_up(arguments.gaussians)
+    np.savez_compressed(arguments.case, **with_attributes(arrays))
+    print(f"{len(arrays['means']):,} Gaussians in {arguments.case}")
+
+
+if __name__ == "__main__":
+    main()
