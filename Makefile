@@ -32,7 +32,7 @@ lint: install  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: install  ## The figures of docs/benchmarks.md (needs the case files named there)
+bench: install  ## Loss, optimizer and operators of docs/benchmarks.md, which names the other commands
 	$(BIN)/python benchmarks/loss.py
 	$(BIN)/python benchmarks/adam.py
 	$(BIN)/python benchmarks/operators.py

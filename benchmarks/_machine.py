@@ -2,6 +2,7 @@
 
 import os
 import platform
+import subprocess
 import sys
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -29,6 +30,21 @@ def facts() -> dict[str, str | int | float]:
         "numba": version("numba"),
         "numpy": version("numpy"),
     }
+
+
+def code() -> str:
+    """The commit of the checkout, with a `+` where files differ from it; the version elsewhere."""
+    root = Path(__file__).parents[1]
+    try:
+        head = _git(root, "rev-parse", "--short=7", "HEAD")
+        return head + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return version("crossgrad")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(root), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def peak_mib() -> float:

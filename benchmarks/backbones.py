@@ -21,7 +21,7 @@ from statistics import mean, stdev
 from threading import Lock
 
 import numpy as np
-from _machine import facts
+from _machine import code, facts
 
 from crossgrad_core.results.metrics_csv import read_metrics
 from crossgrad_core.results.summary import read_summary
@@ -30,7 +30,7 @@ RESULTS = Path(__file__).with_name("results")
 BACKBONES = ("vanilla", "scaffold", "pixel", "mip", "analytic", "octree")
 COLUMNS = (
     *("scene", "backbone", "sampler", "seed", "budget", "seconds", "steps", "views", "primitives"),
-    *("psnr", "ssim", "regimes", "ply_loss", "cpu", "date", "curve"),
+    *("psnr", "ssim", "regimes", "ply_loss", "cpu", "date", "code", "curve"),
 )
 #: Where the curves are read off.
 STEPS = (400, 800, 1200, 1600, 2000)
@@ -77,7 +77,7 @@ def row_of(job: Job, budget: float, out: Path) -> Row:
         *(*job.key, budget, round(summary["train_seconds"], 1), summary["step"], summary["views"]),
         *(summary["primitives"], round(summary["overall"]["psnr"], 4)),
         *(round(summary["overall"]["ssim"], 5), json.dumps(regimes)),
-        *("" if loss is None else round(loss, 3), facts()["cpu"], facts()["date"]),
+        *("" if loss is None else round(loss, 3), facts()["cpu"], facts()["date"], code()),
         json.dumps(curve),
     )
     return dict(zip(COLUMNS, map(str, values), strict=True))
@@ -119,6 +119,7 @@ def line(name: str, rows: Sequence[Row], regimes: Sequence[str]) -> str:
     cells.append(spread((float(row["primitives"]) for row in rows), 0))
     losses = [float(row["ply_loss"]) for row in rows if row["ply_loss"]]
     cells.append(spread(losses, 2) if losses else "0")
+    cells.append(", ".join(sorted({row["code"] for row in rows})))
     return "| " + " | ".join(cells) + " |"
 
 
@@ -126,7 +127,7 @@ def section(scene: str, rows: Sequence[Row]) -> list[str]:
     """The table of one scene."""
     regimes = sorted(json.loads(rows[0]["regimes"]))
     heads = ["backbone, sampler", "seeds", "PSNR", *(f"PSNR {name}" for name in regimes)]
-    heads += ["SSIM", "seconds", "steps", "views", "primitives", "PLY loss, dB"]
+    heads += ["SSIM", "seconds", "steps", "views", "primitives", "PLY loss, dB", "code"]
     lines = [f"## {scene}", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for backbone, sampler in sorted({(row["backbone"], row["sampler"]) for row in rows}):
         same = [row for row in rows if (row["backbone"], row["sampler"]) == (backbone, sampler)]
@@ -156,6 +157,18 @@ def read_off(curves: Sequence[Sequence[Sequence[float]]], axis: int, place: floa
     return f"{mean(map(float, found)):.2f}"
 
 
+def mixture(rows: Iterable[Row]) -> list[str]:
+    """A warning where the rows are of several versions of the code."""
+    codes = sorted({row["code"] for row in rows})
+    if len(codes) < 2:
+        return []
+    return [
+        f"**The rows are of {len(codes)} versions of the code ({', '.join(codes)}): compare rows",
+        "of the same version only.** The last column has the commit.",
+        "",
+    ]
+
+
 def page(rows: Sequence[Row], command: str) -> str:
     """The whole page."""
     machines = sorted({row["cpu"] for row in rows})
@@ -168,6 +181,7 @@ def page(rows: Sequence[Row], command: str) -> str:
         "Mean and standard deviation over seeds; PLY loss: what baking to `point_cloud.ply` costs.",
         "Second table of each scene: PSNR on the way, mean over seeds.",
         "",
+        *mixture(rows),
     ]
     for scene in sorted({row["scene"] for row in rows}):
         lines += section(scene, [row for row in rows if row["scene"] == scene])

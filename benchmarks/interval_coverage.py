@@ -1,6 +1,6 @@
 """How often the intervals of sigma_w^2, sigma_b^2 and their ratio hold the truth.
 
-    python benchmarks/interval_coverage.py [repetitions]
+    python benchmarks/interval_coverage.py [repetitions] [noise ...]
 
 Prints the share of repetitions (nominally 95 %) per kind of noise, dimension of the gradients,
 number of near and far views, and true ratio sigma_b^2 / sigma_w^2.
@@ -14,7 +14,7 @@ replacement, as a probe of a scene does.
 """
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import product
 
 import numpy as np
@@ -92,9 +92,9 @@ def _population_truths(populations: list[NDArray[np.float64]]) -> tuple[float, f
     return within, between, between / within
 
 
-def cases() -> Iterable[tuple[str, int, tuple[int, int], float]]:
+def cases(kinds: Sequence[str]) -> Iterable[tuple[str, int, tuple[int, int], float]]:
     """The rows of the table."""
-    return product(KINDS, DIMENSIONS, SIZES, RATIOS)
+    return product(kinds or KINDS, DIMENSIONS, SIZES, RATIOS)
 
 
 def main() -> None:
@@ -102,7 +102,7 @@ def main() -> None:
     repetitions = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     print(f"share of {repetitions} repetitions whose 95 % interval holds the truth, in %")
     print(f"{'noise':<10}{'P':>5}{'views':>9}{'ratio':>7}{'within':>9}{'between':>9}{'ratio':>7}")
-    for kind, dimension, sizes, ratio in cases():
+    for kind, dimension, sizes, ratio in cases(sys.argv[2:]):
         within, between, quotient = 100.0 * coverage(kind, dimension, sizes, ratio, repetitions)
         views = f"{sizes[0]}+{sizes[1]}"
         print(

@@ -1,0 +1,87 @@
+"""Figures in the documents: each has its command, the scripts are there, and cases can be made."""
+
+import csv
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+DOCS = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for path in (*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md")
+}
+PAGE = DOCS["docs/benchmarks.md"]
+SECTIONS = dict(re.findall(r"^## (.+)\n((?:(?!^## ).*\n?)*)", PAGE, re.MULTILINE))
+
+
+@pytest.fixture
+def ran(monkeypatch, tmp_path):
+    """Runs a script of benchmarks/ in this process."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+    def run(script, *arguments):
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+
+    return run
+
+
+@pytest.mark.parametrize("name", DOCS)
+def test_every_script_that_a_document_names_is_there(name):
+    for script in re.findall(r"benchmarks/(\w+\.py)", DOCS[name]):
+        assert (BENCHMARKS / script).is_file()
+
+
+@pytest.mark.parametrize("title", SECTIONS)
+def test_every_section_has_its_command_and_its_date_or_commits(title):
+    text = SECTIONS[title]
+    assert re.search(r"^    python benchmarks/\w+\.py", text, re.MULTILINE)
+    assert re.search(r"commit\s+\w{7}\b", text)
+
+
+def test_the_table_of_backbones_has_a_commit_in_every_row_and_is_the_one_of_its_rows(tmp_path, ran):
+    rows = BENCHMARKS / "results" / "backbones.csv"
+    with rows.open(encoding="utf-8", newline="") as file:
+        codes = {row["code"] for row in csv.DictReader(file)}
+    assert all(re.fullmatch(r"\w{7}\+?", code) for code in codes)
+    table = tmp_path / "table.md"
+    ran("backbones.py", "boruszyn_kap", "city_hybrid", "--seconds", 140, "--table", table)
+    shown = (BENCHMARKS / "results" / "backbones.md").read_text(encoding="utf-8")
+    assert table.read_text(encoding="utf-8") == shown
+    assert (f"{len(codes)} versions of the code" in shown) == (len(codes) > 1)
+    assert all(code in PAGE for code in codes)
+
+
+def test_a_made_up_case_is_seen_by_its_camera(tmp_path, ran):
+    case = tmp_path / "case.npz"
+    ran("make_case.py", case, "--gaussians", 300)
+    with np.load(case) as made:
+        pose, size = made["viewmat"], np.array([made["width"], made["height"]])
+        local = made["means"] @ pose[:3, :3].T + pose[:3, 3]
+        pixels = local @ made["K"].T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        seen = (local[:, 2] > 0) & ((pixels > 0) & (pixels < size)).all(axis=1)
+        assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)
+        assert len(made["means"]) == 300 and seen.mean() > 0.5
+        assert made["v_image"].shape == (*size[::-1], 3)
+
+
+def test_the_garden_case_is_cut_from_the_public_file(tmp_path, ran):
+    rng = np.random.default_rng(0)
+    garden, case = tmp_path / "test_garden.npz", tmp_path / "case.npz"
+    means = rng.uniform(-3, 3, (50, 3)).astype(np.float32)
+    np.savez(
+        garden, means3d=means, colors=rng.integers(0, 256, (50, 3), dtype=np.uint8),
+        viewmats=np.stack([np.eye(4)] * 3), Ks=np.stack([np.eye(3)] * 3), width=6, height=4,
+    )  # fmt: skip
+    ran("make_case.py", case, "--garden", garden)
+    with np.load(case) as made:
+        assert np.array_equal(made["means"], means[(np.abs(means) <= 2).all(axis=1)])
+        assert {made[name].dtype for name in ("means", "colors", "scales")} == {np.dtype("f4")}
+        assert made["scales"].min() >= 1e-4 and made["scales"].max() <= 0.02
+        assert made["v_image"].shape == (4, 6, 3)
