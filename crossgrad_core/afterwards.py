@@ -20,6 +20,7 @@ from crossgrad_core.results.table import final_table
 from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.session import totals
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.writability import check_file, check_folder
 
 _LOG = logging.getLogger(__name__)
 
@@ -56,6 +57,7 @@ def render(
             other folder is named.
     """
     with _writing(folder, out, "rendering"):
+        check_folder(out or folder)
         setup, state = opened(folder, _machine(device, threads), -1)
         scene = setup.scene
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
@@ -99,6 +101,7 @@ def export(
     with _writing(folder, out, "exporting"):
         if out is not None:
             _check_new(out)
+            check_file(out)
         setup, state = opened(folder, _machine(device, threads), -1)
         if camera is not None:
             _check_bakes(setup)

@@ -15,7 +15,14 @@ from crossgrad_core.files import clear_leftovers
 from crossgrad_core.interrupts import exit_code, way_on
 from crossgrad_core.opening import continued, parsed, set_up
 from crossgrad_core.results.config_file import as_yaml, read_config, write_config
-from crossgrad_core.results.folder import RunName, check_out, create_run_folder, expected_bytes
+from crossgrad_core.results.folder import (
+    RUNS,
+    SMALLEST_NEED,
+    RunName,
+    check_out,
+    create_run_folder,
+    expected_bytes,
+)
 from crossgrad_core.results.lock import locked
 from crossgrad_core.results.log import RunLog
 from crossgrad_core.results.summary import read_summary
@@ -35,6 +42,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.writability import check_folder
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -67,10 +75,12 @@ def run(
         return _resume(resume, settings, verbosity)
     config = with_defaults(parsed(settings))
     check_out(config.out)
+    check_folder(config.out or RUNS, SMALLEST_NEED)
     setup, load_seconds = set_up(config, verbosity)
     if dry_run:
         _print_dry_run(setup)
         return 0
+    check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
     compile_seconds = warm_up(setup)
     length: Length = Forecast(Planned(config.revisions))
     if config.seconds is not None:

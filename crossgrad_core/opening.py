@@ -23,6 +23,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.validation import as_user_error
+from crossgrad_core.wording import listed
 
 #: Settings of a run that may change when it goes on.
 CHANGEABLE = frozenset({"device", "threads", "stop_after"})
@@ -145,7 +146,8 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     if frozen:
         raise UserError(
             "a resumed run keeps its settings",
-            where=", ".join(f"--{name.replace('_', '-')}" for name in frozen),
+            where=f"settings {listed(frozen)}",
+            expected=f"none but {listed(sorted(CHANGEABLE))}",
             todo="leave them out, or start a new run",
         )
     stored = read_config(folder)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.resuming import refuse_beside_resume
 from crossgrad_core.cli.startup import announce
 
 _PARTS = "Components (`crossgrad plugins list` shows the names)"
@@ -299,6 +300,8 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
     """
     given = dict(locals())
     announce(quiet=quiet)
+    if resume is not None:
+        refuse_beside_resume(resume, given)
     from crossgrad_core.cli.settings import merged
 
     for name in ("config", "assignments", "resume", "dry_run", "quiet", "verbose"):

@@ -31,7 +31,10 @@ def stress(
     from crossgrad_core.stress.cases import cases
     from crossgrad_core.stress.suite import installed, run_suite
     from crossgrad_core.stress.table import as_text, failed, write_csv
+    from crossgrad_core.writability import check_file
 
+    if csv is not None:
+        check_file(csv)
     chosen = [each for each in cases(large=elements) if case in each.name]
     cells = list(run_suite(operators or installed(), chosen, progress=_progress))
     typer.echo(as_text(cells))

@@ -12,6 +12,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.files import disk_errors
 from crossgrad_core.opening import opened, parsed
 from crossgrad_core.training.failure import TrainingFailedError
+from crossgrad_core.writability import check_file, check_folder
 
 
 def diagnose(
@@ -44,6 +45,9 @@ def diagnose(
             todo="leave SCENE out: the run knows its scene",
         )
     _check_free(out)
+    check_folder(out or run or Path("runs"))
+    if options.signature is not None:
+        check_file(options.signature)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     if run is not None:
         setup, state = opened(run, settings, -1)

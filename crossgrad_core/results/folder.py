@@ -13,6 +13,8 @@ from crossgrad_core.results.lock import writer_of
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
+#: Where runs are kept, below the working folder.
+RUNS = Path("runs")
 _UNSAFE = re.compile(r"[^\w.+-]+")
 
 
@@ -43,7 +45,7 @@ class RunName:
 
 
 def create_run_folder(
-    name: RunName, out: Path | None = None, root: Path = Path("runs"), needed: int = SMALLEST_NEED
+    name: RunName, out: Path | None = None, root: Path = RUNS, needed: int = SMALLEST_NEED
 ) -> Path:
     """Creates the output folder of a new run.
 
