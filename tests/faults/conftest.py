@@ -24,9 +24,22 @@ def reference(tmp_path_factory):
     folder = tmp_path_factory.mktemp("faults")
     scene = folder / "scene"
     write_tiny_scene(scene, views=6, suffix=".jpg")
-    nursery = Nursery(folder, {**os.environ, "PYTHONWARNINGS": "default"})
+    install_plugin(folder)
+    found = (os.environ.get("PYTHONPATH"), str(folder), str(Path(__file__).parent))
+    path = os.pathsep.join(filter(None, found))
+    nursery = Nursery(folder, {**os.environ, "PYTHONPATH": path})
     yield undisturbed(nursery, scene, folder / "undisturbed")
     nursery.close()
+
+
+def install_plugin(folder):
+    """Makes the observer `faulty` known to whoever has the folder on its path."""
+    info = folder / "faulty-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[crossgrad.observers]\nfaulty = crossgrad_faults.faulty_plugin:Faulty\n"
+    )
 
 
 def pytest_collection_modifyitems(items):

@@ -5,7 +5,8 @@
 Reads jobs as JSON, one a line, and answers each with how it ended. A fork costs milliseconds where
 a new interpreter costs seconds, so that a hundred runs can be killed in minutes.
 
-job:    {"arguments": [...], "output": FILE, "fault": {...} or null, "signals": [[seconds, number]]}
+job:    {"arguments": [...], "output": FILE, "fault": {...} or null, "signals": [[seconds, number]],
+         "environment": {...}}
 answer: {"code": exit status or minus the signal, "seconds": wall time, "events": writes counted}
 """
 
@@ -89,14 +90,16 @@ def run(job: Mapping[str, Any], report: int) -> None:
     os.dup2(output, 1)
     os.dup2(output, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.update(job["environment"])
     told = Counter()
     if job["fault"] is not None:
         install(job["fault"], told)
     code = 1
     try:
-        from crossgrad_core.cli.main import main as command
+        from crossgrad_core.__main__ import main as command
 
-        command(job["arguments"])
+        sys.argv = ["crossgrad", *job["arguments"]]
+        command()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
@@ -121,10 +124,10 @@ class Counter:
 def install(fault: Mapping[str, Any], told: Counter) -> None:
     """Counts the changes below a folder and acts at the given one.
 
-    fault: {"below": FOLDER, "at": n or 0 to count only, "what": "kill" | "full" | "readonly"}
+    fault: {"below": FOLDER, "at": n or 0 to count only, "what": name of an act, "file": FILE}
     """
-    below, at, what = fault["below"], fault["at"], fault["what"]
-    act = ACTS[what]
+    below, at = fault["below"], fault["at"]
+    act = ACTS[fault["what"]](fault)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if not concerns(event, arguments, below):
@@ -151,26 +154,98 @@ def concerns(event: str, arguments: tuple[Any, ...], below: str) -> bool:
     return str(Path(os.fsdecode(path)).absolute()).startswith(below)
 
 
-def kill(event: str, arguments: tuple[Any, ...]) -> None:
+#: What happens at a change of the disk.
+Act = Callable[[str, tuple[Any, ...]], None]
+
+
+def kill(_fault: Mapping[str, Any]) -> Act:
     """As `kill -9` does, right before the change."""
-    os.kill(os.getpid(), signal.SIGKILL)
+    return lambda _event, _arguments: os.kill(os.getpid(), signal.SIGKILL)
 
 
-def full(event: str, arguments: tuple[Any, ...]) -> None:
+def full(_fault: Mapping[str, Any]) -> Act:
     """As a disk without room does from here on; deleting and renaming still work."""
-    if event in NEEDS_ROOM:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(arguments[0]))
+
+    def act(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in NEEDS_ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(arguments[0]))
+
+    return act
 
 
-def readonly(event: str, arguments: tuple[Any, ...]) -> None:
+def readonly(_fault: Mapping[str, Any]) -> Act:
     """As a file system does that was mounted read-only after an error."""
-    raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(arguments[0]))
+
+    def act(_event: str, arguments: tuple[Any, ...]) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(arguments[0]))
+
+    return act
 
 
-ACTS: Mapping[str, Callable[[str, tuple[Any, ...]], None]] = {
+def rot(fault: Mapping[str, Any]) -> Act:
+    """Overwrites the middle of a file, once."""
+    return once(lambda path: path.write_bytes(path.read_bytes()[:200] + bytes(200)), fault)
+
+
+def vanish(fault: Mapping[str, Any]) -> Act:
+    """Deletes a file, once."""
+    return once(Path.unlink, fault)
+
+
+def once(change: Callable[[Path], object], fault: Mapping[str, Any]) -> Act:
+    """An act that changes the fault's file where that was not done yet."""
+    left = [Path(fault["file"])]
+
+    def act(_event: str, _arguments: tuple[Any, ...]) -> None:
+        if left:
+            change(left.pop())
+
+    return act
+
+
+def jump(_fault: Mapping[str, Any]) -> Act:
+    """Moves every clock that the code has imported forward, then back."""
+    shift = [1e6]
+
+    def act(_event: str, _arguments: tuple[Any, ...]) -> None:
+        shift[0] = -shift[0]
+        for name, module in list(sys.modules.items()):
+            if name.startswith("crossgrad_"):
+                for clock in (time.perf_counter, time.monotonic):
+                    moved = shifted(clock, shift[0])
+                    vars(module).update(
+                        {
+                            key: moved
+                            for key, value in vars(module).items()
+                            if is_clock(value, clock)
+                        }
+                    )
+
+    return act
+
+
+def is_clock(value: object, clock: Callable[[], float]) -> bool:
+    """Whether a module's name stands for the clock, moved or not."""
+    return value is clock or getattr(value, "clock", None) is clock
+
+
+def shifted(clock: Callable[[], float], by: float) -> Callable[[], float]:
+    """The clock, moved by some seconds."""
+
+    def moved() -> float:
+        return clock() + by
+
+    moved.clock = clock  # type: ignore[attr-defined]
+    return moved
+
+
+ACTS: Mapping[str, Callable[[Mapping[str, Any]], Act]] = {
     "kill": kill,
     "full": full,
     "readonly": readonly,
+    "rot": rot,
+    "vanish": vanish,
+    "jump": jump,
 }
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,23 +65,25 @@ class Nursery:
         self,
         *arguments: str,
         signals: Sequence[tuple[float, int]] = (),
-        fault: dict[str, Any] | None = None,
+        fault: Mapping[str, Any] | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> End:
         """Runs a command line, with signals after some seconds or a fault at some write."""
-        self.start(*arguments, signals=signals, fault=fault)
+        self.start(*arguments, signals=signals, fault=fault, environment=environment)
         return self.wait()
 
     def start(
         self,
         *arguments: str,
         signals: Sequence[tuple[float, int]] = (),
-        fault: dict[str, Any] | None = None,
+        fault: Mapping[str, Any] | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         """As `run`; returns at once."""
         self.count += 1
         output = self.folder / f"output-{self.count}.txt"
-        job = {"arguments": arguments, "signals": list(signals), "fault": fault}
-        job["output"] = str(output)
+        job: dict[str, Any] = {"arguments": arguments, "signals": list(signals), "fault": fault}
+        job |= {"output": str(output), "environment": dict(environment or {})}
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(job) + "\n")
         self.process.stdin.flush()
@@ -94,8 +96,10 @@ class Nursery:
     def close(self) -> None:
         """Ends the process."""
         assert self.process.stdin is not None
+        assert self.process.stdout is not None
         self.process.stdin.close()
         self.process.wait(timeout=60)
+        self.process.stdout.close()
 
     def _line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
@@ -146,7 +150,10 @@ class Undisturbed:
 
 
 def undisturbed(nursery: Nursery, scene: Path, folder: Path) -> Undisturbed:
-    """Trains the reference run."""
+    """Trains the reference run; kernels are compiled before its time counts."""
+    warm = folder.with_name("warm")
+    end = nursery.run("run", str(scene), "--out", str(warm), "--threads", "1", "--steps", "1")
+    assert end.code == 0, end.said
     fault = {"below": str(folder), "at": 0, "what": "kill"}
     run = Undisturbed(nursery, scene, folder, 0.0, 0)
     end = nursery.run(*run.command(folder), fault=fault)
