@@ -27,7 +27,7 @@ def reference(tmp_path_factory):
     install_plugin(folder)
     found = (os.environ.get("PYTHONPATH"), str(folder), str(Path(__file__).parent))
     path = os.pathsep.join(filter(None, found))
-    nursery = Nursery(folder, {**os.environ, "PYTHONPATH": path})
+    nursery = Nursery(folder, {**os.environ, "PYTHONPATH": path}, scene)
     yield undisturbed(nursery, scene, folder / "undisturbed")
     nursery.close()
 

@@ -7,7 +7,7 @@ from crossgrad_faults.runs import Nursery
 
 @pytest.fixture
 def second(reference, tmp_path):
-    nursery = Nursery(tmp_path, reference.nursery.environment)
+    nursery = Nursery(tmp_path, reference.nursery.environment, reference.scene)
     yield nursery
     nursery.close()
 

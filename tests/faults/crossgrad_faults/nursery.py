@@ -1,15 +1,17 @@
 """A process that has imported everything and runs each command line in a fork of itself.
 
-    python nursery.py
+    python nursery.py ARGUMENT ...
 
-Reads jobs as JSON, one a line, and answers each with how it ended. A fork costs milliseconds where
-a new interpreter costs seconds, so that a hundred runs can be killed in minutes.
+Runs the command line of its own arguments first, so that all kernels are loaded. Then it reads jobs
+as JSON, one a line, and answers each with how it ended. A fork costs milliseconds where a new
+interpreter costs seconds, so that a hundred runs can be killed in minutes.
 
 job:    {"arguments": [...], "output": FILE, "fault": {...} or null, "signals": [[seconds, number]],
          "environment": {...}}
 answer: {"code": exit status or minus the signal, "seconds": wall time, "events": writes counted}
 """
 
+import contextlib
 import errno
 import json
 import os
@@ -25,12 +27,18 @@ from typing import Any
 CHANGES = frozenset({"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate"})
 #: Events that a full disk refuses; it lets go of files.
 NEEDS_ROOM = frozenset({"open", "os.mkdir"})
+#: Environment of the process: no thread besides the first one.
+ALONE = {
+    "NUMBA_NUM_THREADS": "1",
+    "NUMBA_THREADING_LAYER": "workqueue",
+    "OMP_NUM_THREADS": "1",
+}
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
 def main() -> None:
     """Answers jobs until the input ends."""
-    import_everything()
+    load_everything(sys.argv[1:])
     tell({"ready": True})
     for line in sys.stdin:
         tell(answer(json.loads(line)))
@@ -42,18 +50,15 @@ def tell(value: object) -> None:
     sys.stdout.flush()
 
 
-def import_everything() -> None:
-    """Loads what a run imports; no kernel runs yet, since its threads would not survive a fork."""
-    import matplotlib.pyplot
-    import skimage.metrics
-    import torch
+def load_everything(arguments: list[str]) -> None:
+    """Runs a command line in this process: what it imports and compiles, every fork then has.
 
-    import crossgrad_core.cli.main
+    Numba's threads would not survive a fork; `ALONE` keeps it from starting any.
+    """
+    from crossgrad_core.cli.main import main as command
 
-    assert crossgrad_core.cli.main
-    assert matplotlib.pyplot
-    assert skimage.metrics
-    assert torch
+    with contextlib.redirect_stdout(sys.stderr), contextlib.suppress(SystemExit):
+        command(arguments)
 
 
 def answer(job: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from crossgrad_faults import laws
+from crossgrad_faults.nursery import ALONE
 
 #: 60 steps with five edits, a reset, six checkpoints and seven evaluations.
 OPTIONS = (
@@ -43,20 +44,23 @@ class Nursery:
     Args:
         folder: For the output of the command lines.
         environment: Environment variables of the process.
+        scene: On which it trains a step to load its kernels.
     """
 
     folder: Path
     environment: dict[str, str]
+    scene: Path
     count: int = 0
     process: "subprocess.Popen[str]" = field(init=False)
 
     def __post_init__(self) -> None:
+        command = ("run", str(self.scene), "--out", str(self.folder / "warm"))
         self.process = subprocess.Popen(
-            [sys.executable, str(NURSERY)],
+            [sys.executable, str(NURSERY), *command, *OPTIONS, "--quiet"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env=self.environment,
+            env={**self.environment, **ALONE},
             cwd=self.folder,
         )
         assert self._line() == {"ready": True}
@@ -150,10 +154,7 @@ class Undisturbed:
 
 
 def undisturbed(nursery: Nursery, scene: Path, folder: Path) -> Undisturbed:
-    """Trains the reference run; kernels are compiled before its time counts."""
-    warm = folder.with_name("warm")
-    end = nursery.run("run", str(scene), "--out", str(warm), "--threads", "1", "--steps", "1")
-    assert end.code == 0, end.said
+    """Trains the reference run."""
     fault = {"below": str(folder), "at": 0, "what": "kill"}
     run = Undisturbed(nursery, scene, folder, 0.0, 0)
     end = nursery.run(*run.command(folder), fault=fault)
