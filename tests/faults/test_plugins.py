@@ -6,9 +6,10 @@ import pytest
 from crossgrad_faults import laws
 from crossgrad_faults.faulty_plugin import HOOKS
 
-#: Asked before anything is written, or only where a run follows the clock.
+#: Asked before anything is written.
 EARLY = {"crossgrad_objections", "crossgrad_run_start"}
-UNUSED = {"crossgrad_length", "crossgrad_regularize"}
+#: Not called in these runs: they follow no clock, hold nothing back and have no terms.
+UNUSED = {"crossgrad_length", "crossgrad_regularize", "crossgrad_message"}
 
 
 def fails(reference, folder, hook, call, error="RuntimeError"):
