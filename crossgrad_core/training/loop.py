@@ -8,10 +8,11 @@ from typing import Literal, Protocol
 import torch
 
 from crossgrad_core.contexts import StepRecord
+from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.views import model_of
@@ -51,14 +52,18 @@ def train(
     """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
 
     Raises:
-        TrainingFailedError: Something was not finite twice; names step, views and block.
+        TrainingFailedError: Something was not finite twice, or at the start; names step, views and
+            block.
         BaseException: Whatever a plugin, a photo, the memory or the disk raised, with the step as a
             note. After any exception `state` is the last good one.
     """
+    check_start(state)
     keeper = Keeper(state)
     try:
         return _steps(setup, state, sink, stopper, pauses, keeper)
     except TrainingFailedError:
+        if not are_parameters_finite(state):
+            keeper.restore(state)
         raise
     except BaseException as error:
         error.add_note(f"in step {state.step}")
@@ -79,17 +84,12 @@ def _steps(
     while state.step < last and not stopper.requested:
         try:
             record = timed_step(setup, state)
-            saves = saves_after(setup, state.step)
             leaves = state.step == last or stopper.requested
-            if state.step % CHECK_EVERY == 0 or leaves or saves:
-                check_parameters(state, record)
-            keeper.settle(state)
-            if state.step % SNAPSHOT_EVERY == 0 or saves:
-                keeper.snapshot = Snapshot.of(state)
+            keeper.settle(state, look=leaves or looks_after(setup, state.step))
+            if copies_after(setup, state.step):
+                keeper.copy(state)
         except NonFiniteError as error:
-            _rewind(setup, state, keeper.snapshot, error)
-            keeper.settle(state)
-            sink.rewind(setup, state.step)
+            _rewind(setup, state, sink, keeper, error)
             continue
         check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)
@@ -97,8 +97,11 @@ def _steps(
             setup.hook.crossgrad_model(model=model_of(setup, state))
         _tell_held_back(setup, record)
         _record(setup, state, sink)
-        if pauses is not None and state.step < last and pauses(state):
+        pausing = pauses is not None and state.step < last and pauses(state)
+        if pausing and _is_good(setup, state, sink, keeper):
             return "paused"
+    # A signal may have come after the last look.
+    _is_good(setup, state, sink, keeper)
     if stopper.error is not None:
         raise stopper.error
     return "finished" if state.step >= total else "stopped"
@@ -115,30 +118,27 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     return state.last
 
 
-def check_parameters(state: TrainState, record: StepRecord) -> None:
-    """Raises NonFiniteError where a parameter is NaN or infinite."""
-    for name, tensor in state.parameters.items():
-        if not bool(torch.isfinite(tensor.detach()).all()):
-            raise NonFiniteError(state.step, record.names, f"block {name}")
+def _is_good(setup: Setup, state: TrainState, sink: Sink, keeper: Keeper) -> bool:
+    """Looks at a state that somebody is going to keep; where it is bad, training goes back."""
+    try:
+        keeper.look(state)
+    except NonFiniteError as error:
+        _rewind(setup, state, sink, keeper, error)
+        return False
+    return True
 
 
-def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
-    """Stops a run that had to drop too many non-finite gradients."""
-    if state.counters.dropped >= setup.config.max_dropped:
-        raise TrainingFailedError(
-            f"{state.counters.dropped} blocks of single views were dropped because their gradient "
-            f"was not finite, the last in step {state.step} (views {', '.join(record.names)})"
-        )
-
-
-def _rewind(setup: Setup, state: TrainState, snapshot: Snapshot, error: NonFiniteError) -> None:
+def _rewind(
+    setup: Setup, state: TrainState, sink: Sink, keeper: Keeper, error: NonFiniteError
+) -> None:
     rewound_before = state.rewinds > 0
-    snapshot.restore(state, setup.config.seed)
+    keeper.rewind(state, setup.config.seed)
     if rewound_before:
         raise TrainingFailedError(f"{error}, for the second time") from error
     setup.hook.crossgrad_message(
         text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
     )
+    sink.rewind(setup, state.step)
 
 
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
@@ -148,6 +148,16 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"
         )
+
+
+def looks_after(setup: Setup, step: int) -> bool:
+    """Whether all parameters are looked at after this step: what is kept or shown is good."""
+    return step % CHECK_EVERY == 0 or saves_after(setup, step) or evaluates_after(setup, step)
+
+
+def copies_after(setup: Setup, step: int) -> bool:
+    """Whether the state after this step is one to go back to."""
+    return step % SNAPSHOT_EVERY == 0 or saves_after(setup, step)
 
 
 def saves_after(setup: Setup, step: int) -> bool:

@@ -261,12 +261,19 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 
+def test_a_bad_value_right_before_the_length_is_revised_is_rewound(scene, tmp_path, monkeypatch):
+    poisoned(monkeypatch, Poison([7]))
+    assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
+    assert "rewound to step 4" in (tmp_path / "run" / "log.txt").read_text()
+    assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
+
+
 def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
     scene, tmp_path, monkeypatch, capsys
 ):
     # Found at the next look at all parameters, in steps 10 and 20.
     poisoned(monkeypatch, Poison([5, 17]))
-    assert run(scene, tmp_path / "run", steps=30, save_every=100) == 1
+    assert run(scene, tmp_path / "run", steps=30, save_every=100, eval_every=100) == 1
     message = capsys.readouterr().err
     assert "block f_dc is not finite in step 20" in message
     assert ".png" in message

@@ -206,8 +206,8 @@ def test_results_that_cannot_be_written_cost_no_step(when, kept):
 def test_a_state_with_a_value_that_is_not_finite_is_not_kept():
     setup = assembled(trap("step_end", of_record, BrokenError()))
     state = first_state(setup)
-    # Not looked for between the steps 10 and 15.
-    setup.manager.register(Spoil(state, FAILS_IN - 2), name="spoil")
+    # Not looked for between the steps 12 and 15.
+    setup.manager.register(Spoil(state, FAILS_IN - 1), name="spoil")
     with pytest.raises(BrokenError):
         train(setup, state, Results(), Stopper())
     assert_same(state, trained_until(10))
