@@ -134,6 +134,7 @@ def test_sum_and_mean_of_three_views_train_alike():
 
 
 @pytest.mark.matrix
+@pytest.mark.timeout(1800)
 def test_sum_and_mean_of_two_views_train_alike_in_every_combination():
     for backbone, densifier in every_pair():
         check_two_views(backbone, densifier)
