@@ -11,6 +11,7 @@ from crossgrad_core import __version__
 from crossgrad_core.cli import diagnose, evaluate, export, plugins, render, run, stress
 from crossgrad_core.cli.grouped import GroupedCommand
 from crossgrad_core.cli.startup import finish
+from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.errors import UserError
 
 #: Exit status after bad input.
@@ -71,6 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: What the user typed after `crossgrad`; `sys.argv[1:]` by default.
     """
+    if arguments is None:  # This process is the command's own.
+        outlast_readers()
     try:
         # Not `app()`, which would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
