@@ -2,6 +2,8 @@
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -97,3 +99,18 @@ def _quota(limit: Path) -> int:
         return max(1, math.ceil(int(quota) / int(period)))
     except (OSError, ValueError):
         return os.cpu_count() or 1
+
+
+@contextmanager
+def on_one_thread() -> Iterator[None]:
+    """Numba and torch on one thread inside, for work too small to wake others for."""
+    import numba
+
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before[0])
+        torch.set_num_threads(before[1])

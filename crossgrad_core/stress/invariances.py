@@ -11,9 +11,10 @@ from crossgrad_core.blocks import Block, LearningRate
 from crossgrad_core.operator import Operator
 from crossgrad_core.state import EMPTY_STATE
 from crossgrad_core.stress.case import Case, short
+from crossgrad_core.stress.promises import PROMISED
 from crossgrad_core.stress.reference import Views, usual_views
 from crossgrad_core.stress.runner import BLOCK, Cell, context_of, timed
-from crossgrad_core.stress.verdict import PROMISED, Finding
+from crossgrad_core.stress.verdict import Finding
 
 #: A law returns its error in units of u times the largest norm, or None where it does not apply.
 Law = Callable[[Operator], float | None]

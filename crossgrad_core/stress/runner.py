@@ -1,6 +1,6 @@
 """Runs one operator on one case."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, cast
@@ -15,6 +15,7 @@ from crossgrad_core.operator import Operator
 from crossgrad_core.state import EMPTY_STATE, PluginState
 from crossgrad_core.stress.case import Case
 from crossgrad_core.stress.oracles import Oracle
+from crossgrad_core.stress.promises import ALL, Promise
 from crossgrad_core.stress.reference import Answer, Views, answer, usual_views
 from crossgrad_core.stress.solvers import UnprovenError
 from crossgrad_core.stress.verdict import ElementRule, ExactCase, Finding, judge
@@ -25,6 +26,8 @@ BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
 REPEATED = 100_000
 #: Steps that operators with a memory are run for.
 STEPS = 3
+#: Why a case fails whose oracle finds no answer.
+UNPROVEN = "the reference is not proven"
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,13 @@ class Reference:
         oracle: Exact weights, for operators that have them.
         options: Options of the operator, for the oracle.
         rule: A rule for elements, for operators that work on them.
+        promise: The set on which an error is promised, and what holds outside.
     """
 
     oracle: Oracle | None
     options: Mapping[str, Any]
     rule: ElementRule | None = None
+    promise: Promise = ALL
 
 
 def run_case(name: str, operator: Operator, exact: ExactCase, reference: Reference) -> Cell:
@@ -64,29 +69,45 @@ def run_case(name: str, operator: Operator, exact: ExactCase, reference: Referen
     case = exact.case
     if not operator.views.admits(case.views):
         return Cell(name, case.name, Finding("refused"))
+    finding, times = judged(operator, exact, reference)
+    if times and case.size <= REPEATED:
+        times += [timed(operator, case, usual_views(case.views))[2] for _ in range(3)]
+    return Cell(name, case.name, finding, 1e6 * min(times, default=float("nan")))
+
+
+def judged(
+    operator: Operator,
+    exact: ExactCase,
+    reference: Reference,
+    views_of: Callable[[int, int], Views] = usual_views,
+) -> tuple[Finding, list[float]]:
+    """The worst finding of the steps of an operator, and their seconds; none if it failed.
+
+    Args:
+        operator: The operator.
+        exact: The case.
+        reference: What the results are held against.
+        views_of: (K, step) -> the circumstances of the views.
+    """
     state = EMPTY_STATE
     memory: dict[Any, Any] = {}
     findings, times = [], []
     for step in range(STEPS):
-        views = usual_views(case.views, seed=step)
+        views = views_of(exact.case.views, step)
         try:
-            found, state, seconds = timed(operator, case, views, state)
+            found, state, seconds = timed(operator, exact.case, views, state)
         except Exception as error:
             # Third-party code may raise anything.
-            broken = Finding("failed", reason=f"{type(error).__name__}: {error}")
-            return Cell(name, case.name, broken)
+            return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
         try:
             expected = _expected(reference, exact, views, memory)
         except UnprovenError:
-            return Cell(name, case.name, Finding("failed", reason="the reference is not proven"))
-        findings.append(judge(exact, found, expected))
+            return Finding("failed", reason=UNPROVEN), []
+        findings.append(judge(exact, found, expected, reference.promise))
         if not (state.values or state.tensors or state.per_primitive):
             break
-    if case.size <= REPEATED:
-        times += [timed(operator, case, usual_views(case.views))[2] for _ in range(3)]
-    worst = max(findings, key=lambda finding: finding.severity)
-    return Cell(name, case.name, worst, 1e6 * min(times))
+    return max(findings, key=lambda finding: finding.severity), times
 
 
 def _expected(

@@ -8,6 +8,7 @@ from crossgrad_core.registry import build, entries
 from crossgrad_core.stress.case import Case
 from crossgrad_core.stress.exact import DIGITS, require_mpmath
 from crossgrad_core.stress.invariances import LAWS, run_law
+from crossgrad_core.stress.promises import promise_of
 from crossgrad_core.stress.reference import OPTIONS, ORACLES, chained
 from crossgrad_core.stress.runner import Cell, Reference, run_case
 from crossgrad_core.stress.verdict import ExactCase, one_sign
@@ -52,5 +53,6 @@ def reference_of(name: str, operator: Operator) -> Reference:
     if not type(operator).__module__.startswith("crossgrad_operators."):
         return Reference(None, options)
     if name == "graddrop":
-        return Reference(None, options, one_sign)
-    return Reference(chained if name == "chain" else ORACLES.get(name), options)
+        return Reference(None, options, one_sign, promise_of(name))
+    oracle = chained if name == "chain" else ORACLES.get(name)
+    return Reference(oracle, options, promise=promise_of(name))

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 from pathlib import Path
 
+from crossgrad_core.stress.promises import PROMISED
 from crossgrad_core.stress.runner import Cell
-from crossgrad_core.stress.verdict import PROMISED
 
 #: Operators side by side in one part of the table.
 COLUMNS = 5
@@ -15,7 +15,8 @@ _NAME, _CELL = 24, 16
 LEGEND = (
     "Each cell: relative error in units of u kappa (8 is promised) and microseconds.\n"
     "u: unit roundoff of the gradients' type; kappa = max |w_k| |g_k| / |u|, at least 1.\n"
-    "~ kappa u > 0.1, finite is all that is promised; - K is refused; FAIL see below.\n"
+    "~ kappa u > 0.1, finite is all that is promised; * outside the operator's set\n"
+    "(docs/operators.md): finite and not too long; - K is refused; FAIL see below.\n"
     "Without an error: no reference; finite, and the laws at the end hold."
 )
 
@@ -60,7 +61,7 @@ def _shown(cell: Cell) -> str:
         return "-" + " " * 8
     if cell.finding.verdict == "failed":
         return "FAIL" + (time or " " * 8)
-    mark = "~" if cell.finding.verdict == "undetermined" else ""
+    mark = {"undetermined": "~", "outside": "*"}.get(cell.finding.verdict, "")
     error = f"{cell.finding.error:.2f}" if isfinite(cell.finding.error) else ""
     return f"{mark}{error}{time or ' ' * 8}"
 

@@ -1,0 +1,125 @@
+"""Random gradients of the kinds that small solvers get wrong."""
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Rows = NDArray[np.float64]
+#: (generator, B, K, P) -> [B, K, P] gradients.
+Family = Callable[[np.random.Generator, int, int, int], Rows]
+
+#: Largest number of views and of elements.
+VIEWS, ELEMENTS = 20, 50
+#: The distribution that shares of gradients outside a set are stated for.
+USUAL: Final = "random"
+
+
+def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
+    """The rows in a type of gradients, as float64 numbers."""
+    # Adding zero leaves no zero with a sign.
+    result: Rows = torch.from_numpy(rows).to(dtype).double().numpy() + 0.0
+    return result
+
+
+def sizes(rng: np.random.Generator, family: str) -> tuple[int, int]:
+    """K from 2 to 20 and P from 1 to 50; few of both half of the time, but for `USUAL`."""
+    few = family != USUAL and rng.random() < 0.5  # noqa: PLR2004
+    views, elements = (6, 8) if few else (VIEWS, ELEMENTS)
+    return int(rng.integers(2, views + 1)), int(rng.integers(1, elements + 1))
+
+
+def _normal(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    return rng.standard_normal((blocks, views, elements))
+
+
+def _powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> Rows:
+    """10 to random powers."""
+    return np.asarray(10.0 ** rng.uniform(low, high, shape))
+
+
+def usual(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Normal rows, their norms over seven decades."""
+    rows = _normal(rng, blocks, views, elements)
+    return rows * _powers(rng, (blocks, views, 1), -3.5, 3.5)
+
+
+def integers(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Small integers: exact ties, exact singularity."""
+    bounds = rng.choice([1, 2, 9], (blocks, 1, 1))
+    return np.rint(bounds * rng.uniform(-1, 1, (blocks, views, elements)))
+
+
+def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Rank 1 to 3; of integers half of the time, so that rounding leaves the rank as it is."""
+    rank = int(rng.integers(1, 4))
+    factors = _normal(rng, blocks, views, rank)
+    basis = _normal(rng, blocks, rank, elements)
+    exact = rng.random((blocks, 1, 1)) < 0.5  # noqa: PLR2004
+    factors = np.where(exact, np.rint(3 * factors), factors)
+    return factors @ np.where(exact, np.rint(3 * basis), basis)
+
+
+def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Some rows are (opposite) multiples of another one, at distances from 1 to 1e-16."""
+    rows = _normal(rng, blocks, views, elements)
+    source = rows[:, :1] * _apart(rng, blocks, elements)
+    copied = rng.random((blocks, views, 1)) < rng.choice([0.3, 0.7, 1.0], (blocks, 1, 1))
+    sign = np.where(rng.random((blocks, views, 1)) < rng.random((blocks, 1, 1)), 1.0, -1.0)
+    distance = _powers(rng, (blocks, 1, 1), -16, 0)
+    equal = rng.random((blocks, 1, 1)) < 0.5  # noqa: PLR2004
+    scale = np.where(equal, 1.0, _powers(rng, (blocks, views, 1), -3, 3))
+    return np.where(copied, scale * (sign * source + distance * rows), rows)
+
+
+def _apart(rng: np.random.Generator, blocks: int, elements: int) -> Rows:
+    """[B, 1, P] masks: where the source is zero, small distances survive rounding."""
+    kept = rng.random((blocks, 1, elements)) < 0.6  # noqa: PLR2004
+    kept[:, :, 0] = True
+    return np.where(rng.random((blocks, 1, 1)) < 0.5, 1.0, kept)  # noqa: PLR2004
+
+
+def vanishing(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """A convex combination nearly vanishes, up to distances from 1 to 1e-16."""
+    rows = _normal(rng, blocks, views, elements) * _apart(rng, blocks, elements)
+    chosen = rng.random((blocks, views)) < rng.choice([0.3, 0.6, 1.0], (blocks, 1))
+    chosen[:, 0] = True
+    chosen[:, -1] = False
+    weights = np.where(chosen, rng.uniform(0, 1, (blocks, views)), 0.0)
+    last = -np.einsum("bk,bkp->bp", weights, rows)
+    noise = _powers(rng, (blocks, 1), -16, 0) * rng.standard_normal((blocks, elements))
+    rows[:, -1] = last + noise
+    return rows
+
+
+def ratios(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Norm ratios to 1e12."""
+    return _normal(rng, blocks, views, elements) * _powers(rng, (blocks, views, 1), -6, 6)
+
+
+def zeros(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Rows and elements that are exactly zero."""
+    rows = _normal(rng, blocks, views, elements)
+    rows *= rng.random((blocks, views, 1)) < 0.7  # noqa: PLR2004
+    return np.asarray(rows * (rng.random(rows.shape) < rng.uniform(0.2, 1, (blocks, 1, 1))))
+
+
+def mixed(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
+    """Copies or vanishing combinations with norm ratios to 1e12 on top."""
+    first = near_copies if rng.random() < 0.5 else vanishing  # noqa: PLR2004
+    rows = first(rng, blocks, views, elements)
+    return rows * _powers(rng, (blocks, views, 1), -6, 6)
+
+
+FAMILIES: Final[Mapping[str, Family]] = {
+    USUAL: usual,
+    "integers": integers,
+    "low rank": low_rank,
+    "near copies": near_copies,
+    "vanishing": vanishing,
+    "ratios": ratios,
+    "zeros": zeros,
+    "mixed": mixed,
+}

@@ -1,0 +1,245 @@
+"""The search for the worst gradients finds what it should, and finds it again."""
+
+import json
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.operator import Operator
+from crossgrad_core.stress.case import short
+from crossgrad_core.stress.exact import exact_gramian
+from crossgrad_core.stress.reference import answer
+from crossgrad_core.stress.search.batch import Batch, results, search_views
+from crossgrad_core.stress.search.examine import examine
+from crossgrad_core.stress.search.families import FAMILIES, rounded
+from crossgrad_core.stress.search.finite import as_text, run_finite
+from crossgrad_core.stress.search.loop import Extent, fresh, search
+from crossgrad_core.stress.search.quick import QUICK, exact
+from crossgrad_core.stress.search.repeat import read_rows
+from crossgrad_core.stress.search.report import failed
+from crossgrad_core.stress.search.shrink import shrunk
+from crossgrad_core.stress.search.specimens import Specimen
+from crossgrad_core.stress.search.subject import Subject, subject_of
+from crossgrad_core.stress.suite import made, reference_of
+from crossgrad_operators.symmetric import Symmetric
+
+BOTH = (torch.float32, torch.float64)
+
+
+def symmetric_as(operator):
+    """An operator that claims to be `symmetric`."""
+    return Subject("flawed", operator, reference_of("symmetric", Symmetric()), QUICK["symmetric"])
+
+
+def one_in(count, gramians):
+    """[B] a fixed choice of one Gramian in so many."""
+    mantissa, _ = np.frexp(gramians.sum(axis=(1, 2)))
+    return np.floor(np.abs(mantissa) * 2.0**40) % count == 0
+
+
+class SeldomOff(Symmetric):
+    """Wrong by 1e-5 on one case in fifty."""
+
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        wrong = one_in(50, gramians)[:, None, None]
+        return matrices * np.where(wrong, 1 + 1e-5, 1.0), state
+
+
+class SeldomNan(Symmetric):
+    """Not a number on one case in ten thousand."""
+
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        wrong = one_in(10_000, gramians)[:, None, None]
+        return np.where(wrong, np.nan, matrices), state
+
+
+class Jumps(Symmetric):
+    """The sum or nothing, depending on digits that no answer depends on."""
+
+    def transform(self, gramians, context, state, rng):
+        matrices, state = super().transform(gramians, context, state, rng)
+        return matrices * (gramians[:, :1, :1] * 2.0**52 % 2 < 1), state
+
+
+class Absolute(Operator):
+    """Compares lengths with a constant."""
+
+    def transform(self, gramians, context, state, rng):
+        long = np.einsum("bkk->bk", gramians) > 1
+        return np.eye(gramians.shape[1]) * np.where(long, 1.0, 2.0)[:, :, None], state
+
+
+@pytest.mark.parametrize("dtype", BOTH, ids=str)
+def test_an_operator_that_is_seldom_wrong_by_a_little_is_found(dtype):
+    (tally,) = search([symmetric_as(SeldomOff())], Extent(rounds=4, dtypes=(dtype,)))
+    assert failed(tally)
+    assert "u kappa" in tally.failures[0][1]
+
+
+def test_an_operator_that_is_not_a_number_once_in_ten_thousand_is_found():
+    found = run_finite(symmetric_as(SeldomNan()), 50_000)
+    assert found.not_finite > 0
+    assert "not finite" in as_text([found])
+    rows = found.example.rows
+    again = results(SeldomNan(), Batch(rows[None], found.example.dtype, "again"))
+    assert np.isnan(again).any()
+
+
+def test_an_operator_that_jumps_is_found():
+    (tally,) = search([symmetric_as(Jumps())], Extent(rounds=1, dtypes=(torch.float64,)))
+    assert any("moves by" in reason for _, reason in tally.failures)
+
+
+def test_an_operator_without_a_reference_must_scale_with_the_gradients():
+    (tally,) = search([subject_of("theirs", Absolute())], Extent(rounds=2, dtypes=BOTH[:1]))
+    assert failed(tally)
+
+
+def test_the_right_operator_keeps_every_promise():
+    assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
+
+
+def test_a_longer_search_begins_with_the_cases_of_a_shorter_one():
+    once = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
+    again = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
+    for one, other in zip(once, again, strict=True):
+        assert (one.matrices, one.broken) == (other.matrices, other.broken)
+        pairs = zip(one.pool, other.pool, strict=True)
+        assert all(np.array_equal(a.rows, b.rows) for a, b in pairs)
+    assert not np.array_equal(fresh(Extent(seed=5), 2).rows, fresh(Extent(seed=6), 2).rows)
+
+
+@pytest.mark.parametrize("dtype", BOTH, ids=str)
+@pytest.mark.parametrize("family", list(FAMILIES))
+def test_gradients_are_exact_in_their_type_and_finite(family, dtype):
+    rows = rounded(FAMILIES[family](np.random.default_rng(1), 50, 7, 5), dtype)
+    assert rows.shape == (50, 7, 5)
+    assert np.isfinite(rows).all()
+    assert np.array_equal(torch.from_numpy(rows).to(dtype).double().numpy(), rows)
+
+
+def test_families_reach_the_extremes_that_they_are_meant_for():
+    rng = np.random.default_rng(2)
+    norms = np.linalg.norm(FAMILIES["ratios"](rng, 200, 12, 5), axis=2)
+    assert (norms.max(axis=1) / norms.min(axis=1)).max() > 1e11
+    assert (np.linalg.matrix_rank(FAMILIES["low rank"](rng, 50, 9, 9)) <= 3).all()
+    copies = FAMILIES["near copies"](rng, 400, 2, 5)
+    unit = copies / np.linalg.norm(copies, axis=2, keepdims=True)
+    apart = np.linalg.norm(unit[:, 0] - unit[:, 1], axis=1)
+    assert {int(np.log10(d)) for d in apart if 0 < d < 1} >= set(range(-14, 0))
+    assert (~FAMILIES["zeros"](rng, 50, 6, 5).any(axis=2)).any()
+
+
+def agreement(name, rows):
+    """Distance of the quick answer from the exact one, over the largest term; NaN if unproven."""
+    batch = Batch(rows[None], torch.float64, "test")
+    reference = reference_of(name, made(name))
+    found = exact(QUICK[name], batch, reference.options)
+    with mpmath.mp.workdps(50):
+        mpf = mpmath.mpf
+        case = short("test", rows, torch.float64)
+        views = search_views(len(rows))
+        expected = answer(reference.oracle, exact_gramian(case), views, {}, reference.options)
+        pairs = found.weights[0].tolist()
+        off = [mpf(h) + mpf(low) - w for (h, low), w in zip(pairs, expected.weights, strict=True)]
+        gap = [mpmath.fdot(off, [mpf(v) for v in column]) for column in rows.T.tolist()]
+        scale = max(expected.largest, expected.length, mpf("1e-300"))
+        return float(mpmath.norm(gap) / scale) if found.proven[0] else float("nan")
+
+
+@pytest.mark.parametrize("name", sorted(QUICK))
+def test_quick_answers_have_thirty_digits(name):
+    rng = np.random.default_rng(3)
+    operator = made(name)
+    errors = []
+    for views, elements in ((2, 3), (3, 2), (3, 6), (4, 7)):
+        if operator.views.admits(views):
+            errors.append(agreement(name, rng.integers(-9, 10, (views, elements)).astype(float)))
+            scale = 10.0 ** rng.uniform(-3, 3, (views, 1))
+            errors.append(agreement(name, rng.standard_normal((views, elements)) * scale))
+    proven = [error for error in errors if not np.isnan(error)]
+    assert len(proven) >= len(errors) - 2
+    assert max(proven) < 1e-27
+
+
+def test_a_worse_case_shrinks_to_what_it_needs():
+    class OffForThree(Symmetric):
+        def transform(self, gramians, context, state, rng):
+            matrices, state = super().transform(gramians, context, state, rng)
+            return matrices * (1 + 1e-4 * (gramians.shape[1] >= 3)), state
+
+    subject = symmetric_as(OffForThree())
+    rows = rounded(np.random.default_rng(4).standard_normal((6, 7)), torch.float32)
+    value = float(examine(subject, Batch(rows[None], torch.float32, "test")).error[0])
+    small = shrunk(subject, Specimen(rows, torch.float32, "test", 0, value), inside=True)
+    assert len(small.rows) == 3
+    assert small.rows.shape[1] <= 2
+
+
+def test_rows_are_printed_so_that_they_are_read_again_exactly():
+    for dtype in BOTH:
+        rows = rounded(FAMILIES["mixed"](np.random.default_rng(5), 1, 4, 3)[0], dtype)
+        text = Specimen(rows, dtype, "test", 0, 1.0).text()
+        assert np.array_equal(read_rows(text, dtype).exact_head, rows)
+
+
+@pytest.mark.parametrize("text", ["", "1", "[1,2]", "[[1,2],[3]]", "[[1,a]]", "[[]]"])
+def test_rows_that_are_no_matrix_are_refused(text):
+    with pytest.raises(UserError, match="no matrix"):
+        read_rows(text, torch.float32)
+
+
+def stress(*arguments):
+    from crossgrad_core.cli.main import app
+
+    return CliRunner().invoke(app, ["stress", *arguments])
+
+
+def test_the_command_searches_and_repeats_what_it_prints():
+    found = stress("symmetric", "--search", "0.01", "--type", "float32")
+    assert found.exit_code == 0, found.output
+    assert "nothing outside what is stated" in found.output
+    rows = found.output.split("--rows '", 1)[1].split("'", 1)[0]
+    assert len(json.loads(rows)) >= 2
+    assert stress("symmetric", "--rows", rows, "--type", "float32").exit_code == 0
+
+
+def test_the_command_tells_of_broken_promises_by_its_exit_status(monkeypatch):
+    from crossgrad_core.stress.search import subject
+
+    monkeypatch.setattr(subject, "subject_of", lambda _name, _made: symmetric_as(SeldomOff()))
+    found = stress("symmetric", "--search", "0.5", "--type", "float32")
+    assert found.exit_code == 1
+    assert "broken promises" in found.output
+
+
+def test_the_command_runs_very_many_matrices(monkeypatch):
+    assert stress("symmetric", "--matrices", "2500").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--search", "1", "--rows", "[[1]]"], "--search and --rows do not go together"),
+        (["--search", "1", "--case", "plain"], "--case does nothing with --search"),
+        (["--rows", "[[1]]", "--seed", "1"], "--seed does nothing with --rows"),
+        (["--type", "float32"], "--type does nothing with the fixed cases"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(arguments, message):
+    found = stress(*arguments)
+    assert isinstance(found.exception, UserError)
+    assert message in str(found.exception)
+
+
+def test_every_kind_of_run_writes_a_table(tmp_path):
+    for place, mode in enumerate((["--search", "0.01"], ["--matrices", "10"], ["--rows", "[[1]]"])):
+        path = tmp_path / f"{place}.csv"
+        assert stress("sum", *mode, "--csv", str(path)).exit_code == 0
+        assert path.read_text().startswith("operator,")
