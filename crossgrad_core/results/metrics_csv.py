@@ -45,7 +45,8 @@ def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
     """The row of one evaluation."""
     row: Row = dict(asdict(totals))
     row["train_seconds"] = round(totals.train_seconds, _MILLISECONDS)
-    row["peak_memory_mib"] = round(totals.peak_memory_mib, 1)
+    peak = totals.peak_memory_mib
+    row["peak_memory_mib"] = None if peak is None else round(peak, 1)
     row |= {metric: getattr(result.overall, metric) for metric in _METRICS}
     for regime, means in result.regimes.items():
         row[f"psnr_{regime}"] = means.psnr

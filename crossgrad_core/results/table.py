@@ -19,10 +19,12 @@ def final_table(result: EvaluationResult | None, totals: Totals) -> str:
 
 def cost_line(totals: Totals) -> str:
     """Training seconds, steps, rendered views, primitives and memory in one line."""
+    peak = totals.peak_memory_mib
+    memory = "" if peak is None else f", peak memory {peak:,.0f} MiB"
     return (
         f"{totals.train_seconds:,.1f} s training, {totals.step:,} steps, "
         f"{totals.views:,} views rendered, {totals.backward_passes:,} backward passes, "
-        f"{totals.primitives:,} primitives, peak memory {totals.peak_memory_mib:,.0f} MiB"
+        f"{totals.primitives:,} primitives{memory}"
     )
 
 

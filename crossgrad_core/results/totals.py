@@ -13,7 +13,7 @@ class Totals:
         backward_passes: Backward passes.
         train_seconds: Training seconds; compiling, loading, evaluating and reporting excluded.
         primitives: Number of primitives.
-        peak_memory_mib: Peak memory, MiB.
+        peak_memory_mib: Peak memory, MiB; None where the system does not say.
         loss: Mean photometric loss of the last step, None before the first.
     """
 
@@ -22,7 +22,7 @@ class Totals:
     backward_passes: int
     train_seconds: float
     primitives: int
-    peak_memory_mib: float
+    peak_memory_mib: float | None
     loss: float | None
 
 

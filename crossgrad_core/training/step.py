@@ -25,7 +25,7 @@ from crossgrad_core.optimizer import adam_step
 from crossgrad_core.topology import Edit, NoEdit
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.memory import room_for_primitives
+from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -138,7 +138,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit 
         rasterizer=setup.rasterizer,
         views=rendered.records,
         means_lr=_means_lr(setup, state.step),
-        room=_room(setup, state) if setup.schedule.densifies(state.step) else 0,
+        room=_room(setup, state, rendered) if setup.schedule.densifies(state.step) else 0,
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
     state.commit(answer.states)
@@ -175,22 +175,34 @@ def _means_lr(setup: Setup, step: int) -> float:
     return rate.at(step / setup.schedule.lr_steps)
 
 
-def _room(setup: Setup, state: TrainState) -> int:
+def _room(setup: Setup, state: TrainState, rendered: Rendered) -> int:
     """How many primitives may be added now."""
-    primitives = state.primitives(setup)
+    rooms = []
+    if setup.config.max_gaussians is not None:
+        rooms.append(max(0, setup.config.max_gaussians - state.primitives(setup)))
+    memory = room_for_primitives(setup.device, _demand(setup, state, rendered))
+    if memory is not None:
+        rooms.append(memory)
+    return min(rooms, default=sys.maxsize)
+
+
+def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
+    """What a step keeps for each primitive."""
     per_primitive = sum(
         state.parameters[name][:1].numel() * state.parameters[name].element_size()
         for block in setup.blocks
         if block.per_primitive
         for name in block.tensors
     )
-    rooms = []
-    if setup.config.max_gaussians is not None:
-        rooms.append(max(0, setup.config.max_gaussians - primitives))
-    memory = room_for_primitives(setup.device, per_primitive)
-    if memory is not None:
-        rooms.append(memory)
-    return min(rooms, default=sys.maxsize)
+    kept = kept_bytes(rendered.records, state.parameters.values())
+    return Demand(
+        parameters=per_primitive,
+        kept=kept // max(1, state.primitives(setup)),
+        views=len(rendered.records),
+        separate=setup.separate,
+        watched=bool(setup.watchers),
+        joint=setup.joint,
+    )
 
 
 def _check_finite(state: TrainState, rendered: Rendered, gradients: Gradients) -> None:

@@ -1,0 +1,122 @@
+"""The memory guard counts what a step keeps; systems that do not tell their memory do no harm."""
+
+import gc
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.hooks import hookimpl
+from crossgrad_core.manager import make_manager
+from crossgrad_core.results.table import cost_line
+from crossgrad_core.results.totals import Totals
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import memory, step
+from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes
+from crossgrad_core.training.start import first_state
+
+CPU = torch.device("cpu")
+GIB = 2**30
+
+
+@pytest.mark.parametrize(
+    ("kind", "copies"),
+    [
+        ({"views": 1}, 10),
+        ({"views": 2}, 11),  # the sum so far, and the newest view's
+        ({"views": 8}, 11),
+        ({"views": 1, "separate": True}, 10),
+        ({"views": 8, "separate": True}, 17),
+        ({"views": 8, "separate": True, "watched": True}, 18),
+        ({"views": 1, "joint": True}, 10),
+        ({"views": 4, "joint": True}, 6 + 2 + 4 * 3),  # four graphs instead of an edit
+    ],
+)
+def test_copies_of_the_parameters_at_the_worst_moment(kind, copies):
+    assert Demand(parameters=236, kept=0, **kind).bytes == copies * 236
+
+
+def test_what_is_decoded_counts_where_it_is_more_than_the_parameters():
+    assert Demand(parameters=100, kept=800, views=4).bytes == 8 * 100 + 800 + 3 * 200
+
+
+class Look:
+    """Notes what is alive and how much room there is when density control is asked."""
+
+    def __init__(self):
+        self.alive, self.room, self.demand = 0, 0, None
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        shape = context.parameters["f_rest"].shape
+        kinds = (torch.Tensor, torch.nn.Parameter)
+        found = (each for each in gc.get_objects() if type(each) in kinds)
+        places = {each.untyped_storage().data_ptr() for each in found if each.shape == shape}
+        self.alive, self.room = len(places), context.room
+        return (yield)
+
+
+def looked(monkeypatch, available=GIB, **settings):
+    """What a step sees in which density control may edit."""
+    monkeypatch.setattr(memory, "available_bytes", lambda _: available)
+    demands = []
+    room_for = memory.room_for_primitives
+    monkeypatch.setattr(
+        step, "room_for_primitives", lambda d, demand: demands.append(demand) or room_for(d, demand)
+    )
+    given = {"steps": 9, "densify_from": 1, "densify_until": 9, "densify_every": 2, "sh_from": 3}
+    setup = assemble(RunConfig.model_validate({**given, **settings}), sample_scene(), "none")
+    look = Look()
+    setup = replace(setup, manager=make_manager({**setup.plugins, "look": look}))
+    state = first_state(setup)
+    step.take_step(setup, state)
+    gc.collect()
+    step.take_step(setup, state)
+    (look.demand,) = demands
+    return look
+
+
+#: The parameter and two moments.
+OTHERS = 3
+
+
+@pytest.mark.parametrize("views", [2, 5])
+def test_all_gradients_that_are_kept_are_counted(monkeypatch, views):
+    look = looked(monkeypatch, views=views, operator={"name": "pcgrad"})
+    assert look.demand.gradients == views <= look.alive - OTHERS <= views + 1
+
+
+def test_a_sum_keeps_no_gradient_of_a_single_view(monkeypatch):
+    look = looked(monkeypatch, views=5)
+    assert look.alive - OTHERS <= look.demand.gradients == 2
+
+
+def test_more_views_leave_less_room(monkeypatch):
+    operator = {"name": "pcgrad"}
+    few, many = (looked(monkeypatch, views=k, operator=operator) for k in (2, 8))
+    joint = looked(monkeypatch, views=8, backward="joint")
+    assert few.room == GIB // 2 // few.demand.bytes
+    assert few.room > 1.4 * many.room > 1.4 * joint.room
+    assert many.demand.kept == pytest.approx(4 * few.demand.kept, rel=0.3)
+
+
+def test_where_the_system_does_not_say_nothing_is_shown(monkeypatch):
+    monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
+    assert peak_mebibytes(CPU) is None
+    line = cost_line(Totals(1, 2, 3, 4.0, 5, peak_mebibytes(CPU), 0.5))
+    assert "5 primitives" in line and "memory" not in line
+
+
+def test_no_module_of_ours_needs_one_that_only_some_systems_have():
+    absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
+    ours = "import crossgrad_core.app, crossgrad_core.afterwards, crossgrad_core.diagnostics.app"
+    subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
+
+
+def test_this_machine_says_how_much_memory_is_left():
+    available = available_bytes(CPU)
+    assert available is None or available > 0
