@@ -2,10 +2,12 @@
 PYTHON ?= python3
 VENV ?= .venv
 TEST_VENV ?= .venv-test
+# How many faults of each kind `make faults` tries.
+FAULTS ?= 100
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test matrix compat lint bench clean
+.PHONY: demo install test matrix compat faults lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -25,6 +27,9 @@ matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.
 
 compat:  ## The tests on Python 3.12, 3.13 and the lowest versions of packages, one worker each
 	COMPAT_VENVS="$(abspath .venv-compat)" sh tests/compat.sh
+
+faults:  ## Kill, starve and interrupt runs, a hundred times each, and look at what is left
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" FAULTS="$(FAULTS)" sh tests/run.sh -m faults
 
 lint: install  ## ruff and mypy
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"
