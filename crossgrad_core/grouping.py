@@ -25,6 +25,20 @@ class Labelling:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """The one number per view that a grouping splits.
+
+    Attributes:
+        name: What it is, as in "the log distance from the mean camera".
+        values: [V] float64 in the order in which the views were given; not finite where a view has
+            none.
+    """
+
+    name: str
+    values: NDArray[np.float64]
+
+
 class GradientProbe(Protocol):
     """Gradients of a model with frozen parameters, seen through their dot products only."""
 
@@ -69,3 +83,15 @@ class Grouping(Component):
         Raises:
             UserError: The rule leaves a group without training views, with what to do.
         """
+
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
+        """What the rule splits, so that a run can say where that has one mode only.
+
+        Args:
+            scene: The scene.
+            views: The views to be measured.
+
+        Returns:
+            None (the default) for rules that look at more than one number per view.
+        """
+        return None

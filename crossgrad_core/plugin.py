@@ -30,7 +30,7 @@ from crossgrad_core.densifier import Densifier
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.gradients import ViewGradients
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.hooks import hookimpl
 from crossgrad_core.observer import Observer
 from crossgrad_core.operator import Granularity, Operator, OperatorContext
@@ -77,6 +77,7 @@ __all__ = [
     "Phase",
     "Photo",
     "PluginState",
+    "Quantity",
     "Rasterizer",
     "Reader",
     "RegularizeContext",

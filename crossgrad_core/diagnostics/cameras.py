@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.diagnostics.bimodality import bimodality
 from crossgrad_core.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_core.diagnostics.plan import labelled, plan_probe
 from crossgrad_core.diagnostics.probe import Measurement
@@ -14,6 +13,7 @@ from crossgrad_core.diagnostics.table import Row, per_pair_conflict
 from crossgrad_core.diagnostics.variance import variance_split
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries
+from crossgrad_core.scene.bimodality import bimodality
 from crossgrad_core.scene.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_core.scene.types import Scene
 

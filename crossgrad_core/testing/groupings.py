@@ -12,6 +12,7 @@ from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
     Make,
+    cannot_tell,
     global_randomness_untouched,
     require,
 )
@@ -82,6 +83,21 @@ def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
         )
 
 
+def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
+    """What the rule splits has a name and a number for each view, whatever else is measured."""
+    grouping, scene = make(), sample_scene()
+    together = grouping.quantity(scene, scene.views)
+    if together is None:
+        raise cannot_tell("the rule splits no single number")
+    require(bool(together.name.strip()), "the quantity has no name")
+    shape = np.shape(together.values)
+    require(shape == (len(scene.views),), f"{len(scene.views)} views have values {list(shape)}")
+    for place, view in enumerate(scene.views):
+        alone = grouping.quantity(scene, (view,))
+        same = alone is not None and np.allclose(alone.values[0], together.values[place])
+        require(same, f"{view.name} has another value when it is measured alone")
+
+
 def same_seed_same_labels(make: Make[Grouping]) -> None:
     """The labels depend on the arguments alone, and randomness comes from `rng`."""
     scene = sample_scene()
@@ -96,5 +112,6 @@ GROUPING_CHECKS: tuple[Check[Grouping], ...] = (
     every_view_has_a_declared_label,
     every_group_has_training_views,
     the_rule_is_fitted_on_training_views,
+    the_quantity_is_one_number_per_view,
     same_seed_same_labels,
 )

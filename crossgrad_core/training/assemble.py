@@ -23,6 +23,7 @@ from crossgrad_core.sampler import Sampler
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
 from crossgrad_core.training.idle import idle_note
+from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 
@@ -135,7 +136,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     manager = make_manager(plugins)
     answers = manager.hook.crossgrad_objections(selection=selection)
     _refuse(reasons_against(config, selection, answers))
-    groups = _groups(config, scene, components.get("grouping"), notes)
+    groups = _groups(config, scene, selection, notes)
     densifier = cast("Densifier", components["densifier"])
     setup = Setup(
         config=config,
@@ -284,13 +285,15 @@ def _grouping_choice(
 
 
 def _groups(
-    config: RunConfig, scene: Scene, grouping: Component | None, notes: list[str]
+    config: RunConfig, scene: Scene, selection: Selection, notes: list[str]
 ) -> tuple[str, ...] | None:
-    if grouping is None:
+    if "grouping" not in selection.components:
         return None
+    grouping = cast("Grouping", selection.components["grouping"])
     rng = make_streams(config.seed)["grouping"]
-    labelling = cast("Grouping", grouping).label(scene, scene.train_views, rng)
+    labelling = grouping.label(scene, scene.train_views, rng)
     notes += labelling.notes
+    notes += mode_note(selection.names["grouping"], grouping, scene)
     counts = {label: labelling.labels.count(label) for label in dict.fromkeys(labelling.labels)}
     listed = ", ".join(f"{label} {count}" for label, count in counts.items())
     notes.append(f"groups of training views: {listed}")

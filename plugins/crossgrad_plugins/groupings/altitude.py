@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.poses import altitudes, upward
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
@@ -54,6 +54,11 @@ class Altitude(Grouping):
             f"up is {np.array2string(axis, precision=3)} ({source})"
         )
         return Labelling(halves(altitudes(scene, views, axis), threshold), (note,))
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        axis, _ = upward(scene, self.up)
+        return Quantity("the height", altitudes(scene, views, axis))
 
     def _threshold(self, heights: NDArray[np.float64]) -> float:
         if self.cut == "median":

@@ -7,9 +7,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.types import Scene, View
-from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR
+from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import label_by_shares
 
 
@@ -34,3 +34,7 @@ class Anchors(Grouping):
         probe: GradientProbe | None = None,
     ) -> Labelling:
         return label_by_shares(scene, views, "anchors", self.share, (NEAR, FAR))
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        return log_distances(scene, views)

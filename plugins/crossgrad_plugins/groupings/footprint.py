@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.poses import footprint_of
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
@@ -46,6 +46,11 @@ class Footprint(Grouping):
         values = _footprints(scene, views)
         note = f"grouping footprint: near from {threshold:.4g} pixels per local unit"
         return Labelling(halves(-values, -threshold), (note,))
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        footprints = np.array([footprint_of(scene, view) for view in views])
+        return Quantity("the log depth over focal length", -np.log(footprints))
 
 
 def _footprints(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.poses import radial_distances
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.radial import Radial
-from crossgrad_plugins.groupings.split import FAR, NEAR, require_training_views
+from crossgrad_plugins.groupings.split import FAR, NEAR, log_distances, require_training_views
 
 _VARIANCE_FLOOR = 1e-6
 _DISTANCE_FLOOR = 1e-9
@@ -50,6 +50,10 @@ class GaussianMixture(Grouping):
         near, far = np.exp(mixture.means)
         note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
         return Labelling(mixture.labels(radial_distances(scene, views), floor), (note,))
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        return log_distances(scene, views)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.poses import radial_distances
 from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
     halves,
+    log_distances,
     require_groups,
     require_training_views,
 )
@@ -37,3 +38,7 @@ class Radial(Grouping):
         require_groups("radial", halves(train, threshold), (NEAR, FAR), "distance from their mean")
         note = f"grouping radial: near up to {threshold:.4g} local units from the mean camera"
         return Labelling(halves(radial_distances(scene, views), threshold), (note,))
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        return log_distances(scene, views)

@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.types import Scene
+from crossgrad_core.grouping import Quantity
+from crossgrad_core.scene.poses import radial_distances
+from crossgrad_core.scene.types import Scene, View
+
+#: Distances below this share of the median one are rounding.
+_NOWHERE = 1e-9
 
 NEAR, MIDDLE, FAR = "near", "middle", "far"
 
@@ -14,6 +19,15 @@ NEAR, MIDDLE, FAR = "near", "middle", "far"
 def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
     """`near` where a value [V] is at most the threshold, else `far`."""
     return tuple(NEAR if value <= threshold else FAR for value in values)
+
+
+def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
+    """Logarithms of the distances from the mean training camera; none for one that stands there."""
+    distances = radial_distances(scene, views)
+    there = _NOWHERE * float(np.median(radial_distances(scene, scene.train_views)))
+    logs = np.full(len(distances), -np.inf)
+    np.log(distances, out=logs, where=distances > there)
+    return Quantity("the log distance from the mean camera", logs)
 
 
 def require_training_views(scene: Scene, grouping: str) -> None:

@@ -6,9 +6,9 @@ from typing import ClassVar
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.types import Scene, View
-from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR
+from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import label_by_shares
 
 
@@ -29,3 +29,7 @@ class Terciles(Grouping):
         probe: GradientProbe | None = None,
     ) -> Labelling:
         return label_by_shares(scene, views, "terciles", 1.0 / 3.0, self.labels)
+
+    @override
+    def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
+        return log_distances(scene, views)

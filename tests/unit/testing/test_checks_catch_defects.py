@@ -210,6 +210,12 @@ class EmptyGroup(Radial):
         return api.Labelling(("near",) * len(views))
 
 
+class MeasuresRanks(Radial):
+    def quantity(self, scene, views):
+        found = super().quantity(scene, views)
+        return api.Quantity(found.name, found.values.argsort().argsort().astype(float))
+
+
 class FittedOnWhatIsAsked(Radial):
     def label(self, scene, views, rng, probe=None):
         far = (len(views) + 1) // 2
@@ -490,6 +496,7 @@ DEFECTS = [
     (groupings.every_view_has_a_declared_label, OneLabelForAll),
     (groupings.every_group_has_training_views, EmptyGroup),
     (groupings.the_rule_is_fitted_on_training_views, FittedOnWhatIsAsked),
+    (groupings.the_quantity_is_one_number_per_view, MeasuresRanks),
     (groupings.same_seed_same_labels, GlobalLabels),
     (rasterizers.renders_have_the_shape, FlatImage),
     (rasterizers.the_background_shows_through, ForgetsTheBackground),

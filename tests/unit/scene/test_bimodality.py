@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import expon, kurtosis, norm, skew
 
-from crossgrad_core.diagnostics.bimodality import bimodality
+from crossgrad_core.scene.bimodality import bimodality
 
 
 def quantiles(law, n=200_000):

@@ -1,0 +1,37 @@
+"""Says where a grouping splits what has one mode only."""
+
+import numpy as np
+
+from crossgrad_core.grouping import Grouping
+from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.scene.types import Scene
+
+#: Sarle's coefficient of a uniform sample, cut off: what lies below has one mode.
+ONE_MODE = 0.555
+#: In smaller ones two equal points stay below that in the finite-sample form (docs/groupings.md).
+SMALLEST_SAMPLE = 10
+
+
+def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
+    """One note where the training views have one mode in what the grouping splits, else none.
+
+    The finite-sample form of the coefficient decides, for small samples that of plain moments.
+
+    Args:
+        name: Name of the grouping.
+        grouping: The grouping.
+        scene: The scene.
+    """
+    quantity = grouping.quantity(scene, scene.train_views)
+    if quantity is None:
+        return ()
+    found = bimodality(quantity.values[np.isfinite(quantity.values)])
+    figure = found.sample if found.size >= SMALLEST_SAMPLE else found.population
+    # Not a number where all values are equal or there are too few: nothing can be said.
+    if not figure < ONE_MODE:
+        return ()
+    return (
+        f"grouping {name} splits what has one mode: the bimodality of {quantity.name} is "
+        f"{figure:.2f} over {found.size} training views (below {ONE_MODE}), so the split is "
+        "arbitrary there; sampler random needs none",
+    )
