@@ -12,6 +12,7 @@ from crossgrad_core.manager import make_manager
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -64,6 +65,8 @@ def unwatched(setup: Setup) -> Setup:
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """Compiles every kernel that the run will need, on throw-away states.
 
+    Photos are decoded meanwhile: compilers run one at a time and leave the interpreter to others.
+
     Args:
         setup: The run.
         reached: The state of a resumed run, which stays as it is.
@@ -81,11 +84,12 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     if setup.schedule.grows:
         # An edit may draw, too.
         steps.append(setup.schedule.first_edit - 1)
-    for step in steps:
-        if step < setup.schedule.total:
-            state = first_state(setup) if reached is None else deepcopy(reached)
-            state.step = step
-            timed_step(setup, state)
+    with decoded_meanwhile(setup.scene):
+        for step in steps:
+            if step < setup.schedule.total:
+                state = first_state(setup) if reached is None else deepcopy(reached)
+                state.step = step
+                timed_step(setup, state)
     seconds = perf_counter() - start
     _LOG.debug("loaded kernels in %.1f s", seconds)
     return seconds
