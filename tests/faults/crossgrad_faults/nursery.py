@@ -96,6 +96,7 @@ def run(job: Mapping[str, Any], report: int) -> None:
     os.dup2(output, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(job["environment"])
+    own_locks()
     told = Counter()
     if job["fault"] is not None:
         install(job["fault"], told)
@@ -117,6 +118,13 @@ def run(job: Mapping[str, Any], report: int) -> None:
         sys.stderr.flush()
         os.write(report, str(told.count).encode())
         os._exit(code)
+
+
+def own_locks() -> None:
+    """Renews the one lock that forks share: who is killed while holding it would stop all others."""
+    from numba.np.ufunc import parallel
+
+    parallel._set_init_process_lock()
 
 
 @dataclass
