@@ -121,7 +121,7 @@ def run(job: Mapping[str, Any], report: int) -> None:
 
 
 def own_locks() -> None:
-    """Renews the one lock that forks share: who is killed while holding it would stop all others."""
+    """Renews the one lock that forks share: one that is killed with it would stop all others."""
     from numba.np.ufunc import parallel
 
     parallel._set_init_process_lock()

@@ -94,8 +94,11 @@ class Nursery:
 
     def wait(self) -> End:
         """How what was started ended."""
-        said = (self.folder / f"output-{self.count}.txt").read_text
-        return End(**self._line(), said=said(encoding="utf-8"))
+        answer = self._line()
+        output = self.folder / f"output-{self.count}.txt"
+        # Who is killed at once has printed nothing.
+        said = output.read_text(encoding="utf-8", errors="replace") if output.exists() else ""
+        return End(**answer, said=said)
 
     def close(self) -> None:
         """Ends the process."""
