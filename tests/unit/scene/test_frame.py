@@ -30,12 +30,32 @@ def test_scaling_the_input_changes_nearly_no_bit(factor):
     np.testing.assert_allclose(scaled, reference, rtol=0, atol=2.0**-30)
 
 
-def test_moving_the_input_by_a_million_changes_few_bits_and_no_value():
-    move = np.array([5e5, 4e6, 1e6])
-    reference = make_frame(CENTERS, POINTS).points(POINTS)
-    moved = make_frame(CENTERS + move, POINTS + move).points(POINTS + move)
-    assert np.mean(moved.astype(np.float32) == reference.astype(np.float32)) > 0.99
-    np.testing.assert_allclose(moved, reference, rtol=0, atol=3e-9)
+def moved_pose(pose, move):
+    """The pose of the same camera in a scene that was moved, as COLMAP would write it."""
+    moved = pose.copy()
+    moved[:3, 3] = -pose[:3, :3] @ (camera_centers(pose[None])[0] + move)
+    return moved
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_moved_by_a_million_units_cameras_and_points_stay_to_2e_9(seed):
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(12, 3, 3)))[0]
+    poses[:, :3, 3] = rng.normal(size=(12, 3)) * rng.uniform(0.1, 1.0, 3)
+    # An extent of 1 to 10^4 units; points as far as ten times that.
+    poses[:, :3, 3] *= 10 ** rng.uniform(0, 4) / (1.1 * np.abs(camera_centers(poses)).max())
+    points = rng.normal(size=(500, 3)) * 3 * np.abs(camera_centers(poses)).max()
+    move = rng.uniform(-1e6, 1e6, 3)
+    there = np.stack([moved_pose(pose, move) for pose in poses])
+    frame = make_frame(camera_centers(poses), points)
+    far = make_frame(camera_centers(there), points + move)
+    assert 1 / frame.similarity.scale >= 0.9
+    assert np.abs(far.points(points + move) - frame.points(points)).max() <= 2e-9
+    for pose, same in zip(poses, there, strict=True):
+        local, moved = (each[None] for each in (frame.pose(pose), far.pose(same)))
+        assert np.abs(camera_centers(moved) - camera_centers(local)).max() <= 2e-9
+        np.testing.assert_array_equal(moved[0, :3, :3], local[0, :3, :3])
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e-9])

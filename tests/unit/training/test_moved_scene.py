@@ -1,0 +1,73 @@
+"""A scene that was moved trains as one whose first positions differ in the last bit."""
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.evaluation import evaluate
+from crossgrad_core.scene.poses import centers_of
+from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.threads import configure_threads
+from crossgrad_core.training.assemble import assemble, read_scene
+from crossgrad_core.training.export import renderer
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+
+STEPS, RUNS = 30, 10
+SETTINGS = {"steps": STEPS, "densify_from": 10, "densify_every": 10, "densify_until": 25}
+OFFSETS = [(1e6, 1e6, 1e6), (4e5, 5.6e6, 120.0), (0.0, 0.0, -1e6)]
+
+
+def written(folder, **options):
+    write_tiny_scene(folder, views=9, **options)
+    return read_scene(RunConfig(scene=folder), folder)[0]
+
+
+@pytest.fixture(scope="module")
+def in_place(tmp_path_factory):
+    return written(tmp_path_factory.mktemp("scenes") / "tiny")
+
+
+@pytest.fixture(scope="module")
+def spread(in_place):
+    """PSNR in place, and how far apart runs from perturbed positions end."""
+    plain = psnr(in_place)
+    runs = [plain, *(psnr(in_place, seed) for seed in range(RUNS))]
+    return plain, max(runs) - min(runs)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    before = configure_threads()
+    configure_threads(1)
+    yield
+    configure_threads(before)
+
+
+def psnr(scene, seed=None):
+    """After a short run; from positions one unit in the last place aside, where a seed is given."""
+    setup = assemble(RunConfig.model_validate(SETTINGS), scene, "colmap")
+    state = first_state(setup)
+    if seed is not None:
+        state.parameters["means"] = aside(state.parameters["means"].detach(), seed)
+    for _ in range(STEPS):
+        timed_step(setup, state)
+    return evaluate(scene.test_views, renderer(setup, state)).overall.psnr
+
+
+def aside(means, seed):
+    signs = np.random.default_rng(seed).choice([-np.inf, np.inf], means.shape)
+    return torch.nextafter(means, torch.from_numpy(signs).to(means)).requires_grad_()
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_a_moved_scene_is_the_same_to_2e_9_and_its_psnr_within_the_spread(
+    tmp_path, in_place, spread, offset
+):
+    moved = written(tmp_path / "moved", offset=offset)
+    assert np.abs(centers_of(moved.views) - centers_of(in_place.views)).max() <= 2e-9
+    assert np.abs(moved.points - in_place.points).max() <= 2e-9
+    plain, apart = spread
+    assert 0 < apart < 0.01
+    assert abs(psnr(moved) - plain) <= apart
