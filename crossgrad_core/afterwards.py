@@ -3,9 +3,8 @@
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation import evaluate as measured
@@ -20,12 +19,38 @@ from crossgrad_core.results.table import final_table
 from crossgrad_core.training.export import described, export_ply, renderer
 from crossgrad_core.training.session import totals
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
 from crossgrad_core.writability import check_file, check_folder
 
 _LOG = logging.getLogger(__name__)
 
 
-def evaluate(folder: Path, *, device: str | None = None, threads: int | None = None) -> None:
+@dataclass(frozen=True)
+class How:
+    """How a run is opened.
+
+    Attributes:
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+    """
+
+    device: str | None = None
+    threads: int | None = None
+    accept_scene: bool = False
+
+    def open(self, folder: Path) -> tuple[Setup, TrainState]:
+        """The run's setup and its newest state."""
+        given = {"device": self.device, "threads": self.threads}
+        machine = {name: value for name, value in given.items() if value is not None}
+        return opened(folder, machine, -1, accept_scene=self.accept_scene)
+
+
+#: On the run's own device, with all threads and its own scene.
+AS_IT_IS = How()
+
+
+def evaluate(folder: Path, how: How = AS_IT_IS) -> None:
     """Evaluates the held-out views of a run again; prints the table and renews per_view.csv.
 
     The folder of a run that is training, and one that may not be written to, is only read.
@@ -35,21 +60,14 @@ def evaluate(folder: Path, *, device: str | None = None, threads: int | None = N
     """
     require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
     with _writing_if_possible(folder, "evaluating") as writes:
-        setup, state = opened(folder, _machine(device, threads), -1)
+        setup, state = how.open(folder)
         result = measured(setup.scene.test_views, renderer(setup, state))
         if writes:
             write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
         print(final_table(result, totals(setup, state)))  # noqa: T201
 
 
-def render(
-    folder: Path,
-    *,
-    split: str,
-    out: Path | None,
-    device: str | None = None,
-    threads: int | None = None,
-) -> None:
+def render(folder: Path, *, split: str, out: Path | None, how: How = AS_IT_IS) -> None:
     """Draws photo | render | error of the views of a run.
 
     Raises:
@@ -58,7 +76,7 @@ def render(
     """
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
-        setup, state = opened(folder, _machine(device, threads), -1)
+        setup, state = how.open(folder)
         scene = setup.scene
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
         if not views:
@@ -80,8 +98,7 @@ def export(
     file_format: str,
     out: Path | None,
     camera: str | None = None,
-    device: str | None = None,
-    threads: int | None = None,
+    how: How = AS_IT_IS,
 ) -> None:
     """Writes the trained scene to a file that viewers open.
 
@@ -91,8 +108,7 @@ def export(
         out: The file; by default one in the run's folder that summary.json does not describe as
             something else.
         camera: Name of the view to bake for; by default the average over the training views.
-        device: Where tensors live; the run's own by default.
-        threads: CPU threads; all by default.
+        how: How the run is opened.
 
     Raises:
         UserError: It is no run, it has no checkpoint, the file exists, there is no such view or
@@ -102,7 +118,7 @@ def export(
         if out is not None:
             _check_new(out)
             check_file(out)
-        setup, state = opened(folder, _machine(device, threads), -1)
+        setup, state = how.open(folder)
         if camera is not None:
             _check_bakes(setup)
             path = out or folder / f"point_cloud_{_flat(setup, camera)}.{file_format}"
@@ -174,8 +190,3 @@ def _check_bakes(setup: Setup) -> None:
             where="--camera",
             todo="leave it out: the file is the same for every view",
         )
-
-
-def _machine(device: str | None, threads: int | None) -> dict[str, Any]:
-    given = {"device": device, "threads": threads}
-    return {name: value for name, value in given.items() if value is not None}

@@ -2,12 +2,13 @@
 
 import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
@@ -25,8 +26,11 @@ from crossgrad_core.results.folder import (
 )
 from crossgrad_core.results.lock import locked
 from crossgrad_core.results.log import RunLog
+from crossgrad_core.results.panels import FOLDER as RENDERS
+from crossgrad_core.results.scene_file import write_scene
 from crossgrad_core.results.summary import read_summary
 from crossgrad_core.results.table import final_table
+from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.training.assemble import (
     DEFAULT_STEPS,
     growth_note,
@@ -55,14 +59,16 @@ def run(
     resume: Path | None = None,
     dry_run: bool = False,
     verbosity: int = 0,
+    accept_scene: bool = False,
 ) -> int:
     """Trains, evaluates and exports.
 
     Args:
         settings: What the user set, in the shape of `RunConfig`.
         resume: Folder of a stopped run to continue.
-        dry_run: Check everything, print the resolved settings, train nothing.
+        dry_run: Of a new run, check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Continue although photos, masks or points of the scene have changed.
 
     Returns:
         The exit code: 0, 1 where training failed, 130 where the user interrupted the run (128 and
@@ -72,7 +78,14 @@ def run(
         UserError: The input is bad; nothing was written.
     """
     if resume is not None:
-        return _resume(resume, settings, verbosity)
+        take = partial(continued, resume, settings, verbosity, accept_scene=accept_scene)
+        return _resume(resume, take)
+    if accept_scene:
+        raise UserError(
+            "only a run that is continued has a scene to compare with",
+            where="--accept-scene",
+            todo="leave it out, or name the run with --resume",
+        )
     config = with_defaults(parsed(settings))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
@@ -92,6 +105,7 @@ def run(
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config)
+        _write_scene(folder, setup)
         with way_on(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length)
 
@@ -151,7 +165,8 @@ def _held(folder: Path) -> Iterator[None]:
                 "into it",
                 folder,
             )
-        clear_leftovers(folder)
+        for place in (folder, *folder.glob(f"{RENDERS}/*")):
+            clear_leftovers(place)
         yield
 
 
@@ -175,10 +190,16 @@ def _train(setup: Setup, state: TrainState, session: Session, length: Length) ->
     return 0 if stopper.signal is None else exit_code(stopper.signal)
 
 
-def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
+def _resume(folder: Path, take: Callable[[], tuple[Setup, TrainState]]) -> int:
+    """Continues a run.
+
+    Args:
+        folder: The run's folder.
+        take: Answers what it is made of and the state that it goes on from.
+    """
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
     with way_on(resume_line(folder)), _held(folder):
-        setup, state = continued(folder, settings, verbosity)
+        setup, state = take()
         if state.step >= setup.schedule.total and _is_described(folder, state.step):
             raise UserError(
                 "the run is finished",
@@ -188,8 +209,13 @@ def _resume(folder: Path, settings: Mapping[str, Any], verbosity: int) -> int:
             )
         if state.step < setup.schedule.total:
             state.clock.compile += warm_up(setup, state)
+        _write_scene(folder, setup)
         session = Session.resumed(folder, setup, state.step)
         return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+
+
+def _write_scene(folder: Path, setup: Setup) -> None:
+    write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
 
 
 def _is_described(folder: Path, step: int) -> bool:

@@ -1,20 +1,25 @@
 """From settings, or from a run's folder, to a run that can go on."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
 from pydantic import ValidationError
 
-from crossgrad_core.checkpoint import Checkpoint, load_latest
+from crossgrad_core.checkpoint import load_latest
 from crossgrad_core.checkpoint_folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.results.config_file import FILE as CONFIG
 from crossgrad_core.results.config_file import read_config
 from crossgrad_core.results.lock import writer_of
+from crossgrad_core.results.scene_file import check_scene
+from crossgrad_core.resumable import CHANGEABLE
+from crossgrad_core.scene.differences import Weight
+from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
 from crossgrad_core.threads import configure_threads
 from crossgrad_core.training.assemble import assemble, check_names, read_scene
 from crossgrad_core.training.budget import caught_up
@@ -25,8 +30,6 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.validation import as_user_error
 from crossgrad_core.wording import listed
 
-#: Settings of a run that may change when it goes on.
-CHANGEABLE = frozenset({"device", "threads", "stop_after"})
 #: What a run says that has to begin again.
 BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
 
@@ -45,12 +48,15 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
         ) from error
 
 
-def set_up(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
+def set_up(
+    config: RunConfig, verbosity: int, check: Callable[[Fingerprint], tuple[str, ...]] | None = None
+) -> tuple[Setup, float]:
     """The assembled run and the seconds that reading the scene took.
 
     Args:
         config: The configuration, with a scene.
         verbosity: -1 quiet, 0 normal, 1 verbose.
+        check: Refuses a scene that is not the run's; answers with notes on one that it takes.
 
     Raises:
         UserError: The scene cannot be read, or the components cannot work together.
@@ -59,6 +65,8 @@ def set_up(config: RunConfig, verbosity: int) -> tuple[Setup, float]:
     configure_threads(config.threads)
     start = perf_counter()
     scene, reader = read_scene(config, cast("Path", config.scene))
+    notes = () if check is None else check(fingerprint_of(scene, cast("Path", config.scene)))
+    scene = replace(scene, notes=(*notes, *scene.notes))
     seconds = perf_counter() - start
     level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
     if not any(choice.name == "progress" for choice in config.observers):
@@ -87,24 +95,35 @@ def require_checkpoint(folder: Path) -> None:
 
 
 def opened(
-    folder: Path, settings: Mapping[str, Any], verbosity: int = 0
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int = 0,
+    *,
+    accept_scene: bool = False,
 ) -> tuple[Setup, TrainState]:
-    """A run's setup and its newest state; the run may be training meanwhile.
+    """A run's setup and its newest state, to look at; the run may be training meanwhile.
 
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
         verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, or a setting would change the training.
+        UserError: It is no run, it has no checkpoint, a setting would change the training, or the
+            scene is another one.
     """
     require_checkpoint(folder)
-    return _from(load_latest(folder), folder, settings, verbosity)
+    check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
+    return _from(folder, settings, verbosity, check)
 
 
 def continued(
-    folder: Path, settings: Mapping[str, Any], verbosity: int
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int,
+    *,
+    accept_scene: bool = False,
 ) -> tuple[Setup, TrainState]:
     """A run's setup and the state that it goes on from.
 
@@ -114,12 +133,14 @@ def continued(
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
         verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Take a scene of which photos, masks or points have changed.
 
     Raises:
-        UserError: It is no run, or a setting would change the training.
+        UserError: It is no run, a setting would change the training, or the scene is another one.
     """
+    check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
     if _has_checkpoint(folder):
-        return _from(load_latest(folder), folder, settings, verbosity)
+        return _from(folder, settings, verbosity, check)
     setup, seconds = set_up(_config(folder, settings), verbosity)
     state = first_state(setup)
     state.clock.load = seconds
@@ -127,10 +148,14 @@ def continued(
 
 
 def _from(
-    checkpoint: Checkpoint, folder: Path, settings: Mapping[str, Any], verbosity: int
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int,
+    check: Callable[[Fingerprint], tuple[str, ...]],
 ) -> tuple[Setup, TrainState]:
+    checkpoint = load_latest(folder)
     # Read after the checkpoint: a run that follows the clock only adds to its configuration.
-    setup, seconds = set_up(_config(folder, settings), verbosity)
+    setup, seconds = set_up(_config(folder, settings), verbosity, check)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
     return caught_up(setup, state.step), state

@@ -28,6 +28,15 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
             rich_help_panel=_MODEL,
         ),
     ] = None,
+    accept_scene: Annotated[
+        bool,
+        typer.Option(
+            "--accept-scene",
+            help="With --run: take the scene although photos, masks, points or held-out views have "
+            "changed.",
+            rich_help_panel=_MODEL,
+        ),
+    ] = False,
     seconds: Annotated[
         float,
         typer.Option(
@@ -127,4 +136,4 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         "reading": None if max_size is None else {"max_size": max_size},
     }
     settings = {name: value for name, value in given.items() if value is not None}
-    raise typer.Exit(app.diagnose(scene, run, settings, options, out))
+    raise typer.Exit(app.diagnose(scene, run, settings, options, out, accept_scene))

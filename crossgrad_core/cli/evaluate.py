@@ -19,9 +19,17 @@ def evaluate(
     threads: Annotated[
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
+    accept_scene: Annotated[
+        bool,
+        typer.Option(
+            "--accept-scene",
+            help="Take the scene although photos, masks, points or held-out views have changed.",
+        ),
+    ] = False,
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()
     from crossgrad_core import afterwards
 
-    afterwards.evaluate(run, device=device, threads=threads)
+    how = afterwards.How(device, threads, accept_scene)
+    afterwards.evaluate(run, how)

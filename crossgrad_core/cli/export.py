@@ -15,7 +15,7 @@ class Format(StrEnum):
     PLY = "ply"
 
 
-def export(
+def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
     ],
@@ -41,16 +41,17 @@ def export(
     threads: Annotated[
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
+    accept_scene: Annotated[
+        bool,
+        typer.Option(
+            "--accept-scene",
+            help="Take the scene although photos, masks, points or held-out views have changed.",
+        ),
+    ] = False,
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()
     from crossgrad_core import afterwards
 
-    afterwards.export(
-        run,
-        file_format=file_format.value,
-        out=out,
-        camera=camera,
-        device=device,
-        threads=threads,
-    )
+    how = afterwards.How(device, threads, accept_scene)
+    afterwards.export(run, file_format=file_format.value, out=out, camera=camera, how=how)

@@ -33,9 +33,17 @@ def render(
     threads: Annotated[
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
+    accept_scene: Annotated[
+        bool,
+        typer.Option(
+            "--accept-scene",
+            help="Take the scene although photos, masks, points or held-out views have changed.",
+        ),
+    ] = False,
 ) -> None:
     """Draw the views of a run as PNG files."""
     announce()
     from crossgrad_core import afterwards
 
-    afterwards.render(run, split=split.value, out=out, device=device, threads=threads)
+    how = afterwards.How(device, threads, accept_scene)
+    afterwards.render(run, split=split.value, out=out, how=how)

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Final
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.resumable import CHANGEABLE
 from crossgrad_core.wording import listed
 
-#: Settings of a run that may change when it goes on.
-CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
-#: ... and what only this start of the command is asked.
-_OF_THE_COMMAND: Final = frozenset({"resume", "quiet", "verbose"})
+#: What only this start of the command is asked.
+_OF_THE_COMMAND: Final = frozenset({"resume", "accept_scene", "quiet", "verbose"})
 
 
 def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
@@ -28,7 +27,7 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
         raise UserError(
             "a resumed run keeps its settings and its scene",
             where=listed(typed),
-            expected="nothing but --device, --threads, --stop-after beside --resume",
+            expected="--device, --threads, --stop-after and --accept-scene, and nothing else",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )

@@ -248,6 +248,14 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
             rich_help_panel=_RESULTS,
         ),
     ] = None,
+    accept_scene: Annotated[
+        bool,
+        typer.Option(
+            "--accept-scene",
+            help="With --resume: go on although photos, masks or points of the scene have changed.",
+            rich_help_panel=_RESULTS,
+        ),
+    ] = False,
     eval_every: Annotated[
         int | None,
         typer.Option(
@@ -304,11 +312,26 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         refuse_beside_resume(resume, given)
     from crossgrad_core.cli.settings import merged
 
-    for name in ("config", "assignments", "resume", "dry_run", "quiet", "verbose"):
+    of_the_command = (
+        "config",
+        "assignments",
+        "resume",
+        "accept_scene",
+        "dry_run",
+        "quiet",
+        "verbose",
+    )
+    for name in of_the_command:
         del given[name]
     settings = merged(config, given, assignments or [])
 
     from crossgrad_core import app
 
-    code = app.run(settings, resume=resume, dry_run=dry_run, verbosity=int(verbose) - int(quiet))
+    code = app.run(
+        settings,
+        resume=resume,
+        dry_run=dry_run,
+        verbosity=int(verbose) - int(quiet),
+        accept_scene=accept_scene,
+    )
     raise typer.Exit(code)

@@ -21,6 +21,7 @@ def diagnose(
     settings: Mapping[str, object],
     options: Options,
     out: Path | None,
+    accept_scene: bool = False,
 ) -> int:
     """Diagnoses a scene or a run; prints the report and writes it to a folder.
 
@@ -31,6 +32,7 @@ def diagnose(
             a run only `device` and `threads` can be set.
         options: How to probe.
         out: Where the report goes.
+        accept_scene: Of a run, take its scene although parts of it have changed.
 
     Returns:
         The exit code: 0, or 1 where training failed; the probes before that are reported.
@@ -50,7 +52,7 @@ def diagnose(
         check_file(options.signature)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     if run is not None:
-        setup, state = opened(run, settings, -1)
+        setup, state = opened(run, settings, -1, accept_scene=accept_scene)
         report = diagnose_run(setup, state, run, options)
         folder = out or run / "diagnose" / stamp
     else:

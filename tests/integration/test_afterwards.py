@@ -128,16 +128,14 @@ def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path,
     stored = {**yaml.safe_load(path.read_text()), "device": "cuda", "rasterizer": {"name": "torch"}}
     path.write_text(yaml.safe_dump(stored))
     looks = (
-        lambda **options: export(finished, out=tmp_path / "a.ply", **options),
-        lambda **options: afterwards.evaluate(finished, **options),
-        lambda **options: afterwards.render(
-            finished, split="test", out=tmp_path / "renders", **options
-        ),
+        lambda how: export(finished, out=tmp_path / "a.ply", how=how),
+        lambda how: afterwards.evaluate(finished, how),
+        lambda how: afterwards.render(finished, split="test", out=tmp_path / "renders", how=how),
     )
     for look in looks:
         with pytest.raises(UserError, match=r"config.yaml, device: cuda(.|\n)*--device cpu"):
-            look()
-        look(device="cpu", threads=1)
+            look(afterwards.How())
+        look(afterwards.How(device="cpu", threads=1))
     assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
 

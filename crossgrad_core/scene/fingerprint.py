@@ -1,0 +1,156 @@
+"""What a scene is known by: frame, cameras, split, points, and the ends of its photos' files."""
+
+from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.photos import FilePhoto
+from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
+from crossgrad_core.scene.types import Camera, Scene, View
+
+#: Version of the layout; raised whenever an older reader could misread a newer fingerprint.
+FORMAT: Final = 1
+#: Bytes of a file that are read at its start and at its end.
+END = 64 * 2**10
+#: Decimals of pixels and local units that are written down: far more than tell cameras apart.
+DECIMALS = 6
+
+
+class _Mark(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FileMark(_Mark):
+    """A file: its size, and the SHA-256 of its first and last 64 KiB."""
+
+    bytes: int
+    sha256: str
+
+
+class ViewMark(_Mark):
+    """A view.
+
+    Attributes:
+        trained: Whether it is trained on; else it is held out.
+        camera: Width, height, fx, fy, cx, cy in pixels, then centre, right and forward axis in the
+            local frame.
+        photo: Its file; None where it comes from none.
+        mask: Its mask's file; None where it has none.
+    """
+
+    trained: bool
+    camera: tuple[float, ...]
+    photo: FileMark | None
+    mask: FileMark | None
+
+
+class FrameMark(_Mark):
+    """The local frame: its origin in input units, and local units per input unit."""
+
+    offset: tuple[float, float, float]
+    scale: float
+
+
+class PointsMark(_Mark):
+    """The SfM points: their number, and mean and spread of position (local units) and colour."""
+
+    count: int
+    moments: tuple[float, ...]
+
+
+class Fingerprint(_Mark):
+    """A scene.
+
+    Attributes:
+        format: Version of the layout.
+        frame: The local frame.
+        points: The SfM points.
+        lists: Name -> digest of the lists that split the views, where there are any.
+        views: Name -> view.
+    """
+
+    format: Literal[1] = FORMAT
+    frame: FrameMark
+    points: PointsMark
+    lists: dict[str, str]
+    views: dict[str, ViewMark]
+
+
+def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
+    """What a scene is known by; reads at most 128 KiB of each photo and mask.
+
+    Args:
+        scene: The scene.
+        root: Its folder, for the lists of the split.
+
+    Raises:
+        UserError: A photo or mask cannot be read.
+    """
+    trained = frozenset(scene.train)
+    with ThreadPoolExecutor() as pool:
+        files = list(pool.map(_files_of, scene.views))
+    lists = {name: root / name for name in (TRAIN_LIST, TEST_LIST) if (root / name).is_file()}
+    x, y, z = (float(value) for value in scene.similarity.offset)
+    return Fingerprint(
+        frame=FrameMark(offset=(x, y, z), scale=scene.similarity.scale),
+        points=_points_of(scene),
+        lists={name: mark_of(path).sha256 for name, path in lists.items()},
+        views={
+            view.name: ViewMark(
+                trained=index in trained, camera=_numbers_of(view.camera), photo=photo, mask=mask
+            )
+            for index, (view, (photo, mask)) in enumerate(zip(scene.views, files, strict=True))
+        },
+    )
+
+
+def mark_of(path: Path) -> FileMark:
+    """What a file is known by.
+
+    Raises:
+        UserError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            digest = sha256(file.read(END))
+            size = file.seek(0, 2)
+            file.seek(max(END, size - END))
+            digest.update(file.read(END))
+    except OSError as error:
+        raise UserError(
+            "a file of the scene cannot be read",
+            where=path,
+            found=error.strerror or str(error),
+            todo="put it back, or make it readable",
+        ) from error
+    return FileMark(bytes=size, sha256=digest.hexdigest())
+
+
+def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:
+    photo = view.photo
+    if not isinstance(photo, FilePhoto):  # A third party's photos may come from anywhere.
+        return None, None
+    mask = photo.source.mask
+    return mark_of(photo.source.path), None if mask is None else mark_of(mask)
+
+
+def _numbers_of(camera: Camera) -> tuple[float, ...]:
+    pose = camera.world_to_camera
+    numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    numbers += [*camera.center.tolist(), *pose[0, :3].tolist(), *pose[2, :3].tolist()]
+    return tuple(round(float(number), DECIMALS) for number in numbers)
+
+
+def _points_of(scene: Scene) -> PointsMark:
+    if not len(scene.points):
+        return PointsMark(count=0, moments=())
+    values = np.column_stack([scene.points, scene.point_colors / 255.0])
+    moments = (*values.mean(axis=0), *values.std(axis=0))
+    return PointsMark(
+        count=len(values), moments=tuple(round(float(number), DECIMALS) for number in moments)
+    )

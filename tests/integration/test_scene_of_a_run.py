@@ -1,0 +1,148 @@
+"""A run knows its scene: another one is refused with the difference, and taken where it may be."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from crossgrad_core import afterwards, app
+from crossgrad_core.afterwards import How
+from crossgrad_core.diagnostics import app as diagnostics
+from crossgrad_core.diagnostics.command import Options
+from crossgrad_core.errors import UserError
+from crossgrad_core.results.scene_file import FILE
+from crossgrad_core.testing.scenes import write_tiny_scene
+
+NAMES = [f"{index:04}.png" for index in range(6)]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """A stopped run and, beside it, its scene; the first two photos are held out."""
+    root = tmp_path_factory.mktemp("original")
+    scene = write_tiny_scene(root / "scene", views=6)
+    (scene / "test_list.txt").write_text("\n".join(NAMES[:2]))
+    settings = {"scene": str(scene), "out": str(root / "run"), "steps": 4, "stop_after": 2}
+    assert app.run(settings, verbosity=-1) == 0
+    return root
+
+
+@pytest.fixture
+def root(original, tmp_path):
+    """A copy, at the place of its own that its config.yaml names."""
+    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace(str(original), str(tmp_path)))
+    return tmp_path
+
+
+def resume(root, **options):
+    return app.run({}, resume=root / "run", verbosity=-1, **options)
+
+
+def looks(root):
+    """Every command that looks at a run, as a function of how it opens the run."""
+    run = root / "run"
+    return {
+        "eval": lambda how: afterwards.evaluate(run, how),
+        "render": lambda how: afterwards.render(run, split="all", out=root / "out", how=how),
+        "export": lambda how: afterwards.export(
+            run, file_format="ply", out=root / "a.ply", how=how
+        ),
+        "diagnose": lambda how: diagnostics.diagnose(
+            None, run, {}, Options(per_group=2), root / "probes", how.accept_scene
+        ),
+    }
+
+
+def mirrored(path: Path) -> None:
+    with Image.open(path) as image:
+        image.transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(path)
+
+
+def spoilt(scene: Path, how: str) -> str:
+    """Changes the scene; answers words that the refusal must have."""
+    if how == "a photo":
+        mirrored(scene / "images" / NAMES[3])
+        return rf"photos changed: 1 \({NAMES[3]}\)"
+    if how == "held out":
+        (scene / "images" / NAMES[1]).unlink()
+        return rf"held-out photos missing: 1 \({NAMES[1]}\)"
+    if how == "trained":
+        (scene / "images" / NAMES[2]).unlink()
+        (scene / "images" / NAMES[3]).unlink()
+        return rf"training photos missing: 2 \({NAMES[2]}, {NAMES[3]}\)"
+    if how == "split":
+        (scene / "test_list.txt").write_text(NAMES[2])
+        return r"photos held out that were trained on: 1(.|\n)*test_list.txt changed"
+    shutil.rmtree(scene)
+    write_tiny_scene(scene, views=6, scale=3.0, seed=5)
+    (scene / "test_list.txt").write_text("\n".join(NAMES[:2]))
+    return "another local frame: its unit is"
+
+
+@pytest.mark.parametrize("change", ["a photo", "held out", "trained", "split", "another scene"])
+def test_another_scene_is_refused_with_the_difference(root, change):
+    words = spoilt(root / "scene", change)
+    before = {path: path.read_bytes() for path in (root / "run").rglob("*.*") if path.is_file()}
+    for look in (lambda _: resume(root), *looks(root).values()):
+        with pytest.raises(UserError, match=words) as told:
+            look(How())
+        assert "put it back as it was" in str(told.value)
+    now = {path: path.read_bytes() for path in (root / "run").rglob("*.*") if path.is_file()}
+    assert now == before
+
+
+@pytest.mark.parametrize("change", ["trained", "split", "another scene"])
+def test_where_parameters_would_be_misplaced_nothing_helps(root, change):
+    words = spoilt(root / "scene", change)
+    for look in (lambda how: resume(root, accept_scene=True), *looks(root).values()):
+        with pytest.raises(UserError, match=rf"{words}(.|\n)*start a new run"):
+            look(How(accept_scene=True))
+
+
+@pytest.mark.parametrize("change", ["a photo", "held out"])
+def test_what_only_looks_takes_it_where_the_user_says_so(root, change, capsys):
+    spoilt(root / "scene", change)
+    for name, look in looks(root).items():
+        if name != "diagnose":  # It needs more views than these.
+            look(How(accept_scene=True))
+    assert capsys.readouterr().out.count("overall") >= 1
+    views = 1 if change == "held out" else 2
+    assert len((root / "run" / "per_view.csv").read_text().splitlines()) == 1 + views
+
+
+def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):
+    words = spoilt(root / "scene", "a photo")
+    with pytest.raises(UserError, match=rf"{words}(.|\n)*--accept-scene"):
+        resume(root)
+    assert resume(root, accept_scene=True) == 0
+    notes = json.loads((root / "run" / "summary.json").read_text())["notes"]
+    assert any("accepted: photos changed: 1" in note for note in notes)
+    assert "accepted: photos changed: 1" in (root / "run" / "log.txt").read_text()
+    # From then on that is its scene.
+    afterwards.evaluate(root / "run")
+
+
+def test_a_run_goes_on_only_with_its_own_held_out_views(root):
+    words = spoilt(root / "scene", "held out")
+    with pytest.raises(UserError, match=rf"{words}(.|\n)*eval, render and export take it"):
+        resume(root, accept_scene=True)
+
+
+def test_a_run_of_an_older_version_goes_on_and_knows_its_scene_from_then_on(root, caplog):
+    (root / "run" / FILE).unlink()
+    afterwards.evaluate(root / "run")
+    assert caplog.text.count("the run is of an older version") == 1
+    assert not (root / "run" / FILE).exists()
+    assert resume(root) == 0
+    spoilt(root / "scene", "trained")
+    with pytest.raises(UserError, match="training photos missing"):
+        afterwards.evaluate(root / "run")
+
+
+def test_a_new_run_has_nothing_to_accept(root):
+    with pytest.raises(UserError, match="--accept-scene"):
+        app.run({"scene": str(root / "scene"), "steps": 2}, accept_scene=True)

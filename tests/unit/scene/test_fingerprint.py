@@ -1,0 +1,226 @@
+"""A scene is known again, and how it has changed is said in words and weighed."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.results.scene_file import FILE, check_scene, read_scene_file, write_scene
+from crossgrad_core.scene.differences import Weight, differences
+from crossgrad_core.scene.fingerprint import END, FileMark, fingerprint_of, mark_of
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.training.assemble import read_scene
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    write_tiny_scene(folder, views=10)
+    (folder / "masks").mkdir()
+    Image.new("L", (48, 32), 255).save(folder / "masks" / "0003.png")
+    return folder
+
+
+@pytest.fixture
+def scene(pristine, tmp_path):
+    return Path(shutil.copytree(pristine, tmp_path / "scene"))
+
+
+def taken(folder: Path, **reading: object):
+    config = RunConfig.model_validate({"reading": reading})
+    return fingerprint_of(read_scene(config, folder)[0], folder)
+
+
+def told(folder: Path, was) -> list[tuple[Weight, str]]:
+    return [(each.weight, each.text) for each in differences(was, taken(folder))]
+
+
+def test_the_same_scene_in_another_place_and_touched_is_the_same(pristine, scene):
+    for path in scene.rglob("*.*"):
+        path.touch()
+    assert told(scene, taken(pristine)) == []
+
+
+def test_a_missing_photo_shifts_the_split(scene):
+    """Held out is each eighth photo by name: 0000 and 0008, then 0000 and 0009."""
+    was = taken(scene)
+    (scene / "images" / "0002.png").unlink()
+    found = told(scene, was)
+    assert {weight for weight, _ in found} == {Weight.PLACE}
+    assert [text for _, text in found] == [
+        "training photos missing: 1 (0002.png)",
+        "photos held out that were trained on: 1 (0009.png)",
+        "photos trained on that were held out: 1 (0008.png)",
+    ]
+
+
+def test_a_missing_held_out_photo_where_lists_split(scene):
+    names = [f"{index:04}.png" for index in range(10)]
+    (scene / "train_list.txt").write_text("\n".join(names[2:]))
+    (scene / "test_list.txt").write_text("\n".join(names[:2]))
+    was = taken(scene)
+    (scene / "images" / "0001.png").unlink()
+    assert told(scene, was) == [(Weight.HELD_OUT, "held-out photos missing: 1 (0001.png)")]
+    (scene / "test_list.txt").write_text(names[0])
+    assert told(scene, was)[1] == (Weight.HELD_OUT, "test_list.txt changed")
+
+
+def test_a_list_that_says_the_same_in_other_words_is_no_difference(scene):
+    (scene / "test_list.txt").write_text("0001.png\n0004.png\n")
+    was = taken(scene)
+    (scene / "test_list.txt").write_text("# held out\n0004.png\n0001.png\n")
+    assert told(scene, was) == []
+
+
+def test_changed_photos(scene):
+    was = taken(scene)
+    for index in range(5):
+        path = scene / "images" / f"{index:04}.png"
+        with Image.open(path) as image:
+            image.transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(path)
+    text = "photos changed: 5 (0000.png, 0001.png, 0002.png and 2 more)"
+    assert told(scene, was) == [(Weight.CONTENT, text)]
+
+
+@pytest.mark.parametrize("change", ["changed", "new", "missing"])
+def test_masks(scene, change):
+    was = taken(scene)
+    if change == "missing":
+        shutil.rmtree(scene / "masks")
+    else:
+        name = "0003.png" if change == "changed" else "0004.png"
+        Image.new("L", (48, 32), 254).save(scene / "masks" / name)
+    name = "0004.png" if change == "new" else "0003.png"
+    text = f"masks changed, new or missing: 1 ({name})"
+    assert told(scene, was) == [(Weight.CONTENT, text)]
+
+
+@pytest.mark.parametrize(
+    ("other", "text"),
+    [
+        ({"scale": 2.0}, "its unit is 5.46405 input units instead of 2.73202"),
+        ({"offset": (1.0, 0.0, 0.0)}, "its origin moved by 1"),
+        ({"width": 24, "height": 16}, "photos of another size, camera or pose: 10 (0000.png"),
+        ({"points": 150}, "other SfM points (150; there were 200)"),
+    ],
+)
+def test_another_reconstruction(pristine, tmp_path, other, text):
+    write_tiny_scene(tmp_path / "other", **{"views": 10, **other})
+    shutil.copytree(pristine / "masks", tmp_path / "other" / "masks")
+    found = told(tmp_path / "other", taken(pristine))
+    assert text in " ".join(text for _, text in found)
+    heavy = Weight.CONTENT if "points" in other else Weight.PLACE
+    assert max(weight for weight, _ in found) is heavy
+
+
+def test_another_scene_in_its_place(pristine, tmp_path):
+    write_tiny_scene(tmp_path / "other", views=10, seed=1)
+    found = told(tmp_path / "other", taken(pristine))
+    assert [text.partition(":")[0] for _, text in found] == [
+        "other SfM points (200; there were 200)", "photos changed", "masks changed, new or missing",
+    ]  # fmt: skip
+
+
+def test_what_another_machine_rounds_otherwise_is_no_difference():
+    scene = sample_scene()
+    was = fingerprint_of(scene, Path())
+    jitter = np.random.default_rng(0).uniform(-1e-9, 1e-9, scene.points.shape)
+    similarity = replace(
+        scene.similarity,
+        offset=scene.similarity.offset + 1e-9,
+        scale=scene.similarity.scale * (1 + 1e-12),
+    )
+    now = fingerprint_of(
+        replace(scene, points=scene.points + jitter, similarity=similarity), Path()
+    )
+    assert differences(was, now) == []
+
+
+def test_photos_that_come_from_no_file_are_known_by_their_cameras():
+    found = fingerprint_of(sample_scene(), Path())
+    assert all(view.photo is None for view in found.views.values())
+    assert sum(view.trained for view in found.views.values()) == len(sample_scene().train)
+
+
+@pytest.mark.parametrize("size", [0, 1, END - 1, END, END + 1, 2 * END, 5 * END])
+def test_both_ends_of_a_file_count(tmp_path, size):
+    path = tmp_path / "photo"
+    content = bytearray(size)
+    path.write_bytes(content)
+    marks = [mark_of(path)]
+    assert marks[0].bytes == size
+    for place in sorted({0, size - 1, min(END, size) - 1, max(0, size - END)} & set(range(size))):
+        path.write_bytes(content[:place] + b"x" + content[place + 1 :])
+        marks.append(mark_of(path))
+    path.write_bytes(content + b"\0")
+    marks.append(mark_of(path))
+    assert len({mark.sha256 + str(mark.bytes) for mark in marks}) == len(marks)
+
+
+def test_a_photo_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(UserError, match="cannot be read") as error:
+        mark_of(tmp_path / "gone.png")
+    assert "gone.png" in str(error.value)
+
+
+def test_the_file_is_read_back_and_small(pristine, tmp_path):
+    was = taken(pristine)
+    write_scene(tmp_path, was)
+    assert read_scene_file(tmp_path) == was
+    lines = (tmp_path / FILE).read_text().splitlines()
+    assert sum(".png" in line for line in lines) == 10
+    assert max(map(len, lines)) < 400
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{", '{"format": 2}', "\udc80"])
+def test_a_run_without_a_readable_fingerprint_goes_on_with_a_note(tmp_path, caplog, content):
+    if content is not None:
+        (tmp_path / FILE).write_text(content, errors="surrogateescape")
+    now = fingerprint_of(sample_scene(), Path())
+    assert check_scene(tmp_path, now, Weight.CONTENT, accept=False) == ()
+    assert "cannot be told" in caplog.text and str(tmp_path) in caplog.text
+
+
+VIEW = next(iter(fingerprint_of(sample_scene(), Path()).views.values()))
+STATES = st.sampled_from(["absent", "trained", "held out", "trained, changed", "moved"])
+
+
+def made(states: dict[str, str]):
+    base = fingerprint_of(sample_scene(), Path())
+    views = {
+        name: VIEW.model_copy(
+            update={
+                "trained": "trained" in state or state == "moved",
+                "photo": FileMark(bytes=1, sha256="b" if "changed" in state else "a"),
+                "camera": tuple(x + (state == "moved") for x in VIEW.camera),
+            }
+        )
+        for name, state in states.items()
+        if state != "absent"
+    }
+    return base.model_copy(update={"views": views})
+
+
+@given(st.dictionaries(st.sampled_from("abcdef"), st.tuples(STATES, STATES)))
+def test_the_heaviest_difference_decides(changes):
+    was = made({name: before for name, (before, _) in changes.items()})
+    now = made({name: after for name, (_, after) in changes.items()})
+    found = differences(was, now)
+    trained = [{name for name, v in of.views.items() if v.trained} for of in (was, now)]
+    moved = [pair for pair in changes.values() if "moved" in pair and len({*pair, "absent"}) == 3]
+    if trained[0] != trained[1] or moved:
+        expected = Weight.PLACE
+    elif was.views.keys() != now.views.keys():
+        expected = Weight.HELD_OUT
+    else:
+        expected = Weight.CONTENT if was != now else None
+    assert max((each.weight for each in found), default=None) == expected
+    assert len({each.text for each in found}) == len(found)
