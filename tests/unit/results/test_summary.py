@@ -115,7 +115,8 @@ def test_missing_and_damaged_summaries_are_explained(
 
 def test_environment_names_machine_and_versions():
     found = environment()
-    assert found["packages"]["torch"] == torch.__version__
+    # Some builds name theirs only in torch itself: 2.3.0+cu121.
+    assert torch.__version__.startswith(found["packages"]["torch"])
     assert found["packages"]["numpy"] == np.__version__
     assert found["packages"]["numba"] == numba.__version__
     assert found["cpu"]

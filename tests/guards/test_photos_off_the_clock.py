@@ -1,0 +1,23 @@
+"""Plugins of a step ask their context for photos, so that decoding counts as loading."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+#: What decodes on whatever clock is running.
+DECODES = re.compile(r"\.photo\.(image|mask)\(")
+SHELVES = ("backbones", "operators", "plugins")
+
+
+@pytest.mark.parametrize("shelf", SHELVES)
+def test_no_plugin_decodes_photos_itself(shelf):
+    sources = sorted((ROOT / shelf).rglob("*.py"))
+    assert sources
+    assert not [path.name for path in sources if DECODES.search(path.read_text(encoding="utf-8"))]
+
+
+def test_the_pattern_finds_what_decodes():
+    source = ROOT / "crossgrad_core" / "training" / "views.py"
+    assert DECODES.search(source.read_text(encoding="utf-8"))
