@@ -11,8 +11,8 @@ from crossgrad_core.interrupts import end_at_once, listened_to, tell
 
 #: What the user is told at the first and at the second signal; the third one ends the process.
 _WORDS = (
-    "stopping after this step; what is there is saved and evaluated (once more: only saved)",
-    "stopping now; what is there is saved (once more: ends at once)",
+    "stopping: what there is gets saved and evaluated first (once more: only saved)",
+    "stopping: what there is gets saved first (once more: ends at once)",
 )
 
 
