@@ -8,6 +8,7 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
@@ -31,6 +32,7 @@ from crossgrad_core.results.scene_file import write_scene
 from crossgrad_core.results.summary import read_summary
 from crossgrad_core.results.table import final_table
 from crossgrad_core.scene.fingerprint import fingerprint_of
+from crossgrad_core.scene.photo_check import check_photos, fits
 from crossgrad_core.training.assemble import (
     DEFAULT_STEPS,
     growth_note,
@@ -90,6 +92,7 @@ def run(
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
     setup, load_seconds = set_up(config, verbosity)
+    load_seconds += _held_out_decoded(setup)
     if dry_run:
         _print_dry_run(setup)
         return 0
@@ -208,10 +211,19 @@ def _resume(folder: Path, take: Callable[[], tuple[Setup, TrainState]]) -> int:
                 todo="start a new run; --init point_cloud.ply starts from its Gaussians",
             )
         if state.step < setup.schedule.total:
+            state.clock.load += _held_out_decoded(setup)
             state.clock.compile += warm_up(setup, state)
         _write_scene(folder, setup)
         session = Session.resumed(folder, setup, state.step)
         return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+
+
+def _held_out_decoded(setup: Setup) -> float:
+    """Finds held-out photos that cannot be decoded before training; answers the seconds."""
+    start = perf_counter()
+    keep = fits(setup.scene, setup.config.reading.cache_mib)
+    check_photos(setup.scene.test_views, keep=keep)
+    return perf_counter() - start
 
 
 def _write_scene(folder: Path, setup: Setup) -> None:

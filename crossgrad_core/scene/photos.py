@@ -17,6 +17,8 @@ from crossgrad_core.scene.types import Photo
 
 _Decoded = tuple[Tensor, Tensor | None]
 
+#: The smallest size that JPEG files can be decoded at: all of their data is read for it.
+SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 # More than the views of one step, so that none is decoded twice in it.
 _LATEST = 16
@@ -87,6 +89,16 @@ class PhotoSource:
         if keep is None or keep.min() == _OPAQUE:
             return image, None
         return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
+
+    def try_out(self) -> None:
+        """Finds out whether the files can be decoded, for less than `decode` takes.
+
+        Raises:
+            UserError: The photo or its mask is damaged.
+        """
+        decode_photo(self.path, SMALLEST)
+        if self.mask is not None:
+            decode_mask(self.mask)
 
     def _check_size(self, rgb: Pixels) -> None:
         height, width = rgb.shape[:2]

@@ -12,6 +12,7 @@ from crossgrad_core.results.config_file import write_config
 from crossgrad_core.results.log import FILE as LOG
 from crossgrad_core.results.log import RunLog
 from crossgrad_core.results.summary import Status
+from crossgrad_core.scene.photo_check import checked_meanwhile, fits
 from crossgrad_core.training.budget import Length
 from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.reason import is_unexpected, reason_of, steps_of, traceback_of
@@ -74,8 +75,13 @@ class Course:
         return self.ending
 
     def _train(self, length: Length) -> None:
-        with self.stopper.interruptible():
-            self.setup.hook.crossgrad_run_start(run=self._info())
+        setup = self.setup
+        keep = fits(setup.scene, setup.config.reading.cache_mib)
+        with (
+            self.stopper.interruptible(),
+            checked_meanwhile(setup.train_views, self.stopper.fail, keep=keep),
+        ):
+            setup.hook.crossgrad_run_start(run=self._info())
             self._catch_up()
             while True:
                 ended = train(self.setup, self.state, self.session, self.stopper, length.due)

@@ -60,7 +60,7 @@ def train(
     check_start(state)
     keeper = Keeper(state)
     try:
-        return _steps(setup, state, sink, stopper, pauses, keeper)
+        status = _steps(setup, state, sink, stopper, pauses, keeper)
     except TrainingFailedError:
         if not are_parameters_finite(state):
             keeper.restore(state)
@@ -69,6 +69,9 @@ def train(
         error.add_note(f"in step {state.step}")
         keeper.restore(state)
         raise
+    if stopper.error is not None:
+        raise stopper.error
+    return status
 
 
 def _steps(
@@ -102,8 +105,6 @@ def _steps(
             return "paused"
     # A signal may have come after the last look.
     _is_good(setup, state, sink, keeper)
-    if stopper.error is not None:
-        raise stopper.error
     return "finished" if state.step >= total else "stopped"
 
 

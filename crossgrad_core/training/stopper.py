@@ -38,6 +38,10 @@ class Stopper:
         """Whether training is to stop after the step under way."""
         return self.signal is not None or self.error is not None
 
+    def fail(self, error: Exception) -> None:
+        """Asks the run to end after its step because of an error found beside it, in any thread."""
+        self.error = error
+
     @contextmanager
     def installed(self) -> Iterator["Stopper"]:
         """Handles signals inside the block; does nothing outside the main thread.

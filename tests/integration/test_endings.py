@@ -4,6 +4,8 @@ import csv
 import json
 import os
 import signal
+import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -278,3 +280,54 @@ def test_a_run_that_was_killed_at_its_very_end_is_completed(scene, whole, tmp_pa
     assert_same(out, whole)
     with pytest.raises(UserError, match="the run is finished"):
         resumed(out)
+
+
+def rotten(path):
+    """Spoils the pixels of a photo; header and end stay, so that reading finds nothing."""
+    content = bytearray(path.read_bytes())
+    start, end = content.index(b"IDAT") + 4, content.rindex(b"IEND") - 8
+    content[start:end] = bytes(end - start)
+    path.write_bytes(content)
+
+
+def test_a_held_out_photo_that_cannot_be_decoded_costs_no_step(tmp_path):
+    scene = write_tiny_scene(tmp_path / "tiny", views=9)
+    rotten(scene / "images" / "0008.png")
+    with pytest.raises(UserError, match=r"cannot be decoded(.|\n)*0008\.png"):
+        run(scene, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+class Waiting:
+    """Holds up the first step until the run was asked to stop."""
+
+    @hookimpl
+    def crossgrad_step_end(self, record):
+        for thread in threading.enumerate():
+            if thread.name == "crossgrad-photos":
+                thread.join(30)
+
+
+def test_a_training_photo_that_cannot_be_decoded_is_found_beside_training(
+    tmp_path, with_plugin, capsys, monkeypatch
+):
+    """It is drawn in no step here: the sampler keeps to the first views."""
+    scene = write_tiny_scene(tmp_path / "tiny", views=9)
+    (scene / "train_list.txt").write_text("\n".join(f"{i:04}.png" for i in range(1, 8)))
+    rotten(scene / "images" / "0007.png")
+    with_plugin["waiting"] = Waiting()
+    with_plugin["first"] = FirstViews()
+    monkeypatch.setattr(app, "warm_up", lambda *args: 0.0)
+    assert run(scene, tmp_path / "run") == 1
+    told = capsys.readouterr().err
+    assert "0007.png" in told and "training failed: the photo cannot be decoded" in told
+    assert load(latest(tmp_path / "run")).step == summary(tmp_path / "run")["step"] == 1
+
+
+class FirstViews:
+    """Draws the first two views in every step."""
+
+    @hookimpl(wrapper=True)
+    def crossgrad_sample_views(self, context):
+        sampled = yield
+        return replace(sampled, draw=replace(sampled.draw, views=(0, 1)))
