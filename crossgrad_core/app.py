@@ -44,6 +44,10 @@ from crossgrad_core.training.ending import Course, last_words, resume_line
 from crossgrad_core.training.forecast import Forecast
 from crossgrad_core.training.resolve import resolved
 from crossgrad_core.training.session import Session, totals
+from crossgrad_core.training.settings_for_nothing import (
+    refuse_labels_for_nothing,
+    refuse_settings_for_nothing,
+)
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
@@ -92,6 +96,8 @@ def run(
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
     setup, load_seconds = set_up(config, verbosity)
+    refuse_labels_for_nothing(setup)
+    refuse_settings_for_nothing(config, setup)
     load_seconds += _held_out_decoded(setup)
     if dry_run:
         _print_dry_run(setup)

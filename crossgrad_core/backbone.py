@@ -24,12 +24,14 @@ class Backbone(Component):
         response: How its Gaussians fill a pixel.
         plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
             PLY loses nothing.
+        own_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
     """
 
     slot: ClassVar[str] = "backbones"
     default_densifier: ClassVar[str] = "adc"
     response: ClassVar[Response] = "plain"
     plain: ClassVar[bool] = False
+    own_dilation: ClassVar[bool] = False
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:

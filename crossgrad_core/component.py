@@ -30,6 +30,22 @@ class Component(BaseModel):
 
     slot: ClassVar[str]
 
+    def idle_options(self, selection: "Selection") -> Mapping[str, str]:
+        """Options that would change nothing in this selection: name -> why, and the way out.
+
+        A new run is refused where the user has set one of them to something else than its default.
+        """
+        return {}
+
+    def set_for_nothing(self, selection: "Selection") -> dict[str, str]:
+        """The idle options that were set to something else than their default."""
+        fields = type(self).model_fields
+        return {
+            name: why
+            for name, why in self.idle_options(selection).items()
+            if name in self.model_fields_set and getattr(self, name) != fields[name].default
+        }
+
 
 @dataclass(frozen=True)
 class ViewCounts:
@@ -72,12 +88,15 @@ class Selection:
         names: The same slots -> name under which the component was chosen.
         views_per_step: K.
         device: Torch device type.
+        labels: Labels that training views have by the grouping; None where it is not known yet, or
+            where there is no grouping.
     """
 
     components: Mapping[str, Component]
     names: Mapping[str, str]
     views_per_step: int
     device: str
+    labels: tuple[str, ...] | None = None
 
     @property
     def backbone(self) -> "Backbone":

@@ -21,11 +21,15 @@ class Densifier(Component):
         needs: Screen statistics beyond the radii and the mean gradient that it needs
             (`pixels`, `abs_gradient`, `directions`); given while `schedule.collects(step)`.
         blocks: Names of the parameter tensors that it needs a backbone to have.
+        edits: Whether it ever edits the set of primitives.
+        resets: Whether it resets opacities when the schedule says so.
     """
 
     slot: ClassVar[str] = "densifiers"
     needs: ClassVar[frozenset[str]] = frozenset()
     blocks: ClassVar[frozenset[str]] = frozenset()
+    edits: ClassVar[bool] = True
+    resets: ClassVar[bool] = True
 
     def window(self, schedule: Schedule) -> Schedule:
         """The schedule with the times at which this method edits; what the user set wins over it.

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from typing_extensions import override
 
 from crossgrad_core.blocks import BlockKind
 from crossgrad_core.component import Component, Selection, ViewCounts
@@ -82,6 +83,20 @@ class Operator(Component):
     def does_nothing(self, views: int) -> bool:
         """Whether the result is the plain sum, whatever the gradients of that many views are."""
         return views == 1 and self.idle_at_one
+
+    def reads_gramians(self) -> bool:
+        """Whether the Gramians make a difference to its weights; else granularity means nothing."""
+        return True
+
+    def reads_labels(self) -> bool:
+        """Whether the labels of the views make a difference to it."""
+        return False
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self.reads_gramians():
+            return {}
+        return {"granularity": "this operator looks at no Gramians; leave it out"}
 
     @abstractmethod
     def transform(

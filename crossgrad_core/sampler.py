@@ -20,6 +20,8 @@ class Sampler(Component):
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no groups.
         own_labels: Labels of its draws where it makes its own groups and ignores the grouping.
+        reads_groups: Whether the groups of the training views make a difference to its draws.
+        groups: How many groups it needs; None for any number.
     """
 
     slot: ClassVar[str] = "samplers"
@@ -27,6 +29,8 @@ class Sampler(Component):
     default_views: ClassVar[int] = 1
     default_grouping: ClassVar[str | None] = None
     own_labels: ClassVar[tuple[str, ...]] = ()
+    reads_groups: ClassVar[bool] = True
+    groups: ClassVar[int | None] = None
 
     @property
     def view_counts(self) -> ViewCounts:
@@ -50,8 +54,18 @@ class Sampler(Component):
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
-        """Refuses numbers of views for which the sampler means nothing."""
-        if self.view_counts.admits(selection.views_per_step):
-            return []
-        name, views = selection.names["sampler"], selection.views_per_step
-        return [f"sampler {name} needs {self.view_counts}; K = {views} was asked for"]
+        """Refuses numbers of views, and of groups, for which the sampler means nothing."""
+        name, views, labels = (
+            selection.names["sampler"],
+            selection.views_per_step,
+            selection.labels,
+        )
+        reasons = []
+        if not self.view_counts.admits(views):
+            reasons.append(f"sampler {name} needs {self.view_counts}; K = {views} was asked for")
+        if self.groups is not None and labels is not None and len(labels) != self.groups:
+            reasons.append(
+                f"sampler {name} draws from {self.groups} groups; grouping "
+                f"{selection.names['grouping']} gives {len(labels)}: {', '.join(labels)}"
+            )
+        return reasons

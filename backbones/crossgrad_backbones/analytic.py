@@ -26,6 +26,7 @@ class AnalyticSplatting(Vanilla):
 
     response: ClassVar[Response] = "analytic"
     plain: ClassVar[bool] = False
+    own_dilation: ClassVar[bool] = True
 
     @override
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:

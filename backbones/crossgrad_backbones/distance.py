@@ -23,6 +23,7 @@ from crossgrad_backbones.distances import (
 )
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.component import Selection
 from crossgrad_core.contexts import RegularizeContext, Regularized
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.hooks import hookimpl
@@ -57,6 +58,14 @@ class DistanceConditioned(Vanilla):
     smoothness_weight: float = Field(
         0.01, ge=0, description="final weight of the squared derivative by the log distance"
     )
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self._conditioned():
+            return super().idle_options(selection)
+        why = "nothing depends on the distance (condition_* = false); leave it out"
+        names = ("lr_share", "l2_weight", "smoothness_weight")
+        return {**super().idle_options(selection), **dict.fromkeys(names, why)}
 
     def _conditioned(self) -> tuple[Conditioned, ...]:
         chosen = (self.condition_scales, self.condition_opacities, self.condition_colors)

@@ -36,6 +36,7 @@ class MipSplatting(Vanilla):
 
     response: ClassVar[Response] = "antialiased"
     plain: ClassVar[bool] = False
+    own_dilation: ClassVar[bool] = True
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
     parity: bool = Field(

@@ -15,6 +15,7 @@ from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.planting import planted, visible_share
 from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.component import Selection
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.lattice import Lattice
 from crossgrad_core.scene.types import Camera, Scene
@@ -66,6 +67,16 @@ class Octree(AnchorBackbone):
     rounding: Rounding = Field("round", description="how L* becomes a level")
     progressive: bool = Field(default=True, description="open the fine levels one after the other")
     coarse_factor: float = Field(1.5, ge=1, description="each opening comes faster by this factor")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        idle = dict(super().idle_options(selection))
+        if self.base_layer >= 0:
+            idle["middle_cell"] = "base_layer sets the cells; leave one of the two out"
+        if not self.progressive:
+            why = "all levels are open at once (progressive = false); leave it out"
+            idle |= {"init_level": why, "coarse_factor": why}
+        return idle
 
     @override
     def blocks(self) -> tuple[Block, ...]:

@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from crossgrad_core.backbone import Backbone
 from crossgrad_core.blocks import Block, LearningRate, Parameters
+from crossgrad_core.component import Selection
 from crossgrad_core.elementwise import sigmoid
 from crossgrad_core.gaussians import Gaussians
 from crossgrad_core.scene.types import Camera, Scene
@@ -40,6 +41,12 @@ class Vanilla(Backbone):
     lr_opacities: float = Field(0.05, ge=0, description="learning rate of the opacity logits")
     lr_f_dc: float = Field(2.5e-3, ge=0, description="learning rate of SH band 0")
     lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self.sh_degree > 0:
+            return {}
+        return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave it out"}
 
     @override
     def blocks(self) -> tuple[Block, ...]:

@@ -5,7 +5,7 @@ of very different length, very long and very short, and fewer dimensions than vi
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,6 +240,30 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
             )
 
 
+def what_it_reads_is_declared(make: Make[Operator]) -> None:
+    """`reads_labels` and `reads_gramians` are right: other labels or Gramians change nothing else.
+
+    A run refuses a grouping that nobody reads, and a granularity of Gramians that nobody reads.
+    """
+    operator = _gramian_operator(make)
+    for views in admitted(operator.views):
+        case = operator_case(views)
+        matrices, _ = transformed(operator, case)
+        if not operator.reads_labels():
+            labels = tuple("far" for _ in range(views))
+            other = OperatorCase(case.families, case.gramians, replace(case.context, labels=labels))
+            require(
+                np.array_equal(transformed(operator, other)[0], matrices),
+                f"K = {views}: other labels change the matrices, and reads_labels() is False",
+            )
+        if not operator.reads_gramians():
+            turned = OperatorCase(case.families, case.gramians[:, ::-1, ::-1], case.context)
+            require(
+                np.array_equal(transformed(operator, turned)[0], matrices),
+                f"K = {views}: other Gramians change the matrices, and reads_gramians() is False",
+            )
+
+
 OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
     *COMPONENT_CHECKS,
     *AGGREGATION_CHECKS,
@@ -251,4 +275,5 @@ OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
     state_survives_a_checkpoint,
     one_view_keeps_its_direction,
     scales_with_the_gradients,
+    what_it_reads_is_declared,
 )

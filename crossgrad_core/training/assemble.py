@@ -135,7 +135,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     plugins = _plugins(components, observers)
     manager = make_manager(plugins)
     answers = manager.hook.crossgrad_objections(selection=selection)
-    _refuse(reasons_against(config, selection, answers))
+    refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
     densifier = cast("Densifier", components["densifier"])
     setup = Setup(
@@ -332,7 +332,12 @@ def reasons_against(
     return tuple(sorted(set(reasons)))
 
 
-def _refuse(reasons: tuple[str, ...]) -> None:
+def refuse(reasons: tuple[str, ...]) -> None:
+    """Ends the start of a run for these reasons, if there are any.
+
+    Raises:
+        IncompatibleSelectionError: There are.
+    """
     if reasons:
         raise IncompatibleSelectionError(
             "these components cannot work together",

@@ -1,6 +1,7 @@
 """Operators that need to know which group each view comes from."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import cast
 
 from crossgrad_core.component import Selection
@@ -25,19 +26,24 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
     return context.labels
 
 
-def label_objections(selection: Selection, needed: Sequence[str] = ()) -> list[str]:
-    """Reasons why views will not carry (the needed) labels."""
+def label_objections(
+    selection: Selection, needed: Mapping[str, str] = MappingProxyType({})
+) -> list[str]:
+    """Reasons why views will not carry labels, or not those that options of the operator name."""
     name, sampler = selection.names["operator"], selection.names["sampler"]
     grouping = cast("Grouping | None", selection.components.get("grouping"))
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        source, given = f"grouping {selection.names['grouping']}", grouping.labels
+        # A grouping by folders or lists learns its labels from the scene and declares none.
+        source = f"grouping {selection.names['grouping']}"
+        given = grouping.labels if selection.labels is None else selection.labels
     else:
         return [f"operator {name} needs labelled views; sampler {sampler} draws from no groups"]
-    # A grouping by folders or lists learns its labels from the scene and declares none.
-    if not given or set(needed) <= set(given):
+    if not given or set(needed.values()) <= set(given):
         return []
+    wanted = " and ".join(f"{label} (operator.{option})" for option, label in needed.items())
     return [
-        f"operator {name} needs the labels {', '.join(needed)}; {source} gives {', '.join(given)}"
+        f"operator {name} looks for views labelled {wanted}; {source} gives {', '.join(given)}: "
+        "set these options to labels that there are"
     ]

@@ -1,6 +1,6 @@
 """Operators made of operators: by name, in configurations, and with their states side by side."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, TypeAlias, cast
 
@@ -83,6 +83,16 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
         names={**selection.names, "operator": name},
     )
     return list(operator.crossgrad_objections(seen) or ())
+
+
+def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
+    """The option that holds inner operators, where one of these has options that do nothing."""
+    found = [
+        f"{name_of(operator)}.{name}: {why}"
+        for operator in operators
+        for name, why in operator.set_for_nothing(selection).items()
+    ]
+    return {option: "; ".join(found)} if found else {}
 
 
 def _inner(values: Mapping[str, Any], start: str) -> dict[str, Any]:

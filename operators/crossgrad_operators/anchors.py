@@ -28,6 +28,10 @@ class Anchors(Operator):
     far: str = Field("far", description="label of the far anchors")
 
     @override
+    def reads_labels(self) -> bool:
+        return True
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],
@@ -44,4 +48,4 @@ class Anchors(Operator):
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """Refuses other than two views, and samplers whose views carry no labels."""
         counts = Operator.crossgrad_objections(self, selection)
-        return counts + label_objections(selection, (self.near, self.far))
+        return counts + label_objections(selection, {"near": self.near, "far": self.far})

@@ -1,5 +1,6 @@
 """CAGrad (Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning")."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
+from crossgrad_core.component import Selection
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._weights import weighting
@@ -25,6 +27,17 @@ class CAGrad(Operator):
     rescale: Literal["none", "1+c", "1+c^2"] = Field(
         "none", description="what the direction is divided by"
     )
+
+    @override
+    def reads_gramians(self) -> bool:
+        return self.c > 0
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        idle = super().idle_options(selection)
+        if self.c > 0:
+            return idle
+        return {**idle, "rescale": "it divides by 1 where c = 0; leave it out"}
 
     @override
     def transform(

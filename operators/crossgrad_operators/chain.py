@@ -1,5 +1,6 @@
 """Operators one after the other: `a+b` on the command line."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._nested import (
     OperatorField,
+    inner_idle,
     inner_objections,
     inner_state,
     name_of,
@@ -36,6 +38,18 @@ class Chain(Operator):
     @override
     def does_nothing(self, views: int) -> bool:
         return views == 1 and all(link.does_nothing(views) for link in self.links)
+
+    @override
+    def reads_gramians(self) -> bool:
+        return any(link.reads_gramians() for link in self.links)
+
+    @override
+    def reads_labels(self) -> bool:
+        return any(link.reads_labels() for link in self.links)
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        return {**super().idle_options(selection), **inner_idle(selection, "links", self.links)}
 
     @override
     def transform(

@@ -1,5 +1,6 @@
 """Confidence-gated projection (arXiv 2605.00052, appendix; all numbers are ours)."""
 
+from collections.abc import Mapping
 from statistics import NormalDist
 from typing import ClassVar, Final, Literal
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
+from crossgrad_core.component import Selection
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._memory import recall, remember
@@ -33,6 +35,10 @@ class ConfGate(Operator):
     )
     beta: float = Field(0.99, ge=0, lt=1, description="decay of the averages per step")
     warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        return {} if self.tau is None else {"preset": "tau wins over it; leave one of the two out"}
 
     @override
     def transform(

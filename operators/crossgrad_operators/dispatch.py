@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._nested import (
     OperatorField,
+    inner_idle,
     inner_objections,
     inner_state,
     outer_state,
@@ -25,7 +26,7 @@ from crossgrad_operators.confgate import ConfGate
 from crossgrad_operators.sum import Sum
 from crossgrad_operators.symmetric import Symmetric
 
-_KINDS = ("geometry", "appearance", "neutral")
+_KINDS: Final[tuple[BlockKind, ...]] = ("geometry", "appearance", "neutral")
 _OPACITY = frozenset({"opacity", "opacities"})
 
 
@@ -73,6 +74,42 @@ class Dispatch(Operator):
         return all(operator.does_nothing(views) for operator in self._operators().values())
 
     @override
+    def reads_gramians(self) -> bool:
+        return any(operator.reads_gramians() for operator in self._operators().values())
+
+    @override
+    def reads_labels(self) -> bool:
+        return any(operator.reads_labels() for operator in self._operators().values())
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        given = self._given(selection)
+        ruled = {rule.block for rule in self.rules}
+        keys = {self._key(name, kind, ruled) for name, kind in given}
+        idle = dict(super().idle_options(selection))
+        if not keys - ruled:
+            idle["preset"] = "the rules serve every block; leave it out"
+        if not any(name in _OPACITY and name not in ruled for name, _ in given):
+            idle["opacity"] = "no block of opacities is left to a kind; leave it out"
+        if "neutral" not in keys - ruled:
+            idle["neutral"] = "the preset serves no block of neither kind; leave it out"
+        if ruled - keys:
+            names = ", ".join(sorted(ruled - keys))
+            idle["rules"] = (
+                f"the rule for {names} serves no Gramian; under granularity {self.granularity} "
+                f"there are {', '.join(name for name, _ in given)}"
+            )
+        return {**idle, **inner_idle(selection, "rules", [rule.operator for rule in self.rules])}
+
+    def _given(self, selection: Selection) -> list[tuple[str, BlockKind]]:
+        """Name and kind of what a Gramian covers."""
+        blocks = [(block.name, block.kind) for block in selection.backbone.trained_blocks()]
+        if self.granularity != "group":
+            return blocks
+        kinds = {kind for _, kind in blocks}
+        return [(kind, kind) for kind in _KINDS if kind in kinds]
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],
@@ -104,6 +141,10 @@ class Dispatch(Operator):
             for operator in self._operators().values()
             for reason in inner_objections(selection, operator)
         ]
+        if self.granularity == "global":
+            reasons.append(
+                "dispatch serves blocks apart, and granularity global makes one Gramian of all"
+            )
         blocks = [block.name for block in selection.backbone.trained_blocks()]
         for rule in self.rules:
             if rule.block not in (*_KINDS, *blocks):

@@ -27,6 +27,10 @@ class GradDrop(Operator):
     elementwise: ClassVar[bool] = True
 
     @override
+    def reads_gramians(self) -> bool:
+        return False
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

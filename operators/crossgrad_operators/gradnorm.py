@@ -35,6 +35,16 @@ class GradNorm(Operator):
     decay: float = Field(0.99, ge=0, lt=1, description="decay of the average loss per view")
 
     @override
+    def reads_labels(self) -> bool:
+        return True
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self.alpha > 0:
+            return {}
+        return dict.fromkeys(("baseline", "decay"), "alpha = 0 looks at no losses; leave it out")
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

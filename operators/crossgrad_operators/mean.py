@@ -22,6 +22,10 @@ class Mean(Operator):
     idle_at_one: ClassVar[bool] = True
 
     @override
+    def reads_gramians(self) -> bool:
+        return False
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

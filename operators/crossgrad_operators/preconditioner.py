@@ -26,6 +26,10 @@ class Preconditioner(Operator):
     neutral: float = Field(1.0, description="exponent d for blocks of neither kind")
 
     @override
+    def reads_gramians(self) -> bool:
+        return False
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

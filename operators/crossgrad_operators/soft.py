@@ -1,5 +1,6 @@
 """Soft projection: pairwise projection with a threshold and a strength, for sweeps."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
+from crossgrad_core.component import Selection
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._pairs import project, slot_order
@@ -22,6 +24,17 @@ class Soft(Operator):
     idle_at_one: ClassVar[bool] = True
     threshold: float = Field(0.0, ge=0, le=1, description="conflicts are cosines below minus this")
     strength: float = Field(1.0, ge=0, le=1, description="share of the component that is removed")
+
+    @override
+    def reads_gramians(self) -> bool:
+        return self.strength > 0
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        idle = super().idle_options(selection)
+        if self.strength > 0:
+            return idle
+        return {**idle, "threshold": "nothing is taken away where strength = 0; leave it out"}
 
     @override
     def transform(

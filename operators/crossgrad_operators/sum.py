@@ -21,6 +21,10 @@ class Sum(Operator):
     idle_at_one: ClassVar[bool] = True
 
     @override
+    def reads_gramians(self) -> bool:
+        return False
+
+    @override
     def transform(
         self,
         gramians: NDArray[np.float64],

@@ -16,6 +16,10 @@ from crossgrad_operators._weights import weighting
 _Value: TypeAlias = bool | int | float | str
 
 
+#: Weightings whose weights depend on no Gramian.
+_FIXED = frozenset({"Constant", "Mean", "Random", "Sum"})
+
+
 def _pairs(value: object) -> object:
     return tuple(value.items()) if isinstance(value, Mapping) else value
 
@@ -34,6 +38,10 @@ class TorchJD(Operator):
     options: Annotated[
         tuple[tuple[str, _Value], ...], BeforeValidator(_pairs), PlainSerializer(dict)
     ] = Field((), description="the weighting's own arguments")
+
+    @override
+    def reads_gramians(self) -> bool:
+        return self.weighting.removesuffix("Weighting") not in _FIXED
 
     @override
     def transform(

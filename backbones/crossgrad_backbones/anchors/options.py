@@ -1,5 +1,6 @@
 """Options of the backbones of anchors, and the blocks that follow from them."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
@@ -9,6 +10,7 @@ from crossgrad_backbones.anchors import appearance
 from crossgrad_backbones.anchors.heads import Heads
 from crossgrad_core.backbone import Backbone
 from crossgrad_core.blocks import Block, BlockKind, LearningRate
+from crossgrad_core.component import Selection
 
 _FROZEN = LearningRate(0.0)
 
@@ -42,6 +44,15 @@ class AnchorOptions(Backbone):
     lr_bank_final: float = Field(1e-5, gt=0, description="final, feature bank")
     lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
     lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        bank = "there is no feature bank (feature_bank = false); leave it out"
+        codes = "photos have no codes (appearance = 0); leave it out"
+        return {
+            **({} if self.feature_bank else {"lr_bank": bank, "lr_bank_final": bank}),
+            **({} if self.appearance else {"lr_appearance": codes, "lr_appearance_final": codes}),
+        }
 
     @property
     def heads(self) -> Heads:

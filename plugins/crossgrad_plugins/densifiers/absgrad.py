@@ -1,12 +1,14 @@
 """Density control by absolute screen gradients (AbsGS, Ye et al. 2024, arXiv 2404.10484)."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Final, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.component import Selection
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.state import PluginState
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
@@ -18,6 +20,13 @@ from crossgrad_plugins.densifiers.screen_statistics import (
     sums,
     visible,
 )
+
+#: Criterion -> the thresholds that it compares with.
+_THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
+    "abs": frozenset({"grad_threshold", "abs_threshold"}),
+    "gsplat": frozenset({"gsplat_threshold"}),
+    "quantile": frozenset({"grad_threshold"}),
+}
 
 
 class AbsGradDensityControl(CloneSplit):
@@ -38,6 +47,12 @@ class AbsGradDensityControl(CloneSplit):
     grad_threshold: float = Field(2e-4, gt=0, description="of g: abs (clones) and quantile")
     abs_threshold: float = Field(4e-4, gt=0, description="of ga: abs (splits)")
     gsplat_threshold: float = Field(8e-4, gt=0, description="of ga: gsplat (clones and splits)")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        used = _THRESHOLDS[self.criterion]
+        why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave it out"
+        return dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:

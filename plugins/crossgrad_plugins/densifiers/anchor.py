@@ -1,5 +1,6 @@
 """Growing and pruning of anchors (Scaffold-GS, Lu et al. 2024, section 3.3)."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -7,6 +8,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.blocks import Parameters
+from crossgrad_core.component import Selection
 from crossgrad_core.contexts import DensifyContext
 from crossgrad_core.schedule import Schedule
 from crossgrad_plugins.densifiers.anchor_base import AnchorDensifier
@@ -23,6 +25,13 @@ class AnchorControl(AnchorDensifier):
     levels: int = Field(3, ge=1, description="sizes of cells, from coarse to fine")
     coarsest: int = Field(16, ge=1, description="edge of the coarsest cell, voxels")
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self.levels > 1:
+            return {}
+        why = "there is one size of cells (levels = 1); leave it out"
+        return {"threshold_factor": why, "refinement": why}
 
     @override
     def window(self, schedule: Schedule) -> Schedule:

@@ -35,6 +35,7 @@ class AnchorDensifier(Densifier):
     """
 
     blocks: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
+    resets: ClassVar[bool] = False
 
     grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to grow at")
     success_threshold: float = Field(

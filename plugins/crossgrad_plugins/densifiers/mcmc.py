@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import log
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -39,6 +40,7 @@ class MarkovChainMonteCarlo(Densifier):
     """
 
     blocks = frozenset({"means", "scales", "quats", "opacities"})
+    resets: ClassVar[bool] = False
 
     cap: int = Field(1_000_000, ge=0, description="most Gaussians")
     growth: float = Field(0.05, ge=0, le=1, description="share added per pass")

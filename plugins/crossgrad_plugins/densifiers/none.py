@@ -1,5 +1,7 @@
 """No density control: the set of primitives stays as it is."""
 
+from typing import ClassVar
+
 from typing_extensions import override
 
 from crossgrad_core.contexts import DensifyContext
@@ -10,6 +12,9 @@ from crossgrad_core.topology import NO_EDIT, Edit, NoEdit
 
 class NoDensification(Densifier):
     """Never edits; needs no statistics."""
+
+    edits: ClassVar[bool] = False
+    resets: ClassVar[bool] = False
 
     @override
     def densify(

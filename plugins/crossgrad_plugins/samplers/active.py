@@ -33,6 +33,7 @@ class Active(Sampler):
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
     default_views: ClassVar[int] = 2
     default_grouping: ClassVar[str | None] = "radial"
+    groups: ClassVar[int | None] = 2
 
     top: int = Field(
         8, ge=1, description="how many partners are candidates; all of a smaller group"

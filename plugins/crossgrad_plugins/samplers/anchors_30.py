@@ -5,9 +5,10 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.errors import UserError
+from crossgrad_core.hooks import hookimpl
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import PluginState
 from crossgrad_plugins.samplers.draws import training_views
@@ -28,6 +29,18 @@ class Anchors30(Sampler):
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
     default_views: ClassVar[int] = 2
     default_grouping: ClassVar[str | None] = "anchors"
+
+    @hookimpl
+    @override
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Refuses groups without near and far ones."""
+        reasons = Sampler.crossgrad_objections(self, selection)
+        if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
+            reasons.append(
+                "sampler anchors-30 needs groups labelled near and far; grouping "
+                f"{selection.names['grouping']} gives {', '.join(selection.labels)}"
+            )
+        return reasons
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

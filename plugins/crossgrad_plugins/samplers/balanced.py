@@ -28,3 +28,11 @@ def balanced_draw(
             values[label] = deck.to_json()
     views = tuple(view for row in zip(*columns, strict=True) for view in row)
     return Draw(views, tuple(groups) * share), PluginState(values)
+
+
+def idle_order(order: Order, views: int, groups: int) -> Mapping[str, str]:
+    """The option `order` where it changes nothing: one view of a group is never drawn twice."""
+    if order != "distinct" or views > groups:
+        return {}
+    why = "a step has one view of each group, which distinct leaves as iid draws it"
+    return {"order": f"{why}; leave it out, or choose epoch"}

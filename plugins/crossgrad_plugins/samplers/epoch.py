@@ -23,6 +23,7 @@ class Epoch(Sampler):
 
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 1
+    reads_groups: ClassVar[bool] = False
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

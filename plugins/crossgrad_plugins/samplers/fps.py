@@ -28,6 +28,7 @@ class FarthestPoint(Sampler):
 
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
 
     direction_weight: float = Field(
         1.0, ge=0.0, description="weight of the viewing direction against the position"

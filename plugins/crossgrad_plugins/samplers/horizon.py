@@ -1,11 +1,12 @@
 """Far and near views in a ratio that changes once: 2:1, then 1:1."""
 
+from collections.abc import Mapping
 from typing import ClassVar, cast
 
 from pydantic import Field, PositiveInt
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import Json, PluginState
@@ -25,6 +26,7 @@ class Horizon(Sampler):
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 1
     default_grouping: ClassVar[str | None] = "radial"
+    groups: ClassVar[int | None] = 2
 
     coarse: tuple[PositiveInt, PositiveInt] = Field(
         (2, 1), description="far : near in the first stage"
@@ -35,6 +37,13 @@ class Horizon(Sampler):
     coarse_share: float = Field(
         0.6, ge=0.0, le=1.0, description="share of the run that the first stage takes"
     )
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if 0.0 < self.coarse_share < 1.0:
+            return {}
+        name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")
+        return {name: f"coarse_share = {self.coarse_share:g} leaves no {stage} stage; leave it out"}
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

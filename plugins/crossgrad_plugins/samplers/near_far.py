@@ -1,15 +1,16 @@
 """The altitude-balanced pair of the paper: near and far views in equal numbers."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import PluginState
-from crossgrad_plugins.samplers.balanced import balanced_draw
+from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
 from crossgrad_plugins.samplers.groups import groups_of
 
@@ -27,6 +28,7 @@ class NearFar(Sampler):
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
     default_views: ClassVar[int] = 2
     default_grouping: ClassVar[str | None] = "radial"
+    groups: ClassVar[int | None] = 2
 
     alternating: bool = Field(False, description="one view per step, near and far in turn (K = 1)")
     order: Order = Field(
@@ -44,6 +46,10 @@ class NearFar(Sampler):
     @override
     def usual_views(self) -> int:
         return 1 if self.alternating else self.default_views
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        return idle_order(self.order, selection.views_per_step, 2)
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

@@ -1,11 +1,12 @@
 """Random views: `r2view` of the paper at K = 2."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import PluginState
@@ -21,8 +22,15 @@ class Random(Sampler):
 
     views: ClassVar[ViewCounts] = ViewCounts()
     default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
 
     distinct: bool = Field(False, description="draw K different views, not K independent ones")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if selection.views_per_step > 1:
+            return {}
+        return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

@@ -1,16 +1,17 @@
 """The control of near-far: the same balanced pair over groups that mean nothing."""
 
+from collections.abc import Mapping
 from typing import ClassVar, cast
 
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.errors import UserError
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import Json, PluginState
-from crossgrad_plugins.samplers.balanced import balanced_draw
+from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order, training_views
 
 HALVES = ("first", "second")
@@ -26,6 +27,7 @@ class RandomSplit(Sampler):
 
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
     default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
     own_labels: ClassVar[tuple[str, ...]] = HALVES
 
     order: Order = Field(
@@ -33,6 +35,10 @@ class RandomSplit(Sampler):
         description="draws within a half: iid; distinct: no view twice in a step; "
         "epoch: every view once before any comes again",
     )
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        return idle_order(self.order, selection.views_per_step, len(HALVES))
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

@@ -1,15 +1,16 @@
 """Three-way balanced sampling: one view of each third."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
+from crossgrad_core.component import Selection, ViewCounts
 from crossgrad_core.contexts import Draw, SampleContext
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.state import PluginState
-from crossgrad_plugins.samplers.balanced import balanced_draw
+from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
 from crossgrad_plugins.samplers.groups import groups_of
 
@@ -25,12 +26,17 @@ class ThreeWay(Sampler):
     views: ClassVar[ViewCounts] = ViewCounts(3, 3)
     default_views: ClassVar[int] = 3
     default_grouping: ClassVar[str | None] = "terciles"
+    groups: ClassVar[int | None] = 3
 
     order: Order = Field(
         "iid",
         description="draws within a group: iid; distinct: no view twice in a step; "
         "epoch: every view once before any comes again",
     )
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        return idle_order(self.order, selection.views_per_step, 3)
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

@@ -106,6 +106,21 @@ class AbsoluteThreshold(Adding):
         return np.where(context.present, np.where(longer, 1.0, 0.5), 0.0)
 
 
+class FarViewsCountTwice(Adding):
+    def weights(self, gramians, context, rng):
+        far = np.array([label == "far" for label in context.labels])
+        return super().weights(gramians, context, rng) * np.where(far, 2.0, 1.0)
+
+
+class SaysItReadsNoGramians(Adding):
+    def reads_gramians(self):
+        return False
+
+    def weights(self, gramians, context, rng):
+        squares = np.einsum("bkk->bk", gramians)
+        return np.where(squares >= squares.max(axis=1, keepdims=True), 1.0, 0.5)
+
+
 class ForgetsATensor(Adding):
     def aggregate(self, context, state):
         aggregated, state = super().aggregate(context, state)
@@ -484,6 +499,8 @@ DEFECTS = [
     (operators.state_survives_a_checkpoint, TextKeys),
     (operators.one_view_keeps_its_direction, Reverses),
     (operators.scales_with_the_gradients, AbsoluteThreshold),
+    (operators.what_it_reads_is_declared, FarViewsCountTwice),
+    (operators.what_it_reads_is_declared, SaysItReadsNoGramians),
     (samplers.usual_views_are_admitted, UsualViewsRefused),
     (samplers.draws_are_training_views, OneViewTooFew),
     (samplers.draws_are_training_views, NumpyPositions),
