@@ -27,7 +27,7 @@ def test_a_sampler_without_groups_is_refused(name):
 
 def test_anchors_need_near_and_far_views():
     (reason,) = objections("anchors", "random-split")
-    assert "near, far" in reason
+    assert "near (operator.near) and far (operator.far)" in reason
     assert objections("gradnorm", "random-split") == []
 
 
