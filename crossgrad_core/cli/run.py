@@ -49,7 +49,8 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Training rules: default, or inria (order and radii of the original code).",
+            help="Training rules: default, or inria (order of a step, 3-sigma footprint and near "
+            "plane of the original code).",
             rich_help_panel=_CONFIGURATION,
         ),
     ] = None,

@@ -18,7 +18,7 @@ from crossgrad_core.manager import make_manager
 from crossgrad_core.operator import Operator
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.reader import Reader
-from crossgrad_core.registry import build, entries, find
+from crossgrad_core.registry import build, entries, find, load
 from crossgrad_core.sampler import Sampler
 from crossgrad_core.scene.types import Scene
 from crossgrad_core.schedule import Schedule
@@ -186,7 +186,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes.append(why)
     rasterizer = cast(
         "Rasterizer",
-        build("rasterizers", rasterizer_name, _rasterizer_options(config, scene)),
+        build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
     )
     views = config.views or sampler.usual_views
     grouping_choice = _grouping_choice(config, sampler, notes)
@@ -259,9 +259,17 @@ def _operator(config: RunConfig) -> tuple[Operator, str]:
     return cast("Operator", chain), "+".join(link.name for link in links)
 
 
-def _rasterizer_options(config: RunConfig, scene: Scene) -> dict[str, Any]:
+def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:
     options = dict(config.rasterizer.options)
     if config.preset == "inria":
+        if "footprint" not in load("rasterizers", name).model_fields:
+            raise UserError(
+                f"rasterizer {name} does not have the footprint of the original code",
+                where="--preset inria",
+                expected="a rasterizer with the option footprint (numba, torch)",
+                todo="choose another rasterizer, or leave the preset out",
+            )
+        options.setdefault("footprint", "3-sigma")
         # The published near plane is 0.2 units of the input frame.
         options.setdefault("near", 0.2 * scene.similarity.scale)
     return options

@@ -5,12 +5,14 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.rasterizer import Rasterizer
 from crossgrad_core.scene.types import Camera
+from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
@@ -31,6 +33,8 @@ class NumbaRasterizer(Rasterizer):
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
 
+    footprint: Footprint = Field("alpha", description=DESCRIPTION)
+
     @override
     def render(
         self,
@@ -44,6 +48,7 @@ class NumbaRasterizer(Rasterizer):
             near=self.near,
             dilation=self.dilation if gaussians.dilation is None else gaussians.dilation,
             response=gaussians.response,
+            squares=self.footprint == "3-sigma",
             depth="depth" in outputs,
             pixels="pixels" in outputs,
         )

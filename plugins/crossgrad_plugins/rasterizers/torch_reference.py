@@ -4,12 +4,14 @@ from dataclasses import replace
 from typing import ClassVar
 
 import torch
+from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.rasterizer import ALPHA_THRESHOLD, Rasterizer
 from crossgrad_core.scene.types import Camera
+from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.reference.compositing import (
     Drawing,
     composite_tiles,
@@ -19,8 +21,15 @@ from crossgrad_plugins.rasterizers.reference.directions import longest_axes
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import Projection, project
 from crossgrad_plugins.rasterizers.reference.responses import Shape, shape
+from crossgrad_plugins.rasterizers.reference.squares import (
+    common_tiles,
+    published_radii,
+    square_boxes,
+)
 from crossgrad_plugins.rasterizers.reference.statistics import Recorder, recorded
 from crossgrad_plugins.rasterizers.reference.tiles import tile_boxes, tile_lists
+
+_LARGEST_RADIUS = 2.0**30
 
 
 class TorchRasterizer(Rasterizer):
@@ -35,6 +44,8 @@ class TorchRasterizer(Rasterizer):
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
 
+    footprint: Footprint = Field("alpha", description=DESCRIPTION)
+
     @override
     def render(
         self,
@@ -45,7 +56,7 @@ class TorchRasterizer(Rasterizer):
     ) -> Render:
         size = (camera.width, camera.height)
         with torch.no_grad():
-            index, boxes = self._drawn(gaussians, camera)
+            index, boxes, published = self._drawn(gaussians, camera)
         # Whatever is not drawn never enters the graph, so that it cannot pass on a NaN.
         drawn = _rows(gaussians, index)
         projection, shapes, colors = self._splats(drawn, camera)
@@ -62,6 +73,8 @@ class TorchRasterizer(Rasterizer):
         )
         radii = shapes.radii.detach().ceil().clamp(min=1)
         screen.radii[index] = torch.where(touched, radii, 0.0).int()
+        if published is not None:
+            screen.radii = published
         if "pixels" in outputs:
             screen.pixels = torch.zeros_like(screen.radii)
             screen.pixels[index] = blended.int()
@@ -79,19 +92,36 @@ class TorchRasterizer(Rasterizer):
         shapes = shape(projection, gaussians.opacities, dilation, gaussians.response)
         return projection, shapes, view_colors(gaussians, camera.center.to(gaussians.means))
 
-    def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
-        """The Gaussians to draw, front to back, and their tile boxes [V, 4]."""
+    def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The Gaussians to draw, front to back, their tile boxes [V, 4], and all published radii.
+
+        The radii [N] int32 are None unless the footprint is the published one.
+        """
         projection, shapes, colors = self._splats(gaussians, camera)
         table = splat_table(projection.means, projection.depths, colors, shapes)
+        size = (camera.width, camera.height)
+        squares, published = None, None
+        if self.footprint == "3-sigma":
+            dilation = self._dilation(gaussians)
+            radii = published_radii(projection, dilation)
+            squares = square_boxes(projection.means, radii, size)
+            seen = (projection.depths > self.near) & (squares[:, 2:] > squares[:, :2]).all(-1)
+            published = torch.where(seen, radii.clamp(max=_LARGEST_RADIUS), 0.0).int()
         drawn = table.isfinite().all(-1) & shapes.reach.isfinite().all(-1)
         drawn &= (projection.depths > self.near) & (shapes.peaks >= ALPHA_THRESHOLD)
         drawn &= gaussians.opacities >= ALPHA_THRESHOLD
         index = drawn.nonzero().squeeze(-1)
         index = index[projection.depths[index].argsort(stable=True)]
-        size = (camera.width, camera.height)
         boxes = tile_boxes(projection.means[index], shapes.reach[index], size)
+        if squares is not None:
+            boxes = common_tiles(boxes, squares[index])
         seen = (boxes[:, 2:] > boxes[:, :2]).all(-1)
-        return index[seen], boxes[seen]
+        return index[seen], boxes[seen], published
+
+    def _dilation(self, gaussians: Gaussians) -> float:
+        if gaussians.response == "analytic":
+            return 0.0
+        return self.dilation if gaussians.dilation is None else gaussians.dilation
 
 
 def _rows(gaussians: Gaussians, index: Tensor) -> Gaussians:

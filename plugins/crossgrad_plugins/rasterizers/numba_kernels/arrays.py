@@ -65,6 +65,7 @@ class DrawOptions:
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
         response: How a Gaussian fills a pixel; `antialiased` lowers opacities by what the dilation
             adds in area (Mip-Splatting's 2-D filter), `analytic` is not dilated.
+        squares: Whether a Gaussian touches only the tiles of the published 3-sigma square.
         depth: Whether to composite the depth.
         pixels: Whether to count the pixels of each Gaussian.
     """
@@ -73,6 +74,7 @@ class DrawOptions:
     near: float = 1e-3
     dilation: float = 0.3
     response: Response = "plain"
+    squares: bool = False
     depth: bool = False
     pixels: bool = False
 
@@ -87,6 +89,7 @@ class Projected:
         records: [N * RECORD] float32.
         owners: [N] int32, the Gaussian of each record.
         drawn: [chunks] int64, records per chunk.
+        limits: [N, 2] int32, columns of 16 pixels that each record may touch; None for no limits.
     """
 
     camera: Pinhole
@@ -94,6 +97,7 @@ class Projected:
     records: Float32
     owners: Int32
     drawn: Int64
+    limits: Int32 | None = None
 
 
 @dataclass(frozen=True)

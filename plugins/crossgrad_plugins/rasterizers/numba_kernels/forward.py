@@ -43,6 +43,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
+    COLUMNS,
     COSINE,
     DECAY,
     DEPTH,
@@ -63,6 +64,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 #: Entries whose reach is computed before any of them is blended: hides the latency of their
 #: memory reads and row extents, and is how often finished segments are looked for.
 BATCH = 16
+
+# Side of the squares that limits count, pixels; the segments of one column of segments as bits.
+_SQUARE = 16
+_COLUMN = np.uint64((1 << TILE_HEIGHT) - 1)
 
 # State of a segment: one vector each. The transmittance is negative once a pixel is finished.
 # The depths of all segments follow the states of all segments.
@@ -85,6 +90,17 @@ def _start(state: NDArray[np.float32], width: int, height: int) -> np.uint64:
         if row < height and first < width:
             live |= np.uint64(1) << np.uint64(segment)
     return live
+
+
+@device
+def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
+    """Returns the segments of a tile, whose first column is `left`, within a record's limits."""
+    inside = np.uint64(0)
+    for column in range(COLUMNS):
+        square = (left + column * SEGMENT) // _SQUARE
+        if limits[record, 0] <= square <= limits[record, 1]:
+            inside |= _COLUMN << np.uint64(column * TILE_HEIGHT)
+    return inside
 
 
 @device
@@ -204,6 +220,7 @@ def _composite(
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
+    limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
     """Composites one tile and leaves in `masks` the segments that each entry was blended into."""
@@ -230,6 +247,8 @@ def _composite(
                     records, record, np.float32(left), np.float32(top), rows, filled * ROWS
                 )
             reached &= live
+            if limits is not None:
+                reached &= _within(limits, np.intp(entries[k, 0]), left)
             masks[k] = np.uint64(reached)
             batch[filled] = k
             # No branch: an entry that reaches nothing is overwritten by the next one.
@@ -260,6 +279,7 @@ def composite(
     depth: NDArray[np.float32] | None,
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
+    limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
     """Composites all tiles.
@@ -276,6 +296,7 @@ def composite(
         depth: [H, W] written, or None.
         counts: [slots] pixels blended per slot, written; zero before. None: not counted.
         analytic: Any vector says that the records are of the analytic response; None: plain.
+        limits: [N, 2] first and last column of 16 pixels per record; None: no limits.
         masks: [E] segments per entry, written; zero before.
     """
     tile = take(jobs)
@@ -292,6 +313,7 @@ def composite(
             depth,
             counts,
             analytic,
+            limits,
             masks,
         )
         tile = take(jobs)

@@ -74,6 +74,7 @@ def forward(
         depth,
         counts,
         _analytic(options),
+        projected.limits,
         masks,
     )
     pixels = None
@@ -264,6 +265,7 @@ def _project(
         records=np.empty(count * RECORD, np.float32),
         owners=np.empty(count, np.int32),
         drawn=np.empty(chunks, np.int64),
+        limits=np.empty((count, 2), np.int32) if options.squares else None,
     )
     boxes = np.empty((count, 4), np.int32)
     shelves = np.empty((count, SHELF), np.int32)
@@ -276,6 +278,7 @@ def _project(
         _dilation(options),
         options.response == "antialiased",
         _analytic(options),
+        projected.limits,
         gaussians.means,
         gaussians.quats,
         gaussians.scales,

@@ -40,10 +40,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     FOUND,
     MEAN_U,
     MEAN_V,
+    SQUARE,
     VARIANCE_X,
     VARIANCE_Y,
     analytic_record,
     plain_record,
+    square,
 )
 
 
@@ -127,6 +129,7 @@ def _record_block(
     camera: Pinhole,
     near: float,
     analytic: NDArray[np.float32] | None,
+    limits: NDArray[np.int32] | None,
     opacities: NDArray[np.float32],
     colors: NDArray[np.float32] | None,
     found: NDArray[np.float64],
@@ -143,15 +146,25 @@ def _record_block(
         i = begin + k
         radii[i] = 0
         opacity, z = np.float64(opacities[i]), get(found, CAMERA_DEPTH, k)
+        within = (0.0, width - 1.0, 0.0, height - 1.0)
+        if limits is not None:
+            published, within = square(k, width, height, found)
+            if z > near and z < math.inf:
+                # Seen by the published code, whether or not it touches a pixel.
+                radii[i] = published
         if not (z > near and z < math.inf and opacity >= LEAST_ALPHA and opacity < math.inf):
             continue
         if analytic is None:
-            radius = plain_record(k, j, opacity, width, height, found, records, boxes)
+            radius = plain_record(k, j, opacity, width, height, within, found, records, boxes)
         else:
-            radius = analytic_record(k, j, opacity, width, height, found, records, boxes)
+            radius = analytic_record(k, j, opacity, width, height, within, found, records, boxes)
         if radius == 0 or (colors is not None and not _tint(i, j, colors, records)):
             continue
-        radii[i] = radius
+        if limits is None:
+            radii[i] = radius
+        else:
+            limits[j, 0] = np.int32(within[0]) // np.int32(SQUARE)
+            limits[j, 1] = np.int32(within[1]) // np.int32(SQUARE)
         records[j * RECORD + DEPTH] = z
         depths[j] = z
         owners[j] = i
@@ -167,6 +180,7 @@ def project(
     dilation: float,
     antialiased: bool,
     analytic: NDArray[np.float32] | None,
+    limits: NDArray[np.int32] | None,
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
@@ -190,6 +204,8 @@ def project(
         dilation: Added to both variances, px^2.
         antialiased: Whether opacities are lowered by what the dilation adds in area.
         analytic: Any vector asks for records of the analytic response (with no dilation).
+        limits: [N, 2] written per record: first and last column of 16 pixels that it may touch, by
+            the published footprint; None asks for the footprint alpha >= 1/255.
         means: [N, 3].
         quats: [N, 4] wxyz, any norm.
         scales: [N, 3] linear.
@@ -230,6 +246,7 @@ def project(
                 camera,
                 near,
                 analytic,
+                limits,
                 opacities,
                 colors,
                 found,

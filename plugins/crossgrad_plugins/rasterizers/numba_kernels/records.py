@@ -48,6 +48,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
 FOUND = 8
 
+#: The published footprint: standard deviations, least square of half the difference of the
+#: variances (px^4), and side of its tiles, pixels.
+SIGMAS, LEAST_SPREAD, SQUARE = 3.0, 0.1, 16.0
+#: First and last pixel column, first and last pixel row.
+Rectangle = tuple[float, float, float, float]
+
 _LARGEST_RADIUS = 2.0**30
 # Projected values beyond this are dropped; well inside float32.
 _LARGEST = 1e30
@@ -122,12 +128,15 @@ def _place(
     extent_y: float,
     width: int,
     height: int,
+    within: Rectangle,
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
-) -> tuple[float, float, float, float]:
+) -> Rectangle:
     """Writes mean and tile box of record j; returns its pixels x0, x1, y0, y1 (x0 > x1: none)."""
-    x0, x1 = first_pixel(u - extent_x), last_pixel(u + extent_x, width)
-    y0, y1 = first_pixel(v - extent_y), last_pixel(v + extent_y, height)
+    x0 = max(first_pixel(u - extent_x), within[0])
+    x1 = min(last_pixel(u + extent_x, width), within[1])
+    y0 = max(first_pixel(v - extent_y), within[2])
+    y1 = min(last_pixel(v + extent_y, height), within[3])
     if x0 > x1 or y0 > y1:
         return 1.0, 0.0, 1.0, 0.0
     at = j * RECORD
@@ -143,6 +152,47 @@ def _place(
 
 
 @device
+def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple[int, Rectangle]:
+    """Returns the published radius of projected Gaussian k and the pixels that it may touch.
+
+    They are those of the 16 x 16 tiles that a square of that half-side around the mean overlaps; a
+    square off the image has radius 0 (3DGS: three standard deviations, at least of variance 0.1).
+    """
+    u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
+    a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)
+    nothing = 0, (1.0, 0.0, 1.0, 0.0)
+    half = 0.5 * (a - c)
+    largest = 0.5 * (a + c) + math.sqrt(max(LEAST_SPREAD, half * half + b * b))
+    # A sum that is not finite fails the comparison.
+    if not (get(found, DETERMINANT, k) > 0.0 and abs(u) + abs(v) + largest < _LARGEST):
+        return nothing
+    radius = np.ceil(SIGMAS * math.sqrt(largest))
+    x0, x1 = first_tile(u - radius), last_tile(u + radius)
+    y0, y1 = first_tile(v - radius), last_tile(v + radius)
+    if x0 > x1 or y0 > y1 or x0 * SQUARE >= width or y0 * SQUARE >= height:
+        return nothing
+    pixels = (
+        x0 * SQUARE,
+        min(x1 * SQUARE + SQUARE, np.float64(width)) - 1.0,
+        y0 * SQUARE,
+        min(y1 * SQUARE + SQUARE, np.float64(height)) - 1.0,
+    )
+    return np.int32(min(radius, _LARGEST_RADIUS)), pixels
+
+
+@device
+def first_tile(low: float) -> float:
+    """Returns the first tile of the published grid that is not before `low`, pixels."""
+    return max(np.floor((low - 0.5) / SQUARE), 0.0)
+
+
+@device
+def last_tile(high: float) -> float:
+    """Returns the last tile of the published grid that is not beyond `high`, pixels; -1: none."""
+    return max(np.floor((high - 0.5) / SQUARE), -1.0)
+
+
+@device
 def _radius(extent: float) -> int:
     """Returns the radius that is reported for a footprint of half-extent `extent`."""
     return np.int32(max(1.0, np.ceil(min(extent, _LARGEST_RADIUS))))
@@ -155,6 +205,7 @@ def plain_record(
     opacity: float,
     width: int,
     height: int,
+    within: Rectangle,
     found: NDArray[np.float64],
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
@@ -177,7 +228,7 @@ def plain_record(
     ):
         return 0
     extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
-    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, within, records, boxes)
     if x0 > x1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
         return 0
     at = j * RECORD
@@ -215,6 +266,7 @@ def analytic_record(
     opacity: float,
     width: int,
     height: int,
+    within: Rectangle,
     found: NDArray[np.float64],
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
@@ -236,7 +288,7 @@ def analytic_record(
         return 0
     extent_x = abs(cosine) * reach_1 + abs(sine) * reach_2
     extent_y = abs(sine) * reach_1 + abs(cosine) * reach_2
-    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, records, boxes)
+    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, within, records, boxes)
     if x0 > x1:
         return 0
     axis, sigma, reach = (cosine, sine), (sigma_1, sigma_2), (reach_1, reach_2)
