@@ -54,7 +54,8 @@ def files(package):
 
 
 def compiled(caplog):
-    return [record.getMessage() for record in caplog.records if record.levelno == logging.INFO]
+    said = [record.getMessage() for record in caplog.records if record.levelno == logging.INFO]
+    return [text for text in said if text.startswith("compiling")]
 
 
 @pytest.fixture(autouse=True)
