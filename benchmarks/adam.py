@@ -15,8 +15,9 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.optimizer import AdamState, adam_step
-from crossgrad_core.threads import configure_threads
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.training.adam.adam import adam_step
 
 FLOATS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "f_dc": 3, "f_rest": 45}
 

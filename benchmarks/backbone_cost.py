@@ -18,11 +18,11 @@ import torch
 from _machine import facts
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.scene.types import Scene
-from crossgrad_core.spherical import SH_C0
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import assemble, read_scene
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, warm_up

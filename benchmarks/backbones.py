@@ -23,8 +23,8 @@ from threading import Lock
 import numpy as np
 from _machine import code, facts
 
-from crossgrad_core.results.metrics_csv import read_metrics
-from crossgrad_core.results.summary import read_summary
+from crossgrad_core.run.results.metrics_csv import read_metrics
+from crossgrad_core.run.results.summary import read_summary
 
 RESULTS = Path(__file__).with_name("results")
 BACKBONES = ("vanilla", "scaffold", "pixel", "mip", "analytic", "octree")

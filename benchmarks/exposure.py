@@ -14,8 +14,8 @@ from statistics import mean
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.opening import opened
-from crossgrad_core.training.export import renderer
+from crossgrad_core.run.export import renderer
+from crossgrad_core.run.opening import opened
 
 
 def psnr(image: NDArray[np.float64], photo: NDArray[np.float64]) -> float:

@@ -12,10 +12,10 @@ from typing import cast
 
 import torch
 from _machine import facts
+from support.extremes import cases, jittered, outcome
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.registry import build, entries
-from crossgrad_core.testing.extremes import cases, jittered, outcome
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.fixtures import sample_camera
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

@@ -20,8 +20,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.diagnostics.grouped import Groups
-from crossgrad_core.diagnostics.intervals import split_intervals
+from crossgrad_plugins.diagnostics.grouped import Groups
+from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
 
 HEAVY = ("student3", "radial5", "lognormal")
 KINDS = ("normal", "decaying", *HEAVY, "finite")

@@ -15,8 +15,9 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.photometric import l1_ssim_loss, photometric_loss
-from crossgrad_core.threads import configure_threads
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.training.loss.loss import photometric_loss
+from crossgrad_core.training.loss.reference import l1_ssim_loss
 
 
 def timed(loss: Callable[[Tensor], Tensor], image: Tensor, reps: int) -> list[float]:

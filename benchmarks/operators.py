@@ -24,15 +24,15 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.aggregation import operator_context
-from crossgrad_core.blocks import Block, BlockKind, LearningRate
-from crossgrad_core.contexts import AggregateContext
-from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
-from crossgrad_core.gradients import ViewGradients
-from crossgrad_core.operator import Operator
-from crossgrad_core.registry import build, entries
-from crossgrad_core.state import EMPTY_STATE
-from crossgrad_core.threads import configure_threads
+from crossgrad_core.contract.aggregation import operator_context
+from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
+from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.entries import build, entries
 
 #: Block -> elements per Gaussian and kind, as in the vanilla backbone with SH degree 3.
 WIDTHS: dict[str, tuple[int, BlockKind]] = {

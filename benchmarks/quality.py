@@ -14,8 +14,8 @@ from statistics import mean, stdev
 
 from _machine import facts
 
-from crossgrad_core import app
-from crossgrad_core.results.summary import read_summary
+from crossgrad_core.run import app
+from crossgrad_core.run.results.summary import read_summary
 
 
 def settings(arguments: argparse.Namespace, method: str, seed: int, out: Path) -> dict[str, object]:

@@ -21,10 +21,10 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.gaussians import Gaussians, Render
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.registry import build
-from crossgrad_core.scene.types import Camera
+from crossgrad_core.contract.gaussians import Gaussians, Render
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.registry.entries import build
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 

@@ -18,12 +18,13 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.optimizer import AdamState, adam_step
-from crossgrad_core.photometric import photometric_loss
-from crossgrad_core.scene.types import Camera
-from crossgrad_core.schedule import Phase, Schedule
-from crossgrad_core.spherical import SH_C0
-from crossgrad_core.threads import configure_threads
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
 #: Late enough for SH degree 3 in the published schedule.

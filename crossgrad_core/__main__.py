@@ -1,6 +1,6 @@
 """The command `crossgrad`, and `python -m crossgrad_core`."""
 
-from crossgrad_core.interrupts import ended_quietly
+from crossgrad_core.system.interrupts import ended_quietly
 
 
 def main() -> None:

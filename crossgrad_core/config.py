@@ -5,8 +5,8 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator
 
-from crossgrad_core.scene.options import SceneOptions
-from crossgrad_core.schedule import ScheduleMode
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.contract.schedule import ScheduleMode
 
 #: Name of a choice that the run makes at its start.
 AUTO: Final = "auto"

@@ -5,10 +5,10 @@ Names that are listed here keep their meaning within a minor version; see docs/p
 
 from pydantic import Field
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Block, BlockKind, LearningRate, Parameters
-from crossgrad_core.component import Component, Selection, ViewCounts
-from crossgrad_core.contexts import (
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.contract.component import Component, Selection, ViewCounts
+from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
     Aggregated,
@@ -26,22 +26,22 @@ from crossgrad_core.contexts import (
     StepRecord,
     ViewRecord,
 )
-from crossgrad_core.densifier import Densifier
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
+from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.observer import Observer
+from crossgrad_core.contract.operator import Granularity, Operator, OperatorContext
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.reader import Reader
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.gradients import ViewGradients
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.observer import Observer
-from crossgrad_core.operator import Granularity, Operator, OperatorContext
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.reader import Reader
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.scene.options import SceneOptions
-from crossgrad_core.scene.types import Camera, Photo, Scene, Similarity, View
-from crossgrad_core.schedule import Phase, Schedule
-from crossgrad_core.state import EMPTY_STATE, PluginState
-from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows
 
 __all__ = [
     "EMPTY_STATE",

@@ -22,13 +22,13 @@ from crossgrad_backbones.distances import (
     told_apart,
 )
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.blocks import Block, LearningRate, Parameters
-from crossgrad_core.component import Selection
-from crossgrad_core.contexts import RegularizeContext, Regularized
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.scene.types import Camera, Scene
-from crossgrad_core.schedule import Phase
+from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.contexts import RegularizeContext, Regularized
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.contract.schedule import Phase
 
 #: Tensor of the scale that distances are measured on.
 SCALE = "distances"

@@ -13,13 +13,13 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
 from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
+from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.planting import planted, visible_share
-from crossgrad_core.blocks import Block, LearningRate, Parameters
-from crossgrad_core.component import Selection
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.lattice import Lattice
-from crossgrad_core.scene.types import Camera, Scene
-from crossgrad_core.schedule import Phase
+from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.contract.schedule import Phase
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
 

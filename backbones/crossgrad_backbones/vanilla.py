@@ -10,14 +10,14 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Block, LearningRate, Parameters
-from crossgrad_core.component import Selection
-from crossgrad_core.elementwise import sigmoid
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.scene.types import Camera, Scene
-from crossgrad_core.schedule import Phase
-from crossgrad_core.spherical import COEFFICIENTS, SH_C0
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.numerics.spherical import COEFFICIENTS, SH_C0
 from crossgrad_core.splats import nearest_neighbour_scales
 
 #: Opacity of a new Gaussian.

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from textwrap import fill
 
-from crossgrad_core import registry
 from crossgrad_core.errors import UserError
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.testing.checking import Result, check_entry
 from crossgrad_core.wording import did_you_mean, sentences, singular
 

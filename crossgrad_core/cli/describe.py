@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from crossgrad_core import registry
-from crossgrad_core.component import Component
+from crossgrad_core.contract.component import Component
+from crossgrad_core.registry import entries as registry
 from crossgrad_core.wording import listed, singular
 
 _WIDTH = 80

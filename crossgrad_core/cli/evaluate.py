@@ -29,7 +29,7 @@ def evaluate(
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()
-    from crossgrad_core import afterwards
+    from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
     afterwards.evaluate(run, how)

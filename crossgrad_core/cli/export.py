@@ -51,7 +51,7 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()
-    from crossgrad_core import afterwards
+    from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
     afterwards.export(run, file_format=file_format.value, out=out, camera=camera, how=how)

@@ -8,11 +8,13 @@ import typer
 from typer.main import get_command
 
 from crossgrad_core import __version__
-from crossgrad_core.cli import diagnose, evaluate, export, plugins, render, run, stress
+from crossgrad_core.cli import evaluate, export, plugins, render, run
 from crossgrad_core.cli.grouped import GroupedCommand
 from crossgrad_core.cli.startup import finish
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.errors import UserError
+from crossgrad_operators.stress import cli as stress
+from crossgrad_plugins.diagnostics import cli as diagnose
 
 #: Exit status after bad input.
 BAD_INPUT = 2

@@ -4,10 +4,10 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core import registry
 from crossgrad_core.cli.grouped import GroupedCommand
 from crossgrad_core.errors import UserError
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.wording import did_you_mean, listed, sentences
 
 app = typer.Typer(

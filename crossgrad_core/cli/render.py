@@ -43,7 +43,7 @@ def render(
 ) -> None:
     """Draw the views of a run as PNG files."""
     announce()
-    from crossgrad_core import afterwards
+    from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
     afterwards.render(run, split=split.value, out=out, how=how)

@@ -326,7 +326,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         del given[name]
     settings = merged(config, given, assignments or [])
 
-    from crossgrad_core import app
+    from crossgrad_core.run import app
 
     code = app.run(
         settings,

@@ -12,9 +12,9 @@ import yaml
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, singular
-from crossgrad_core.yaml_values import described, read_mapping, read_yaml
 
 Settings: TypeAlias = dict[str, Any]
 

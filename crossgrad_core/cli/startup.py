@@ -13,10 +13,10 @@ from typing import Final
 from typing_extensions import override
 
 from crossgrad_core import __version__
-from crossgrad_core.terminal import is_live
+from crossgrad_core.system.terminal import is_live
 
 #: The logger that speaks of kernels, and how its messages begin.
-KERNELS: Final = "crossgrad_core.kernel_cache"
+KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
 #: Seconds between lines about kernels where stderr is no terminal, and where it is one.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 10.0, 1.0
 _PACKAGE = "crossgrad_core"

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene.blank_photos import without_blank_photos
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.raw_checks import check_points, check_views
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
 from crossgrad_core.scene.split import split_views
-from crossgrad_core.scene.types import Camera, Scene, View
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:

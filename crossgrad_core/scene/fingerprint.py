@@ -8,10 +8,10 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos import FilePhoto
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
-from crossgrad_core.scene.types import Camera, Scene, View
 
 #: Version of the layout; raised whenever an older reader could misread a newer fingerprint.
 FORMAT: Final = 1

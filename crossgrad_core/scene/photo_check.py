@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from threading import Event, Thread, get_native_id
 
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos import FilePhoto
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_core.scene.wording import name_some
 
 _LOG = logging.getLogger(__name__)

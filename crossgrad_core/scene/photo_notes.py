@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene import pillow
 from crossgrad_core.scene.decode import RESIZE_FILTER
 from crossgrad_core.scene.headers import PhotoHeader
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.photo_files import PhotoFolder
 from crossgrad_core.scene.photos import PhotoSource
 from crossgrad_core.scene.wording import count, megapixels, name_some

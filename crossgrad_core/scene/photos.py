@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.contract.scene import Photo
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize, turn
-from crossgrad_core.scene.types import Photo
 
 _Decoded = tuple[Tensor, Tensor | None]
 

@@ -6,8 +6,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.types import Camera, Scene, View
 
 #: An axis, or where to take it from.
 Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]

@@ -7,8 +7,8 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count, name_some
 

@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.scene.types import Camera
+from crossgrad_core.contract.scene import Camera
 
 NEAR, FAR = "near", "far"
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.wording import count, name_some
 
 TRAIN_LIST = "train_list.txt"

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.blocks import Block, LearningRate
-from crossgrad_core.contexts import AggregateContext, Aggregated
-from crossgrad_core.dense_gradients import DenseViewGradients
-from crossgrad_core.operator import Operator
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.gradients.separate import DenseViewGradients
 from crossgrad_core.testing.contract import (
     Check,
     Make,

@@ -7,13 +7,13 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Parameters, primitives_of
-from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
-from crossgrad_core.topology import Edit, apply_to_parameters
 from crossgrad_core.wording import listed
 
 #: Steps at which decoding is looked at: before the first, early, the last.

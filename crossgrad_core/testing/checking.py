@@ -7,9 +7,9 @@ from importlib import import_module
 from typing import Any, TypeAlias
 from unittest import SkipTest
 
-from crossgrad_core import registry
 from crossgrad_core.errors import UserError
-from crossgrad_core.places import defined_at, raised_at
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.places import defined_at, raised_at
 from crossgrad_core.wording import in_one_line, singular
 
 #: `check(make)`, see `crossgrad_core.testing.contract`; of any slot.

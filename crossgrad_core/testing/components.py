@@ -2,9 +2,9 @@
 
 from pydantic import ValidationError
 
-from crossgrad_core.component import Component
+from crossgrad_core.contract.component import Component
 from crossgrad_core.errors import UserError
-from crossgrad_core.manager import make_manager
+from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.testing.contract import Check, ContractError, Make, require
 from crossgrad_core.wording import in_one_line, listed
 

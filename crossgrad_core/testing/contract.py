@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.component import Component, ViewCounts
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.component import Component, ViewCounts
+from crossgrad_core.contract.state import PluginState
 
 C = TypeVar("C", bound=Component)
 

@@ -8,15 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Parameters, primitives_of
-from crossgrad_core.contexts import DensifyContext, ViewRecord
-from crossgrad_core.densifier import Densifier
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.gaussians import Screen
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.topology import Edit, NoEdit, apply_to_parameters, gather_indices
 from crossgrad_core.errors import UserError
-from crossgrad_core.gaussians import Screen
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.registry import build, entries, load
-from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
@@ -29,7 +30,6 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
-from crossgrad_core.topology import Edit, NoEdit, apply_to_parameters, gather_indices
 
 #: Steps of the published schedule around its second and third edit, at 600 and 700.
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))

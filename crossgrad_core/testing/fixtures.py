@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.scene.types import Camera, Scene, View
-from crossgrad_core.schedule import Phase, Schedule
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.testing.posed import posed_scene, posed_view
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,

@@ -10,8 +10,9 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import torch
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.contexts import (
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.contexts import (
     AggregateContext,
     Aggregated,
     Answer,
@@ -25,21 +26,20 @@ from crossgrad_core.contexts import (
     Sampled,
     StepRecord,
 )
-from crossgrad_core.densifier import Densifier
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.manager import call_seam, make_manager
-from crossgrad_core.observer import Observer
-from crossgrad_core.optimizer import AdamState
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.registry import build
-from crossgrad_core.schedule import Schedule
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.observer import Observer
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.topology import NO_EDIT
+from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.manager import call_seam, make_manager
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, require, revived
 from crossgrad_core.testing.densifiers import DensifierRun
 from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
-from crossgrad_core.topology import NO_EDIT
 
 #: The hooks of one run's manager; pluggy gives them no types.
 Hooks: TypeAlias = Any

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.blocks import BlockKind
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.blocks import BlockKind
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.testing.aggregation import AGGREGATION_CHECKS
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (

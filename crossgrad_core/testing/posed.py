@@ -8,11 +8,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from crossgrad_core.contexts import Draw, SampleContext, StepRecord
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.scene.types import Camera, Scene, Similarity, View
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 
 
 class _Blank:

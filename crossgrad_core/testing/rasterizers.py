@@ -6,9 +6,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from crossgrad_core.gaussians import Gaussians, Render, Screen
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.registry import build
+from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_camera, sample_gaussians

@@ -5,10 +5,10 @@ from typing import cast
 
 import numpy as np
 
-from crossgrad_core.contexts import Draw
-from crossgrad_core.grouping import Grouping
-from crossgrad_core.registry import build
-from crossgrad_core.sampler import Sampler
+from crossgrad_core.contract.contexts import Draw
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,

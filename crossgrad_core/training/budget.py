@@ -6,8 +6,8 @@ from dataclasses import replace
 from math import ceil
 from typing import Protocol
 
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.assemble import growth_note, schedule_of
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.run.assemble import growth_note, schedule_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched

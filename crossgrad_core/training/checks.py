@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.contexts import StepRecord
+from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState

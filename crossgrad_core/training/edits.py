@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import (
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import (
     Edit,
     NoEdit,
     apply_to_moment,

@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 
 import torch
 
-from crossgrad_core.contexts import StepRecord
+from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.keeper import Keeper

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from crossgrad_core.contexts import ViewRecord
+from crossgrad_core.contract.contexts import ViewRecord
 
 #: Copies of the parameters that are always alive: themselves, two moments, the last good state.
 STANDING = 6

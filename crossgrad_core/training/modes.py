@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from crossgrad_core.grouping import Grouping
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.scene import Scene
 from crossgrad_core.scene.bimodality import bimodality
-from crossgrad_core.scene.types import Scene
 
 #: Sarle's coefficient of a uniform sample, cut off: what lies below has one mode.
 ONE_MODE = 0.555

@@ -7,11 +7,11 @@ from math import isfinite
 import numpy as np
 import torch
 
-from crossgrad_core.contexts import AggregateContext
-from crossgrad_core.dense_gradients import DenseViewGradients
+from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.operator import Operator
-from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.gradients.separate import DenseViewGradients
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
 
-from crossgrad_core.scene.types import Scene
+from crossgrad_core.contract.scene import Scene
 
 
 @contextmanager

@@ -9,16 +9,16 @@ import pluggy
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Block
-from crossgrad_core.component import Selection
 from crossgrad_core.config import RunConfig
-from crossgrad_core.densifier import Densifier
-from crossgrad_core.operator import Operator
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.scene.types import Scene, View
-from crossgrad_core.schedule import Phase, Schedule
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Block
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.training.operator_scale import OperatorScale
 
 

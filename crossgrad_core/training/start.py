@@ -7,10 +7,10 @@ from time import perf_counter
 
 import numpy as np
 
-from crossgrad_core.blocks import Parameters
-from crossgrad_core.manager import make_manager
-from crossgrad_core.optimizer import AdamState
-from crossgrad_core.scene.types import Scene
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
@@ -43,7 +43,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
         if reading.init == "random":
             scene = with_random_points(scene, rng)
         return setup.backbone.create(scene, rng)
-    from crossgrad_core.ply import read_ply
+    from crossgrad_core.ply.file import read_ply
 
     cloud = read_ply(reading.init_file).to_local(setup.scene.similarity)
     return setup.backbone.adopt(cloud.to_gaussians(), setup.scene, rng)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from crossgrad_core.blocks import Parameters, primitives_of
-from crossgrad_core.contexts import StepRecord
-from crossgrad_core.optimizer import AdamState
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from crossgrad_core.blocks import LearningRate
-from crossgrad_core.contexts import (
+from crossgrad_core.contract.blocks import LearningRate
+from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
     Aggregated,
@@ -20,9 +20,9 @@ from crossgrad_core.contexts import (
     Sampled,
     StepRecord,
 )
-from crossgrad_core.manager import call_seam
-from crossgrad_core.optimizer import adam_step
-from crossgrad_core.topology import Edit, NoEdit
+from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.registry.manager import call_seam
+from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-from crossgrad_core.interrupts import end_at_once, listened_to, tell
+from crossgrad_core.system.interrupts import end_at_once, listened_to, tell
 
 #: What the user is told at the first and at the second signal; the third one ends the process.
 _WORDS = (

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contexts import Draw, Model, RegularizeContext, ViewRecord
-from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
-from crossgrad_core.gaussians import Gaussians, Render
-from crossgrad_core.gradients import ViewGradients
-from crossgrad_core.photometric import photometric_loss
-from crossgrad_core.scene.types import View
+from crossgrad_core.contract.contexts import Draw, Model, RegularizeContext, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, Render
+from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.scene import View
+from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState

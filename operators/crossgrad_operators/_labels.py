@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import cast
 
-from crossgrad_core.component import Selection
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.operator import OperatorContext
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import Grouping
-from crossgrad_core.operator import OperatorContext
 
 
 def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.operator import OperatorContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.operator import OperatorContext
+from crossgrad_core.contract.state import PluginState
 
 #: More Gramians than this are those of primitives.
 _BLOCKS = 64

@@ -6,10 +6,10 @@ from typing import Annotated, Any, TypeAlias, cast
 
 from pydantic import BeforeValidator, PlainSerializer
 
-from crossgrad_core.component import Selection
-from crossgrad_core.operator import Operator
-from crossgrad_core.registry import build, entries
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.registry.entries import build, entries
 
 STATE_SEPARATOR = "/"
 

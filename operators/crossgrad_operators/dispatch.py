@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 from typing_extensions import override
 
-from crossgrad_core.blocks import BlockKind
-from crossgrad_core.component import Selection
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.blocks import BlockKind
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._nested import (
     OperatorField,
     inner_idle,

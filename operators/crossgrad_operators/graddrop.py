@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contexts import AggregateContext, Aggregated
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
 
 
 class GradDrop(Operator):

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import Selection
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import Json, PluginState
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._weights import weighting

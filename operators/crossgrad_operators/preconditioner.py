@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 #: Bounds of r / r_ref: a camera at the centroid must not lose all weight.

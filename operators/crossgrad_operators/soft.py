@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import Selection
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._pairs import project, slot_order
 
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 from typing_extensions import override
 
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
 from crossgrad_operators._weights import weighting
 
 _Value: TypeAlias = bool | int | float | str

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.operator import Operator, OperatorContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
 
 
 class UPGrad(Operator):

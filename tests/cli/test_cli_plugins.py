@@ -3,12 +3,13 @@
 import sys
 
 import pytest
+from support.distributions import write_distribution
 
-from crossgrad_core import __version__, registry
+from crossgrad_core import __version__
 from crossgrad_core.cli import main as command
 from crossgrad_core.cli.main import main
-from crossgrad_core.slots import GROUPS
-from crossgrad_core.testing.distributions import write_distribution
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 
 OPERATOR = """
 import numpy as np

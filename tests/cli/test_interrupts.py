@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from support.scenes import write_tiny_scene
 
-from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_core.training.stopper import _WORDS
 
 #: Sends itself a signal when a module is about to be imported, or when a line has been written.
@@ -89,8 +89,8 @@ def test_what_is_ignored_stays_ignored():
 def test_files_that_are_being_written_do_not_stay(tmp_path):
     program = (
         "import os, pathlib, signal, sys\n"
-        "from crossgrad_core.files import atomic_file\n"
-        "from crossgrad_core.interrupts import ended_quietly\n"
+        "from crossgrad_core.system.files import atomic_file\n"
+        "from crossgrad_core.system.interrupts import ended_quietly\n"
         "with ended_quietly(), atomic_file(pathlib.Path(sys.argv[1])) as file:\n"
         "    file.write(b'half')\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -119,8 +119,8 @@ import importlib, json, os, signal, sys, threading
 
 import matplotlib.pyplot, scipy.spatial, skimage.metrics, torch
 from crossgrad_core import __main__ as command, app, evaluation
-from crossgrad_core.results import curve, panels
-from crossgrad_core.photometric import fused
+from crossgrad_core.run.results import curve, panels
+from crossgrad_core.training.loss import fused
 from crossgrad_plugins.rasterizers.numba_kernels import frame
 
 def trap(number, moments):
@@ -157,10 +157,10 @@ WAY_ON = "continue with: crossgrad run --resume 'a run'"
 STOPPING, SAVING = _WORDS
 STEP = "crossgrad_core.training.loop.take_step"
 OPTIMIZE = "crossgrad_core.training.step._optimize"
-SESSION = "crossgrad_core.training.session:Session."
+SESSION = "crossgrad_core.run.session:Session."
 #: Signal, calls at which it is sent, what is said, steps in the summary, whether there are results.
 CASES = {
-    "before the folder": (signal.SIGINT, ["crossgrad_core.app._new_folder"],
+    "before the folder": (signal.SIGINT, ["crossgrad_core.run.app._new_folder"],
                           ["interrupted"], None, False),
     "before the first step": (signal.SIGINT, [SESSION + "__init__"],
                               ["interrupted", WAY_ON], None, False),

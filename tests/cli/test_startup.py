@@ -27,7 +27,7 @@ sys.stderr = Writing()
 from crossgrad_core.__main__ import main
 main()
 """
-LOG = logging.getLogger("crossgrad_core.kernel_cache")
+LOG = logging.getLogger("crossgrad_core.numerics.kernel_cache")
 STAGES = logging.getLogger("crossgrad_core.training.start")
 
 

@@ -8,9 +8,9 @@ import sys
 import threading
 
 import pytest
+from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli import streams
-from crossgrad_core.testing.scenes import write_tiny_scene
 
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 

@@ -7,10 +7,11 @@ from itertools import product
 from pathlib import Path
 
 import pytest
+from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli.main import main
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training import assemble, start
+from crossgrad_core.run import assemble
+from crossgrad_core.training import start
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ Ours are taken by distribution: somebody else's plugin in this environment is no
 
 import pytest
 
-from crossgrad_core import registry
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.testing.checking import checks_of
 
 CASES = [

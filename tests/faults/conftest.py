@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 from crossgrad_faults.runs import Nursery, undisturbed
-
-from crossgrad_core.testing.scenes import write_tiny_scene
+from support.scenes import write_tiny_scene
 
 #: How many kills, and how many of the writes, in the short version; `make faults` sets more.
 SHORT = 3

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.run import assemble as assembling
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import assemble as assembling
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

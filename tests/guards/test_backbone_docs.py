@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crossgrad_core.registry import entries, load
+from crossgrad_core.registry.entries import entries, load
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {"backbones": DOCS / "backbones.md", "densifiers": DOCS / "densifiers.md"}

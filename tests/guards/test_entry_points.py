@@ -7,9 +7,9 @@ from importlib.util import find_spec
 
 import pytest
 
-from crossgrad_core import registry
-from crossgrad_core.component import Component
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.contract.component import Component
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 
 SHELVES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
 OURS = [

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from crossgrad_core.hooks import HookSpecs
+from crossgrad_core.contract.hooks import HookSpecs
 
 ROOT = Path(__file__).parents[2]
 HOOKS = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 from crossgrad_core.training.operator_scale import OperatorScale
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core import plugin
-from crossgrad_core.slots import GROUPS
+from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.testing.checking import checks_of
 
 ROOT = Path(__file__).parents[2]

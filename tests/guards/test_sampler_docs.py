@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {"samplers": DOCS / "samplers.md", "groupings": DOCS / "groupings.md"}

@@ -8,7 +8,7 @@ from typer.main import get_command
 
 from crossgrad_core.cli.main import app
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.contract.scene_options import SceneOptions
 
 PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")
 MODELS = {"run": RunConfig, "reading": SceneOptions}

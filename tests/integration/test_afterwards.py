@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import afterwards, app
 from crossgrad_core.errors import UserError
-from crossgrad_core.ply import read_ply
-from crossgrad_core.results.lock import locked
-from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.ply.file import read_ply
+from crossgrad_core.run import afterwards, app
+from crossgrad_core.run.results.lock import locked
 
 STEPS = 4
 

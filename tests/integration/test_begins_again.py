@@ -6,13 +6,13 @@ import shutil
 
 import pytest
 import torch
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import afterwards, app
-from crossgrad_core.checkpoint import latest, load
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.lock import locked
-from crossgrad_core.results.metrics_csv import read_metrics
-from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.run import afterwards, app
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.results.lock import locked
+from crossgrad_core.run.results.metrics_csv import read_metrics
 
 MEASURED = {"psnr", "ssim", "ssim_skimage", "primitives", "loss", "views"}
 

@@ -4,16 +4,16 @@ import csv
 
 import pytest
 import torch
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import app
-from crossgrad_core.checkpoint import latest, load
 from crossgrad_core.cli.main import main
-from crossgrad_core.diagnostics.app import diagnose
-from crossgrad_core.diagnostics.command import Options
 from crossgrad_core.errors import UserError
-from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.run import app
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.training import loop
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_plugins.diagnostics.app import diagnose
+from crossgrad_plugins.diagnostics.command import Options
 
 FILES = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
 QUICK = Options(per_group=4, probes=2, seconds=1.0)
@@ -163,8 +163,8 @@ def diagnosed(scene, out):
 def test_a_training_that_fails_reports_its_probes_and_the_reason(
     scene, tmp_path, monkeypatch, capfd
 ):
-    monkeypatch.setattr("crossgrad_core.diagnostics.command.steps_for", lambda *given: (40, ""))
-    monkeypatch.setattr("crossgrad_core.diagnostics.command.warm_up", lambda setup: 0.0)
+    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.steps_for", lambda *given: (40, ""))
+    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.warm_up", lambda setup: 0.0)
     failing_from(monkeypatch, 25)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()
@@ -180,8 +180,10 @@ def test_a_training_that_fails_before_the_first_probe_says_so(
     scene, tmp_path, monkeypatch, capfd, compiling
 ):
     if not compiling:
-        monkeypatch.setattr("crossgrad_core.diagnostics.command.steps_for", lambda *given: (40, ""))
-        monkeypatch.setattr("crossgrad_core.diagnostics.command.warm_up", lambda setup: 0.0)
+        monkeypatch.setattr(
+            "crossgrad_plugins.diagnostics.command.steps_for", lambda *given: (40, "")
+        )
+        monkeypatch.setattr("crossgrad_plugins.diagnostics.command.warm_up", lambda setup: 0.0)
     failing_from(monkeypatch, 1)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()

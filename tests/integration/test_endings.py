@@ -9,13 +9,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import app
-from crossgrad_core.checkpoint import latest, load
+from crossgrad_core.contract.hooks import hookimpl
 from crossgrad_core.errors import UserError
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training import assemble, session
+from crossgrad_core.run import app, assemble, session
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
 
 STEPS, FAILS_IN = 8, 5
 RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}

@@ -7,15 +7,15 @@ import pytest
 import torch
 from gsply import plyread
 from gsply.formats import EXPECTED_PROPERTIES_BY_SH_DEGREE
+from support.combinations import NEEDED
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.registry import offers
-from crossgrad_core.scene.types import Similarity
-from crossgrad_core.splat_cloud import SplatCloud
-from crossgrad_core.testing.combinations import NEEDED
+from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.ply.cloud import SplatCloud
+from crossgrad_core.registry.entries import offers
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.export import export_ply
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.assemble import assemble
-from crossgrad_core.training.export import export_ply
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

@@ -4,11 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import app
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.lock import locked
-from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.run import app
+from crossgrad_core.run.results.lock import locked
 
 
 @pytest.fixture(scope="module")

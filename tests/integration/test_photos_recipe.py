@@ -9,9 +9,9 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from crossgrad_core import app
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.run import app
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 ROOT = Path(__file__).parents[2]

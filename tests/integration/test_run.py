@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import app
-from crossgrad_core.checkpoint import latest, load
-from crossgrad_core.contexts import Aggregated, Densified, Regularized
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.ply import read_ply
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.topology import NO_EDIT, Edit, Rows
+from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
+from crossgrad_core.ply.file import read_ply
+from crossgrad_core.run import app
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
 
 #: Density control within a few dozen steps; by default it waits for step 500.
 GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}
@@ -244,7 +244,7 @@ class Poison:
 
 
 def poisoned(monkeypatch, poison):
-    from crossgrad_core.training import assemble
+    from crossgrad_core.run import assemble
 
     original = assemble._plugins
     monkeypatch.setattr(assemble, "_plugins", lambda *args: {**original(*args), "poison": poison})

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from support.scenes import write_tiny_scene
 
-from crossgrad_core import afterwards, app
-from crossgrad_core.afterwards import How
-from crossgrad_core.diagnostics import app as diagnostics
-from crossgrad_core.diagnostics.command import Options
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.scene_file import FILE
-from crossgrad_core.testing.scenes import write_tiny_scene
+from crossgrad_core.run import afterwards, app
+from crossgrad_core.run.afterwards import How
+from crossgrad_core.run.results.scene_file import FILE
+from crossgrad_plugins.diagnostics import app as diagnostics
+from crossgrad_plugins.diagnostics.command import Options
 
 NAMES = [f"{index:04}.png" for index in range(6)]
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-
-from crossgrad_core.testing.scenes import write_tiny_scene
+from support.scenes import write_tiny_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "plugin"
 

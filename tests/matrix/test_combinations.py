@@ -9,10 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-
-from crossgrad_core.errors import IncompatibleSelectionError
-from crossgrad_core.registry import load
-from crossgrad_core.testing.combinations import (
+from support.combinations import (
     SLOTS,
     STEPS,
     as_lines,
@@ -21,10 +18,13 @@ from crossgrad_core.testing.combinations import (
     from_lines,
     refused,
 )
+from support.pairwise import pairs_of, pairwise
+
+from crossgrad_core.errors import IncompatibleSelectionError
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.entries import load
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.pairwise import pairs_of, pairwise
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -99,7 +99,7 @@ def check_repeats(run, repetition):
 def test_exactly_the_written_combinations_are_refused_for_the_written_reasons():
     rows = every_combination()
     found = as_lines(refused(rows), rows)
-    assert found == WRITTEN, "python -m crossgrad_core.testing.combinations writes them anew"
+    assert found == WRITTEN, "python -m support.combinations writes them anew"
 
 
 @pytest.mark.parametrize("line", WRITTEN)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.threads import configure_threads
 
 #: torch shares out what has more than 32,768 elements; a share that no vector length divides.
 ROWS = 40_001

@@ -10,10 +10,10 @@ from torch.nn.functional import normalize
 from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.directional import ColorFit
 from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
-from crossgrad_core.elementwise import sigmoid
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.rasterizer import ALPHA_THRESHOLD
-from crossgrad_core.scene.types import Camera
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.numerics.elementwise import sigmoid
 
 #: The average is taken over at most so many cameras.
 BAKED_CAMERAS = 32

@@ -17,14 +17,14 @@ from crossgrad_backbones.anchors.decode import decoded
 from crossgrad_backbones.anchors.frustum import in_frustum
 from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_backbones.anchors.volume import mean_volume
-from crossgrad_core.blocks import Parameters
-from crossgrad_core.contexts import RegularizeContext, Regularized
+from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.contexts import RegularizeContext, Regularized
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD
+from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.contract.schedule import Phase
 from crossgrad_core.errors import UserError
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.rasterizer import ALPHA_THRESHOLD
-from crossgrad_core.scene.types import Camera, Scene
-from crossgrad_core.schedule import Phase
 
 
 @dataclass(frozen=True)

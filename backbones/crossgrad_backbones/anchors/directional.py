@@ -6,7 +6,7 @@ from math import pi, sqrt
 import torch
 from torch import Tensor
 
-from crossgrad_core.spherical import SH_C0
+from crossgrad_core.numerics.spherical import SH_C0
 
 #: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).
 _SH_C1 = sqrt(3.0 / (4.0 * pi))

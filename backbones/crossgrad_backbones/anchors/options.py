@@ -8,9 +8,9 @@ from typing_extensions import override
 
 from crossgrad_backbones.anchors import appearance
 from crossgrad_backbones.anchors.heads import Heads
-from crossgrad_core.backbone import Backbone
-from crossgrad_core.blocks import Block, BlockKind, LearningRate
-from crossgrad_core.component import Selection
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
+from crossgrad_core.contract.component import Selection
 
 _FROZEN = LearningRate(0.0)
 

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.lattice import Lattice
+from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_core.splats import nearest_neighbour_scales
 
 

@@ -5,8 +5,8 @@ import torch
 from crossgrad_example.clip import STATE, Clip
 from crossgrad_example.equal_length import EqualLength
 
-from crossgrad_core.contexts import Aggregated
-from crossgrad_core.manager import call_seam, make_manager
+from crossgrad_core.contract.contexts import Aggregated
+from crossgrad_core.registry.manager import call_seam, make_manager
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 
 

@@ -8,11 +8,9 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.component import Selection
-from crossgrad_core.contexts import DensifyContext
-from crossgrad_core.state import PluginState
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
-from crossgrad_plugins.densifiers.screen_statistics import (
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.screen_statistics import (
     add,
     mean,
     ndc_abs_gradient,
@@ -20,6 +18,8 @@ from crossgrad_plugins.densifiers.screen_statistics import (
     sums,
     visible,
 )
+from crossgrad_core.contract.state import PluginState
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
 
 #: Criterion -> the thresholds that it compares with.
 _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {

@@ -5,11 +5,12 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contexts import DensifyContext
-from crossgrad_core.elementwise import logsigmoid
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, sums, visible
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import Rows
+from crossgrad_core.numerics.elementwise import logsigmoid
 from crossgrad_core.splats import rotation_matrices
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import Rows
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,
@@ -17,7 +18,6 @@ from crossgrad_plugins.densifiers.direction_scores import (
     ndc_directions,
     plane_scores,
 )
-from crossgrad_plugins.densifiers.screen_statistics import add, mean, ndc_gradient, sums, visible
 from crossgrad_plugins.densifiers.split_position import split_positions
 
 

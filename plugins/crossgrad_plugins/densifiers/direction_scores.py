@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.contexts import ViewRecord
-from crossgrad_plugins.densifiers.screen_statistics import half_size
+from crossgrad_core.contract.contexts import ViewRecord
+from crossgrad_core.contract.screen_statistics import half_size
 
 #: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5

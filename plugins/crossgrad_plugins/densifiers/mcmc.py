@@ -10,20 +10,20 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.blocks import Parameters
-from crossgrad_core.contexts import (
+from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.contexts import (
     AfterStepContext,
     Densified,
     DensifyContext,
     RegularizeContext,
     Regularized,
 )
-from crossgrad_core.densifier import Densifier
-from crossgrad_core.elementwise import sigmoid
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import NO_EDIT, Edit, NoEdit, Rows
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
+from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_plugins.densifiers.position_noise import position_noise
 from crossgrad_plugins.densifiers.relocation import Pool
 

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.contexts import DensifyContext
-from crossgrad_core.densifier import Densifier
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import NO_EDIT, Edit, NoEdit
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit
 
 
 class NoDensification(Densifier):

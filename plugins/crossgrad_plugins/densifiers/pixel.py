@@ -5,10 +5,10 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contexts import DensifyContext, ViewRecord
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, pixels, sums
+from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
-from crossgrad_plugins.densifiers.screen_statistics import add, mean, ndc_gradient, pixels, sums
 
 
 class PixelDensityControl(CloneSplit):

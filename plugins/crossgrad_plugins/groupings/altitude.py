@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.scene.poses import altitudes, upward
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -9,10 +9,10 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
 from crossgrad_core.scene.poses import centers_of, radial_distances
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.scene.poses import footprint_of
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

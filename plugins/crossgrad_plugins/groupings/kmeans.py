@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.scene.poses import centers_of, radial_distances
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.scene.types import Scene, View
-from crossgrad_core.text_files import read_rows
+from crossgrad_core.system.text_files import read_rows
 from crossgrad_plugins.groupings.split import require_training_views
 
 

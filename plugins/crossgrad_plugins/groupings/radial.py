@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.scene.poses import radial_distances
-from crossgrad_core.scene.types import Scene, View
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

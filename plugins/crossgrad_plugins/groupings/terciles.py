@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.grouping import GradientProbe, Grouping, Labelling, Quantity
-from crossgrad_core.scene.types import Scene, View
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import label_by_shares
 

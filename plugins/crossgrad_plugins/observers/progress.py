@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
-from crossgrad_core.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.observer import Observer
-from crossgrad_core.results.lines import (
+from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.observer import Observer
+from crossgrad_core.run.results.lines import (
     Pace,
     evaluation_line,
     figures,
     length_lines,
     progress_line,
 )
-from crossgrad_core.terminal import is_live
+from crossgrad_core.system.terminal import is_live
 
 if TYPE_CHECKING:
     from tqdm import tqdm

@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
-from crossgrad_core.contexts import Draw, SampleContext, StepRecord
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.state import Json, PluginState
+from crossgrad_core.contract.component import ViewCounts
+from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_plugins.samplers.draws import training_views
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from crossgrad_core.contexts import Draw, SampleContext
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.contexts import Draw, SampleContext
+from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.samplers.draws import Deck, Order, draw
 
 

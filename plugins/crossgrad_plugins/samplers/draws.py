@@ -6,9 +6,9 @@ from typing import Literal, cast
 
 import numpy as np
 
-from crossgrad_core.contexts import SampleContext
+from crossgrad_core.contract.contexts import SampleContext
+from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
-from crossgrad_core.state import Json
 
 Order = Literal["iid", "distinct", "epoch"]
 

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.component import ViewCounts
-from crossgrad_core.contexts import Draw, SampleContext
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.component import ViewCounts
+from crossgrad_core.contract.contexts import Draw, SampleContext
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.samplers.draws import Deck, draw, training_views
 from crossgrad_plugins.samplers.groups import drawn
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
-from crossgrad_core.contexts import Draw, SampleContext
+from crossgrad_core.contract.contexts import Draw, SampleContext
 from crossgrad_core.errors import UserError
 
 

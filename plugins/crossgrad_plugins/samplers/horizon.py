@@ -6,10 +6,10 @@ from typing import ClassVar, cast
 from pydantic import Field, PositiveInt
 from typing_extensions import override
 
-from crossgrad_core.component import Selection, ViewCounts
-from crossgrad_core.contexts import Draw, SampleContext
-from crossgrad_core.sampler import Sampler
-from crossgrad_core.state import Json, PluginState
+from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.contexts import Draw, SampleContext
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_plugins.samplers.draws import Deck, draw
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Generator
 from typing import Any, Literal
 
-from crossgrad_core.hooks import HookSpecs
+from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.plugin import Field, Observer, hookimpl
 
 ERRORS = {"RuntimeError": RuntimeError, "MemoryError": MemoryError, "OSError": OSError}

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.extremes import jittered
 
 from crossgrad_backbones.anchors import decode as decoding
 from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.volume import mean_volume
 from crossgrad_backbones.scaffold import Scaffold
-from crossgrad_core.testing.extremes import jittered
+from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.topology import Edit, apply_to_parameters
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 CAMERA = replace(sample_camera(), width=9, height=6, fx=7.5, fy=7.5, cx=4.5, cy=3.0)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from support.scenes import write_tiny_scene
 
 from crossgrad_backbones.baking import as_plain
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.gaussians import Gaussians
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.run.assemble import assemble, read_scene
+from crossgrad_core.run.export import export_ply
 from crossgrad_core.testing.fixtures import sample_gaussians, sample_scene
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training.assemble import assemble, read_scene
-from crossgrad_core.training.export import export_ply
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

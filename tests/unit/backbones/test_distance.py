@@ -10,7 +10,7 @@ import torch
 from crossgrad_backbones.distance import DistanceConditioned
 from crossgrad_backbones.distances import encoded, fitted_scale
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contexts import RegularizeContext
+from crossgrad_core.contract.contexts import RegularizeContext
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene, step_fields
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

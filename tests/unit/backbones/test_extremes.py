@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from support.extremes import cases, jittered, outcome
 
-from crossgrad_core.registry import build, offers
-from crossgrad_core.testing.extremes import cases, jittered, outcome
+from crossgrad_core.registry.entries import build, offers
 from crossgrad_core.testing.fixtures import sample_camera
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

@@ -17,8 +17,8 @@ from crossgrad_backbones.levels.fitting import (
     root_above,
     root_cell,
 )
+from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.planting import planted, visible_share
-from crossgrad_core.lattice import Lattice
 
 
 def quantile(values, q):

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.octree import Octree
 from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.lattice import Lattice
-from crossgrad_core.photometric import photometric_loss
-from crossgrad_core.schedule import Phase, Schedule
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.assemble import assemble
+from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 WHOLE = {

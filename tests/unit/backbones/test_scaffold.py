@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.extremes import jittered
 
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size, voxel_centers
 from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contexts import RegularizeContext
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.spherical import SH_C0
-from crossgrad_core.testing.extremes import jittered
+from crossgrad_core.contract.contexts import RegularizeContext
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

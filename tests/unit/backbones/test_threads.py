@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.registry import build, entries
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase
-from crossgrad_core.threads import configure_threads
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 

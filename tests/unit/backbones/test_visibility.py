@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.gaussians import posed_camera
 
 from crossgrad_backbones.visibility import columns_of, depths_in_view, finest_pixels
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.gaussians import posed_camera
 
 NEAR = 1e-3
 CAMERAS = [posed_camera(focal=focal) for focal in (15.0, 40.0)] + [

@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from crossgrad_core.aggregation import aggregate_by_gramians
-from crossgrad_core.blocks import Block, LearningRate
-from crossgrad_core.contexts import AggregateContext
-from crossgrad_core.dense_gradients import DenseViewGradients
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.aggregation import aggregate_by_gramians
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.gradients.separate import DenseViewGradients
 from crossgrad_core.testing.fixtures import step_fields
 from crossgrad_operators.pcgrad import PCGrad
 

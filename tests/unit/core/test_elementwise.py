@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from crossgrad_core.elementwise import BLOCK, logsigmoid, sigmoid, sigmoid_
-from crossgrad_core.threads import configure_threads
+from crossgrad_core.numerics.elementwise import BLOCK, logsigmoid, sigmoid, sigmoid_
+from crossgrad_core.numerics.threads import configure_threads
 
 FUNCTIONS = {
     "sigmoid": (sigmoid, torch.sigmoid),

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from crossgrad_core.evaluation import Evaluated, ViewMetrics, evaluate, summarised
-from crossgrad_core.scene.types import Camera, View
+from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.evaluation.evaluation import Evaluated, ViewMetrics, evaluate, summarised
 
 HEIGHT, WIDTH = 20, 32
 

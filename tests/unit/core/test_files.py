@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.files import (
+from crossgrad_core.system.files import (
     atomic_file,
     clear_leftovers,
     disk_errors,

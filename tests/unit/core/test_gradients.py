@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.aggregation import aggregate_by_gramians
-from crossgrad_core.blocks import Block, LearningRate
-from crossgrad_core.contexts import AggregateContext
-from crossgrad_core.dense_gradients import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.contract.aggregation import aggregate_by_gramians
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build
-from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.registry.entries import build
 from crossgrad_operators.sum import Sum
 from crossgrad_operators.symmetric import Symmetric
 
@@ -235,7 +235,7 @@ def test_threads_and_chunks_change_no_bit(views):
 
 
 def test_one_core_and_all_cores_give_the_same_bits():
-    from crossgrad_core.numba_kernels import dense
+    from crossgrad_core.gradients.numba_kernels import dense
 
     rows = torch.randn(3, 50_001, generator=torch.Generator().manual_seed(0))
     addresses = np.array([[row.data_ptr() for row in rows]])

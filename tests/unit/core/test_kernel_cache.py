@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossgrad_core.kernel_cache import fingerprint
+from crossgrad_core.numerics.kernel_cache import fingerprint
 
 KERNEL = """
-from crossgrad_core.jit import strict_kernel
+from crossgrad_core.numerics.jit import strict_kernel
 from {package}.numba_kernels.constants import STEP
 
 
@@ -60,7 +60,7 @@ def compiled(caplog):
 
 @pytest.fixture(autouse=True)
 def listening(caplog):
-    caplog.set_level(logging.INFO, "crossgrad_core.kernel_cache")
+    caplog.set_level(logging.INFO, "crossgrad_core.numerics.kernel_cache")
 
 
 def test_a_kernel_is_compiled_once(package, caplog):
@@ -191,8 +191,8 @@ def test_two_processes_that_compile_at_once_leave_both_results(package):
 
 
 def test_every_kernel_of_ours_is_keyed_by_the_files_that_it_inlines():
-    from crossgrad_core import kernel_cache
-    from crossgrad_core.photometric import fused
+    from crossgrad_core.numerics import kernel_cache
+    from crossgrad_core.training.loss.numba_kernels import fused
 
     names = {path.name for path in kernel_cache._sources(Path(fused.__file__))}
     assert {"fused.py", "terms.py", "windows.py", "simd.py", "reference.py"} <= names

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.lattice import Lattice
+from crossgrad_backbones.levels.lattice import Lattice
 
 ROUNDING = {"floor": (0.0, math.floor), "round": (0.5, round), "ceil": (1.0, math.ceil)}
 

@@ -5,10 +5,10 @@ import types
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from crossgrad_core.contexts import Densified, Draw, Sampled
+from crossgrad_core.contract.contexts import Densified, Draw, Sampled
 from crossgrad_core.errors import UserError
-from crossgrad_core.manager import call_seam, make_manager
 from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
+from crossgrad_core.registry.manager import call_seam, make_manager
 
 
 class Densifier:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from crossgrad_core.metrics import (
+from crossgrad_core.evaluation.metrics import (
     PSNR_LIMIT,
     lpips_unavailable_reason,
     psnr,
@@ -15,7 +15,7 @@ from crossgrad_core.metrics import (
     ssim,
     ssim_skimage,
 )
-from crossgrad_core.photometric import ssim_map
+from crossgrad_core.training.loss.reference import ssim_map
 
 
 def levels(seed, h=30, w=40):

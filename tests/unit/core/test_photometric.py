@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from crossgrad_core.photometric import l1_ssim_loss, photometric_loss, ssim_map
-from crossgrad_core.photometric.fused import loss_terms
-from crossgrad_core.photometric.reference import gaussian_window
+from crossgrad_core.training.loss.loss import photometric_loss
+from crossgrad_core.training.loss.numba_kernels.fused import loss_terms
+from crossgrad_core.training.loss.reference import gaussian_window, l1_ssim_loss, ssim_map
 
 H, W = 34, 46
 

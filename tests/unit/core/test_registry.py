@@ -3,12 +3,12 @@
 import sys
 
 import pytest
+from support.distributions import write_distribution
 
-from crossgrad_core import registry
+from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.errors import UserError
-from crossgrad_core.grouping import Grouping
-from crossgrad_core.slots import GROUPS
-from crossgrad_core.testing.distributions import write_distribution
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.slots import GROUPS
 
 GOOD = """
 from pydantic import Field

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.blocks import Block, LearningRate
-from crossgrad_core.dense_gradients import DenseViewGradients
-from crossgrad_core.numba_kernels import double_double
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.numerics import double_double
 
 RATE = LearningRate(1.0)
 BLOCKS = (

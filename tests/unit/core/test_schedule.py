@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from crossgrad_core.blocks import LearningRate
-from crossgrad_core.schedule import Schedule
+from crossgrad_core.contract.blocks import LearningRate
+from crossgrad_core.contract.schedule import Schedule
 
 
 def test_published_schedule_at_reference_length():

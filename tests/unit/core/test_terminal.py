@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from crossgrad_core.terminal import is_live
+from crossgrad_core.system.terminal import is_live
 
 fcntl = pytest.importorskip("fcntl")
 termios = pytest.importorskip("termios")

@@ -6,9 +6,9 @@ import numba
 import pytest
 import torch
 
-from crossgrad_core import threads
 from crossgrad_core.errors import UserError
-from crossgrad_core.threads import available_cores, configure_threads
+from crossgrad_core.numerics import threads
+from crossgrad_core.numerics.threads import available_cores, configure_threads
 
 
 @pytest.fixture(autouse=True)

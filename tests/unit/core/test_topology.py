@@ -2,9 +2,15 @@
 
 import torch
 
-from crossgrad_core.blocks import Block, LearningRate
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import Edit, Rows, apply_to_moment, apply_to_parameters, gather_indices
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import (
+    Edit,
+    Rows,
+    apply_to_moment,
+    apply_to_parameters,
+    gather_indices,
+)
 
 BLOCKS = (
     Block("means", ("means",), True, "geometry", LearningRate(1.0)),

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-from crossgrad_core.validation import as_user_error
+from crossgrad_core.registry.validation import as_user_error
 
 
 class Inner(BaseModel):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.yaml_values import MOST_VALUES, read_mapping, read_yaml, write_yaml
+from crossgrad_core.system.yaml_values import MOST_VALUES, read_mapping, read_yaml, write_yaml
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n"

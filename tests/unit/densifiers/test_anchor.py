@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_backbones.anchors.growth.cells import (
+    FARTHEST,
+    cells_of,
+    free_cells,
+    in_reach,
+    numbered,
+)
+from crossgrad_backbones.anchors.growth.control import AnchorControl
 from crossgrad_backbones.scaffold import Scaffold
-from crossgrad_core.contexts import DensifyContext, ViewRecord
-from crossgrad_core.gaussians import Gaussians, Screen
-from crossgrad_core.scene.types import Camera, View
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.state import PluginState
-from crossgrad_core.topology import NO_EDIT, apply_to_moment, apply_to_parameters
-from crossgrad_plugins.densifiers.anchor import AnchorControl
-from crossgrad_plugins.densifiers.cells import FARTHEST, cells_of, free_cells, in_reach, numbered
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_parameters
 
 SCHEDULE = AnchorControl().window(Schedule.for_run(30_000))
 CAMERA = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.eye(4, dtype=torch.float64))

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError
-from crossgrad_core.gaussians import Gaussians, Screen
-from crossgrad_core.scene.types import Camera, View
-from crossgrad_core.state import PluginState
+from crossgrad_core.run import assemble as assembling
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
-from crossgrad_core.topology import NO_EDIT, apply_to_parameters
-from crossgrad_core.training import assemble as assembling
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.dc4gs import DirectionalConsistency

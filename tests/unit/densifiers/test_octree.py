@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_backbones.anchors.growth.new_anchors import Urge
+from crossgrad_backbones.levels.lattice import Lattice
+from crossgrad_backbones.levels.octree_control import OctreeControl
+from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
 from crossgrad_backbones.octree import Octree
-from crossgrad_core.blocks import primitives_of
-from crossgrad_core.contexts import DensifyContext, ViewRecord
-from crossgrad_core.gaussians import Gaussians, Screen
-from crossgrad_core.lattice import Lattice
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.blocks import primitives_of
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.topology import Edit, apply_to_parameters, gather_indices
-from crossgrad_plugins.densifiers.new_anchors import Urge
-from crossgrad_plugins.densifiers.octree import OctreeControl
-from crossgrad_plugins.densifiers.octree_growing import Thresholds, grown, seen_from_farther
 
 ORIGIN, ROOT, FORK, DISTANCE = -1.1, 0.5, 2, 4.0
 THRESHOLDS = Thresholds(2e-4, 2**0.2)

@@ -6,15 +6,15 @@ from math import hypot
 import numpy as np
 import pytest
 import torch
+from support.gaussians import posed_camera
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contexts import DensifyContext, ViewRecord
-from crossgrad_core.gaussians import Gaussians, Screen
-from crossgrad_core.scene.types import View
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.state import PluginState
-from crossgrad_core.testing.gaussians import posed_camera
-from crossgrad_core.topology import NO_EDIT
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.scene import View
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl, quantile
 from crossgrad_plugins.densifiers.pixel import PixelDensityControl
 

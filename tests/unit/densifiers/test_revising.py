@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
+from support.brute_force import trace
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contexts import DensifyContext
-from crossgrad_core.registry import build
-from crossgrad_core.schedule import Phase, Schedule
-from crossgrad_core.state import EMPTY_STATE
-from crossgrad_core.testing.brute_force import trace
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_parameters
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene, step_fields
-from crossgrad_core.topology import NO_EDIT, apply_to_moment, apply_to_parameters
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.error_share import largest_shares, pixel_error, spread_views

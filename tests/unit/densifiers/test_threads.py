@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.registry import entries
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import assemble
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.entries import entries
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

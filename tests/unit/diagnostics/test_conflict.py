@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.diagnostics.conflict import conflict
-from crossgrad_core.diagnostics.distances import conflict_by_distance
-from crossgrad_core.diagnostics.exponent import distance_exponent
-from crossgrad_core.diagnostics.ratios import geometric_mean, gradient_ratio
+from crossgrad_plugins.diagnostics.conflict import conflict
+from crossgrad_plugins.diagnostics.distances import conflict_by_distance
+from crossgrad_plugins.diagnostics.exponent import distance_exponent
+from crossgrad_plugins.diagnostics.ratios import geometric_mean, gradient_ratio
 
 NEAR = np.array([True, True, False, False])
 

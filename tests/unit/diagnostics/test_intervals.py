@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossgrad_core.diagnostics.grouped import GroupedGramian, Groups
-from crossgrad_core.diagnostics.interval import Interval
-from crossgrad_core.diagnostics.intervals import split_intervals
-from crossgrad_core.diagnostics.pivots import StudentisedGap
-from crossgrad_core.diagnostics.resampling import Resamples, multiplicities
-from crossgrad_core.diagnostics.variance import split_of, variance_split
+from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
+from crossgrad_plugins.diagnostics.intervals.interval import Interval
+from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
+from crossgrad_plugins.diagnostics.intervals.pivots import StudentisedGap
+from crossgrad_plugins.diagnostics.intervals.resampling import Resamples, multiplicities
+from crossgrad_plugins.diagnostics.variance import split_of, variance_split
 
 
 def benchmark():

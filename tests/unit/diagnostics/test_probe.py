@@ -4,19 +4,20 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contexts import Model
-from crossgrad_core.diagnostics import probe
-from crossgrad_core.diagnostics.cameras import camera_rows, distances_of, grouping_rows
-from crossgrad_core.diagnostics.plan import labelled, plan_probe
-from crossgrad_core.diagnostics.probe import ModelProbe, measure
-from crossgrad_core.diagnostics.report import read_probes, write_csv
-from crossgrad_core.diagnostics.table import ALL, table
-from crossgrad_core.diagnostics.watch import Watch
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.contexts import Model
 from crossgrad_core.errors import UserError
-from crossgrad_core.optimizer import AdamState, adam_step
-from crossgrad_core.photometric import photometric_loss
-from crossgrad_core.registry import build
+from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
+from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.loss.loss import photometric_loss
+from crossgrad_plugins.diagnostics import probe
+from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
+from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
+from crossgrad_plugins.diagnostics.probe import ModelProbe, measure
+from crossgrad_plugins.diagnostics.report import read_probes, write_csv
+from crossgrad_plugins.diagnostics.table import ALL, table
+from crossgrad_plugins.diagnostics.watch import Watch
 
 VIEWS = (0, 2, 5, 8)
 

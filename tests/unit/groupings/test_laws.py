@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.groupings.anchors import Anchors
 from crossgrad_plugins.groupings.gmm import GaussianMixture

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from crossgrad_core.contexts import EvaluationReport, StepRecord
-from crossgrad_core.manager import make_manager
+from crossgrad_core.contract.contexts import EvaluationReport, StepRecord
+from crossgrad_core.registry.manager import make_manager
 from crossgrad_plugins.observers.progress import Progress
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from crossgrad_core.operator import OperatorContext
-from crossgrad_core.registry import build
-from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.contract.operator import OperatorContext
+from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.registry.entries import build
 
 
 @dataclass

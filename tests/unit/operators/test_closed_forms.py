@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.registry import build
+from crossgrad_core.registry.entries import build
 
 ROOT = np.sqrt(2)
 #: g1 = (1, 0), g2 = (-1, 1): a = 1, b = 2, m = -1, cos = -1/sqrt 2.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.registry import build
+from crossgrad_core.registry.entries import build
 
 
 def pairs():

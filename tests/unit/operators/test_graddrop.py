@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.state import EMPTY_STATE
-from crossgrad_core.stress.reference import Views
-from crossgrad_core.stress.runner import BLOCK, context_of
 from crossgrad_operators.graddrop import GradDrop
+from crossgrad_operators.stress.reference import Views
+from crossgrad_operators.stress.runner import BLOCK, context_of
 
 
 def drop(*gradients, seed=0):

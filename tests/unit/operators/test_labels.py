@@ -2,8 +2,8 @@
 
 import pytest
 
-from crossgrad_core.component import Selection
-from crossgrad_core.registry import build
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.registry.entries import build
 
 LABELLED = "operator {} needs labelled views; sampler random draws from no groups"
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build
-from crossgrad_core.state import EMPTY_STATE, PluginState
+from crossgrad_core.registry.entries import build
 
 CONFLICT = np.array([[1.0, 0.0], [-0.5, 1.0]])
 AGREEMENT = np.array([[1.0, 0.0], [0.5, 1.0]])

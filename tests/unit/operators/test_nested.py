@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from crossgrad_core.component import Selection, ViewCounts
+from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build
-from crossgrad_core.state import EMPTY_STATE
+from crossgrad_core.registry.entries import build
 from crossgrad_operators.chain import Chain
 from crossgrad_operators.dispatch import Dispatch
 from crossgrad_operators.pcgrad import PCGrad

@@ -8,23 +8,23 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.errors import UserError
-from crossgrad_core.operator import Operator
-from crossgrad_core.stress.case import short
-from crossgrad_core.stress.exact import exact_gramian
-from crossgrad_core.stress.reference import answer
-from crossgrad_core.stress.search.batch import Batch, results, search_views
-from crossgrad_core.stress.search.examine import examine
-from crossgrad_core.stress.search.families import FAMILIES, rounded
-from crossgrad_core.stress.search.finite import as_text, run_finite
-from crossgrad_core.stress.search.loop import Extent, fresh, search
-from crossgrad_core.stress.search.quick import QUICK, exact
-from crossgrad_core.stress.search.repeat import read_rows
-from crossgrad_core.stress.search.report import failed
-from crossgrad_core.stress.search.shrink import shrunk
-from crossgrad_core.stress.search.specimens import Specimen
-from crossgrad_core.stress.search.subject import Subject, subject_of
-from crossgrad_core.stress.suite import made, reference_of
+from crossgrad_operators.stress.case import short
+from crossgrad_operators.stress.exact import exact_gramian
+from crossgrad_operators.stress.reference import answer
+from crossgrad_operators.stress.search.batch import Batch, results, search_views
+from crossgrad_operators.stress.search.examine import examine
+from crossgrad_operators.stress.search.families import FAMILIES, rounded
+from crossgrad_operators.stress.search.finite import as_text, run_finite
+from crossgrad_operators.stress.search.loop import Extent, fresh, search
+from crossgrad_operators.stress.search.quick import QUICK, exact
+from crossgrad_operators.stress.search.repeat import read_rows
+from crossgrad_operators.stress.search.report import failed
+from crossgrad_operators.stress.search.shrink import shrunk
+from crossgrad_operators.stress.search.specimens import Specimen
+from crossgrad_operators.stress.search.subject import Subject, subject_of
+from crossgrad_operators.stress.suite import made, reference_of
 from crossgrad_operators.symmetric import Symmetric
 
 BOTH = (torch.float32, torch.float64)
@@ -211,7 +211,7 @@ def test_the_command_searches_and_repeats_what_it_prints():
 
 
 def test_the_command_tells_of_broken_promises_by_its_exit_status(monkeypatch):
-    from crossgrad_core.stress.search import subject
+    from crossgrad_operators.stress.search import subject
 
     monkeypatch.setattr(subject, "subject_of", lambda _name, _made: symmetric_as(SeldomOff()))
     found = stress("symmetric", "--search", "0.5", "--type", "float32")

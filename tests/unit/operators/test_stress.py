@@ -9,13 +9,13 @@ import torch
 from typer.testing import CliRunner
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import entries
-from crossgrad_core.stress.case import Case, short
-from crossgrad_core.stress.cases import cases
-from crossgrad_core.stress.runner import Reference, run_case
-from crossgrad_core.stress.suite import made, reference_of, run_suite
-from crossgrad_core.stress.table import as_text, failed, write_csv
-from crossgrad_core.stress.verdict import ExactCase
+from crossgrad_core.registry.entries import entries
+from crossgrad_operators.stress.case import Case, short
+from crossgrad_operators.stress.cases import cases
+from crossgrad_operators.stress.runner import Reference, run_case
+from crossgrad_operators.stress.suite import made, reference_of, run_suite
+from crossgrad_operators.stress.table import as_text, failed, write_csv
+from crossgrad_operators.stress.verdict import ExactCase
 from crossgrad_operators.symmetric import Symmetric
 
 OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
@@ -112,7 +112,7 @@ def test_the_table_shows_errors_times_and_failures(tmp_path):
 
 def test_the_command_tells_by_its_exit_status(monkeypatch):
     from crossgrad_core.cli.main import app
-    from crossgrad_core.stress import suite
+    from crossgrad_operators.stress import suite
 
     arguments = ["stress", "symmetric", "--case", "conflict", "--elements", "1000"]
     good = CliRunner().invoke(app, arguments)

@@ -10,7 +10,7 @@ from torchjd import aggregation
 from torchjd.linalg import QuadprogProjector
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build
+from crossgrad_core.registry.entries import build
 
 TOLERANCE = 1e-6
 VIEWS = (2, 3, 4, 6)

@@ -17,13 +17,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 import torch
+from support.brute_force import trace
+from support.brute_gradients import pixel_gradients, places
+from support.gaussians import posed_camera, random_gaussians
 
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.registry import build, entries, load
-from crossgrad_core.scene.types import Camera
-from crossgrad_core.testing.brute_force import trace
-from crossgrad_core.testing.brute_gradients import pixel_gradients, places
-from crossgrad_core.testing.gaussians import posed_camera, random_gaussians
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.registry.entries import build, entries, load
 
 REFERENCE = "torch"
 OURS = [name for name, entry in entries("rasterizers").items() if entry.distribution == "crossgrad"]

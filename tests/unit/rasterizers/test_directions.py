@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.brute_gradients import pixel_gradients
+from support.gaussians import posed_camera, random_gaussians, smooth_gaussians
 
-from crossgrad_core.registry import build
-from crossgrad_core.testing.brute_gradients import pixel_gradients
-from crossgrad_core.testing.gaussians import posed_camera, random_gaussians, smooth_gaussians
+from crossgrad_core.registry.entries import build
 
 OUTPUTS = frozenset({"directions", "abs_gradient", "depth", "pixels"})
 CAMERA = posed_camera(40, 28, focal=40.0)

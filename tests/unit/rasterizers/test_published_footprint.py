@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.rasterizer import Rasterizer
-from crossgrad_core.registry import build
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run import assemble as assembling
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
-from crossgrad_core.training import assemble as assembling
 from crossgrad_plugins.rasterizers.reference.projection import project
 
 NAMES = ("torch", "numba")

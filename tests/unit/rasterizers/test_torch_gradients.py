@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.brute_force import trace
+from support.gaussians import posed_camera, random_gaussians, smooth_gaussians
 
-from crossgrad_core.testing.brute_force import trace
-from crossgrad_core.testing.gaussians import posed_camera, random_gaussians, smooth_gaussians
 from crossgrad_plugins.rasterizers.reference import compositing
 from crossgrad_plugins.rasterizers.reference.projection import project
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

@@ -6,11 +6,11 @@ from math import ceil, erf, exp, log, pi, sqrt
 import numpy as np
 import pytest
 import torch
+from support.brute_force import trace
+from support.gaussians import posed_camera, random_gaussians
 
-from crossgrad_core.gaussians import Gaussians
-from crossgrad_core.scene.types import Camera
-from crossgrad_core.testing.brute_force import trace
-from crossgrad_core.testing.gaussians import posed_camera, random_gaussians
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Camera
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 BLACK = torch.zeros(3, dtype=torch.float64)

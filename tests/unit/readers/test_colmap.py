@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.scenes import write_tiny_scene
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.options import SceneOptions
-from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.evaluation import EvaluationResult, ViewMetrics, summarised
-from crossgrad_core.results.totals import Totals
-from crossgrad_core.scene.types import Camera, View
+from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.evaluation.evaluation import EvaluationResult, ViewMetrics, summarised
+from crossgrad_core.run.results.totals import Totals
 
 
 class ArrayPhoto:

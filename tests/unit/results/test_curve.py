@@ -7,8 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from crossgrad_core.results.curve import draw_curve
-from crossgrad_core.results.metrics_csv import Row
+from crossgrad_core.run.results.curve import draw_curve
+from crossgrad_core.run.results.metrics_csv import Row
 
 
 def make_rows(count: int, regimes: tuple[str, ...] = ("far", "near")) -> list[Row]:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.folder import RunName, create_run_folder, expected_bytes
-from crossgrad_core.results.lock import locked
+from crossgrad_core.run.results.folder import RunName, create_run_folder, expected_bytes
+from crossgrad_core.run.results.lock import locked
 
 STARTED = datetime(2026, 3, 5, 9, 8, 7).astimezone()
 NAME = RunName("boruszyn", "vanilla", "near-far", "pcgrad", STARTED)

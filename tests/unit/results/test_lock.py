@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.lock import FILE, RunInUseError, locked, writer_of
+from crossgrad_core.run.results.lock import FILE, RunInUseError, locked, writer_of
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from crossgrad_core.results.lock import locked
+from crossgrad_core.run.results.lock import locked
 with locked(Path(sys.argv[1]), "training"):
     print("locked", flush=True)
     time.sleep(60)

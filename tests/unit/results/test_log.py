@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from crossgrad_core.contexts import EvaluationReport, StepRecord
-from crossgrad_core.manager import make_manager
-from crossgrad_core.results.lines import Pace, duration, evaluation_line, progress_line
-from crossgrad_core.results.log import RunLog
+from crossgrad_core.contract.contexts import EvaluationReport, StepRecord
+from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.run.results.lines import Pace, duration, evaluation_line, progress_line
+from crossgrad_core.run.results.log import RunLog
 
 
 def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0.5) -> StepRecord:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.metrics_csv import (
+from crossgrad_core.run.results.metrics_csv import (
     MetricsCsv,
     columns_for,
     metrics_row,

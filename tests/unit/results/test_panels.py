@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from crossgrad_core.evaluation import Evaluated, ViewMetrics
-from crossgrad_core.results.panel_names import chosen_views, flat_names
-from crossgrad_core.results.panels import PanelWriter, draw_panel, error_map
+from crossgrad_core.evaluation.evaluation import Evaluated, ViewMetrics
+from crossgrad_core.run.results.panel_names import chosen_views, flat_names
+from crossgrad_core.run.results.panels import PanelWriter, draw_panel, error_map
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.environment import environment
-from crossgrad_core.results.metrics_csv import metrics_row
-from crossgrad_core.results.per_view import write_per_view
-from crossgrad_core.results.summary import Summary, read_summary, write_summary
-from crossgrad_core.results.table import final_table
-from crossgrad_core.results.totals import Seconds
+from crossgrad_core.run.results.environment import environment
+from crossgrad_core.run.results.metrics_csv import metrics_row
+from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.summary import Summary, read_summary, write_summary
+from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.results.totals import Seconds
 
 
 @pytest.fixture(name="summary")

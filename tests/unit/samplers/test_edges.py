@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.component import Selection
+from crossgrad_core.contract.component import Selection
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
 from crossgrad_plugins.samplers.fps import FarthestPoint, farthest_point_order
 from crossgrad_plugins.samplers.horizon import Horizon

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from crossgrad_core.registry import build
-from crossgrad_core.state import PluginState
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
 
 TWO = ("near",) * 4 + ("far",) * 7

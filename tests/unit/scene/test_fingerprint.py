@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.results.scene_file import FILE, check_scene, read_scene_file, write_scene
+from crossgrad_core.run.assemble import read_scene
+from crossgrad_core.run.results.scene_file import FILE, check_scene, read_scene_file, write_scene
 from crossgrad_core.scene.differences import Weight, differences
 from crossgrad_core.scene.fingerprint import END, FileMark, fingerprint_of, mark_of
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training.assemble import read_scene
 
 
 @pytest.fixture(scope="module")

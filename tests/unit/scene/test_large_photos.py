@@ -6,14 +6,14 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from support.scenes import write_tiny_scene
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene import pillow
 from crossgrad_core.scene.decode import decode_photo, resize
 from crossgrad_core.scene.headers import PhotoHeader, read_header
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.reduction import choose_reduction
-from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 resource = pytest.importorskip("resource")

@@ -5,13 +5,13 @@ from threading import Event, Timer
 
 import pytest
 import torch
+from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.scene.photo_check import check_photos, checked_meanwhile, fits
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training.assemble import read_scene
 
 SECONDS = 30
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_core.contract.scene import Camera
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
-from crossgrad_core.scene.types import Camera
 
 NONE = np.zeros(0, dtype=np.int64)
 

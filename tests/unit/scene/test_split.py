@@ -1,7 +1,7 @@
 import pytest
 
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.split import split_views
 
 NAMES = [f"{k:02d}.jpg" for k in range(28)]

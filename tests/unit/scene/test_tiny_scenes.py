@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-
-from crossgrad_core.testing.scenes import write_tiny_scene
+from support.scenes import write_tiny_scene
 
 
 def load(path):

@@ -11,7 +11,7 @@ import torch
 from pydantic import ConfigDict, field_serializer
 
 from crossgrad_core import plugin as api
-from crossgrad_core.registry import load
+from crossgrad_core.registry.entries import load
 from crossgrad_core.testing import (
     aggregation,
     backbones,

@@ -4,8 +4,7 @@ from itertools import product
 
 from hypothesis import given
 from hypothesis import strategies as st
-
-from crossgrad_core.testing.combinations import as_lines, every_combination, from_lines, refused
+from support.combinations import as_lines, every_combination, from_lines, refused
 
 ROWS = list(product("abc", "de", "fgh", "ij"))
 REASONS = ("needs K = 2; K = 1 was asked for", "has no: tensors", "is late")

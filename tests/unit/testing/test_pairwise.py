@@ -5,8 +5,7 @@ from itertools import combinations, product
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from crossgrad_core.testing.pairwise import pairs_of, pairwise
+from support.pairwise import pairs_of, pairwise
 
 
 def pairs(rows):

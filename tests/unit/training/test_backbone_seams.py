@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.blocks import Block, LearningRate
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.densifier import Densifier
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.errors import IncompatibleSelectionError
-from crossgrad_core.registry import build
-from crossgrad_core.state import PluginState
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.topology import NO_EDIT, Edit
-from crossgrad_core.training import assemble as assembling
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.training.start import first_state
 
 

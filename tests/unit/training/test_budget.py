@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.densifier import Densifier
-from crossgrad_core.registry import build
-from crossgrad_core.schedule import Schedule
-from crossgrad_core.training.assemble import growth_note
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import growth_note
 from crossgrad_core.training.budget import (
     Planned,
     Timed,

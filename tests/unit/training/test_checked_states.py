@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contexts import Densified
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.manager import make_manager
+from crossgrad_core.contract.contexts import Densified
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.topology import Edit, Rows
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.topology import Edit, Rows
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.loop import CHECK_EVERY, train
-from crossgrad_core.training.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.stopper import Stopper
 

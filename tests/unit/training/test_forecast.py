@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.registry import build
-from crossgrad_core.results.lines import roughly
-from crossgrad_core.schedule import Schedule
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.forecast import LOOK_STEPS, Forecast
+from crossgrad_core.run.results.lines import roughly
 from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
-from crossgrad_core.training.forecast import LOOK_STEPS, Forecast
 from crossgrad_core.training.state import Clock
 
 RUN = make_dataclass(

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.hooks import HookSpecs, hookimpl
-from crossgrad_core.manager import make_manager
+from crossgrad_core.contract.hooks import HookSpecs, hookimpl
+from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.persist import to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import train
-from crossgrad_core.training.persist import to_checkpoint
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper

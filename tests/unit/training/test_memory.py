@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.hooks import hookimpl
-from crossgrad_core.manager import make_manager
-from crossgrad_core.results.table import cost_line
-from crossgrad_core.results.totals import Totals
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.results.table import cost_line
+from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import memory, step
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes
 from crossgrad_core.training.start import first_state
 
@@ -113,7 +113,8 @@ def test_where_the_system_does_not_say_nothing_is_shown(monkeypatch):
 
 def test_no_module_of_ours_needs_one_that_only_some_systems_have():
     absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
-    ours = "import crossgrad_core.app, crossgrad_core.afterwards, crossgrad_core.diagnostics.app"
+    ours = "import crossgrad_core.run.app, crossgrad_core.run.afterwards\n"
+    ours += "import crossgrad_plugins.diagnostics.app"
     subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.component import ViewCounts
-from crossgrad_core.contexts import Aggregated
+from crossgrad_core.contract.component import ViewCounts
+from crossgrad_core.contract.contexts import Aggregated
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.errors import UserError
-from crossgrad_core.operator import Operator
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 from crossgrad_core.testing.contract import admitted
 from crossgrad_core.training.operator_scale import OperatorScale, Scale, neutral

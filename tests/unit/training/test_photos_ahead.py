@@ -6,8 +6,8 @@ from threading import Event, current_thread, main_thread
 import pytest
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import NoisePhoto, sample_scene
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.start import warm_up
 

@@ -3,17 +3,17 @@
 from pathlib import Path
 
 import pytest
+from support.scenes import write_tiny_scene
 
-from crossgrad_core.app import run
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.opening import set_up
-from crossgrad_core.registry import build, entries
+from crossgrad_core.registry.entries import build, entries
+from crossgrad_core.run.app import run
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.opening import set_up
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.scenes import write_tiny_scene
-from crossgrad_core.training.assemble import assemble
-from crossgrad_core.training.resolve import resolved
-from crossgrad_core.training.settings_for_nothing import refuse_settings_for_nothing
 
 IDLE = [
     ({"operator": {"name": "sum", "granularity": "gaussian"}}, "operator.granularity"),

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.export import export_ply
+from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.budget import lengthened
-from crossgrad_core.training.export import export_ply
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.resolve import resolved
 from crossgrad_core.training.start import first_state
 
 

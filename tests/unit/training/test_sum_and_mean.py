@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from support.combinations import NEEDED, every_combination, refused
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.testing.combinations import NEEDED, every_combination, refused
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.threads import configure_threads
-from crossgrad_core.training.assemble import assemble
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
 from crossgrad_backbones.anchors.panels import PANEL
-from crossgrad_core.elementwise import sigmoid_
+from crossgrad_core.numerics.elementwise import sigmoid_
 
 #: Anchors of a stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
 STRETCH = 2048

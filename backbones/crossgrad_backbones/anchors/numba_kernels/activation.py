@@ -13,7 +13,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_backbones.anchors.heads import COVARIANCE
-from crossgrad_core.jit import kernel, parallel_kernel
+from crossgrad_core.numerics.jit import kernel, parallel_kernel
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
     bits,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.gaussians import Response
+from crossgrad_core.contract.gaussians import Response
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import Pinhole
 
 Float32 = NDArray[np.float32]
@@ -158,7 +158,7 @@ class GaussianGradients:
         rest: [N, B - 1, 3], None without harmonics.
         centres: [N, 2] by the projected mean, per pixel.
         absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
-        directions: [N, 6, 5] of `crossgrad_core.gaussians.Screen`, None unless asked for.
+        directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`, None unless asked for.
     """
 
     means: Float32

@@ -13,7 +13,7 @@ final transmittance; the accumulated depth is one more colour channel.
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     broadcast,
     fma,

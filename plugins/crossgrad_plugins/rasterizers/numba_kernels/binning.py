@@ -7,7 +7,7 @@ consecutive slots; the tile lists are then filled in the order of depth.
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
     broadcast,

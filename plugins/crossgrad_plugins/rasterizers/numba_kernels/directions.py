@@ -2,13 +2,13 @@
 
 A pass of its own after the backward pass, for those who ask for it: it draws the tiles again with
 the same operations as `backward`, hence with the same gradients, and sums per entry and bin what
-`crossgrad_core.gaussians.Screen.directions` describes.
+`crossgrad_core.contract.gaussians.Screen.directions` describes.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
     Mask,

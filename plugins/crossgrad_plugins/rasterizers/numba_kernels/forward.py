@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     as_negative,
     bits,

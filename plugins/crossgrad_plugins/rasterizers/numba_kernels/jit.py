@@ -7,7 +7,7 @@ the tests that look for them.
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-from crossgrad_core.jit import compiled, inlined
+from crossgrad_core.numerics.jit import compiled, inlined
 
 P = ParamSpec("P")
 R = TypeVar("R")

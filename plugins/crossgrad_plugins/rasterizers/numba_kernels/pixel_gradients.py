@@ -7,7 +7,7 @@ other gradients need is left out.
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import (
+from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
     broadcast,

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.simd import LANES, Lanes, Mask, fnma, load, splat, store, where
+from crossgrad_core.numerics.simd import LANES, Lanes, Mask, fnma, load, splat, store, where
 from crossgrad_plugins.rasterizers.numba_kernels.constants import FINISHED, ONE, STOPPED
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (

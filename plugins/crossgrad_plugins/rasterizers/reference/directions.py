@@ -26,7 +26,7 @@ def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
 def binned_directions(
     gradients: Tensor, offsets: Tensor, axes: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """[G, BINS, FIELDS] of `crossgrad_core.gaussians.Screen.directions`, of some pixels.
+    """[G, BINS, FIELDS] of `crossgrad_core.contract.gaussians.Screen.directions`, of some pixels.
 
     Args:
         gradients: [2, P, G] by the projected mean of each Gaussian, of each pixel.

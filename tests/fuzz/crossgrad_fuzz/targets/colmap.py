@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from support.scenes import write_tiny_scene
 
-from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_fuzz.case import Case, load
 from crossgrad_fuzz.mutate import at_offsets
 from crossgrad_fuzz.target import Target

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from crossgrad_core import text_files
+from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene import split
-from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST, split_views
+from crossgrad_core.system import text_files
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.target import Target
 from crossgrad_plugins.groupings import lists

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from crossgrad_core import ply, ply_table
-from crossgrad_core.ply import PROPERTIES, read_ply, sh_degree_of, write_ply
-from crossgrad_core.scene.types import Similarity
-from crossgrad_core.splat_cloud import SplatCloud
+from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.ply import file as ply
+from crossgrad_core.ply import table as ply_table
+from crossgrad_core.ply.cloud import SplatCloud
+from crossgrad_core.ply.file import PROPERTIES, read_ply, sh_degree_of, write_ply
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from crossgrad_core import text_files
-from crossgrad_core.diagnostics import report
-from crossgrad_core.diagnostics.report import read_probes
-from crossgrad_core.results import metrics_csv, summary
-from crossgrad_core.results.metrics_csv import MetricsCsv, read_metrics
-from crossgrad_core.results.summary import read_summary
+from crossgrad_core.run.results import metrics_csv, summary
+from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
+from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.system import text_files
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target
+from crossgrad_plugins.diagnostics import report
+from crossgrad_plugins.diagnostics.report import read_probes
 
 _METRICS, _SUMMARY, _TABLE = metrics_csv.FILE, summary.FILE, "table.csv"
 _REGIMES = ("far", "near")

@@ -1,0 +1,1 @@
+"""How anchors grow and are pruned (Scaffold-GS)."""

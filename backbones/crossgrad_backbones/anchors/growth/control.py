@@ -1,0 +1,59 @@
+"""Growing and pruning of anchors (Scaffold-GS, Lu et al. 2024, section 3.3)."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
+from crossgrad_backbones.anchors.growth.anchor_growing import Level, grown
+from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
+from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.schedule import Schedule
+
+
+class AnchorControl(AnchorDensifier):
+    """Grows anchors into free cells of three sizes, coarse ones first."""
+
+    blocks: ClassVar[frozenset[str]] = AnchorDensifier.blocks | {"voxel_size"}
+
+    threshold_factor: float = Field(2.0, ge=1, description="factor of the threshold per level")
+    levels: int = Field(3, ge=1, description="sizes of cells, from coarse to fine")
+    coarsest: int = Field(16, ge=1, description="edge of the coarsest cell, voxels")
+    refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if self.levels > 1:
+            return {}
+        why = "there is one size of cells (levels = 1); leave it out"
+        return {"threshold_factor": why, "refinement": why}
+
+    @override
+    def window(self, schedule: Schedule) -> Schedule:
+        return replace(
+            schedule,
+            densify_from=schedule.anchors_from,
+            densify_every=schedule.anchors_every,
+            reset_every=None,
+        )
+
+    @override
+    def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:
+        levels = self._levels(float(parameters["voxel_size"]))
+        return grown(parameters, urge.gradient, urge.eligible, levels, context.rng)
+
+    def _levels(self, voxel: float) -> tuple[Level, ...]:
+        """The levels of growth for voxels of that edge."""
+        return tuple(
+            Level(
+                cell=voxel * max(1, self.coarsest // self.refinement**level),
+                threshold=self.grad_threshold * self.threshold_factor**level,
+                keep=1.0 - 0.5 ** (level + 1),
+            )
+            for level in range(self.levels)
+        )

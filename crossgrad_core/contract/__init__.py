@@ -1,0 +1,1 @@
+"""What plugins see: data, slots, components, contexts and hooks."""

@@ -1,0 +1,115 @@
+"""From the gradients of K views to one, by way of Gramians: what all Gramian operators share."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.contract.blocks import Block, BlockKind
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated
+from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.operator import Granularity, Operator, OperatorContext
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.errors import UserError
+
+
+def aggregate_by_gramians(
+    operator: Operator, context: AggregateContext, state: PluginState
+) -> tuple[Aggregated, PluginState]:
+    """One pass for the Gramians of all blocks, one small solve, one pass for the weighted sums.
+
+    Counts blocks (Gramians, under other granularities) in which some view's gradient is exactly
+    zero or absent (`zero`), some pair of non-zero gradients shares no element (`disjoint`), some
+    view was left out because it is not finite (`dropped`), or some pair has a negative dot product
+    (`conflict`).
+
+    Raises:
+        UserError: The operator answered with weights that are not finite.
+    """
+    gradients, granularity = context.gradients, operator.granularity
+    gramians = gradients.gramians(granularity)
+    present = gradients.present(granularity)
+    given = operator_context(context, granularity, present)
+    matrices, state = operator.transform(gramians, given, state, context.rng)
+    weights = np.where(present, _added_rows(matrices), 0.0)
+    if not np.isfinite(weights).all():
+        raise _not_finite(operator, given, weights)
+    # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
+    counts = _counts(gradients, granularity, gramians, present)
+    return Aggregated(gradients.combine(weights, granularity), counts), state
+
+
+def _added_rows(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[B, K] the sum over R of matrices [B, R, K]; row by row, as numpy is slow at short sums."""
+    total = np.zeros((matrices.shape[0], matrices.shape[2]))
+    for row in range(matrices.shape[1]):
+        total += matrices[:, row]
+    return total
+
+
+def operator_context(
+    context: AggregateContext, granularity: Granularity, present: NDArray[np.bool_]
+) -> OperatorContext:
+    """What a Gramian operator may know, from what the seam is offered."""
+    names = context.gradients.names(granularity)
+    return OperatorContext(
+        step=context.step,
+        blocks=names,
+        kinds=_kinds(names, context.blocks),
+        losses=context.losses,
+        labels=context.labels,
+        distances=context.distances,
+        reference_distance=context.reference_distance,
+        present=present,
+        unit=context.gradients.unit,
+        remainders=partial(context.gradients.remainders, granularity),
+    )
+
+
+def _kinds(names: Sequence[str], blocks: Sequence[Block]) -> tuple[BlockKind, ...]:
+    """Kinds of blocks; groups are named by their kind, the whole is neutral."""
+    known: dict[str, BlockKind] = {
+        "geometry": "geometry",
+        "appearance": "appearance",
+        "neutral": "neutral",
+        "all": "neutral",
+    }
+    known |= {block.name: block.kind for block in blocks}
+    return tuple(map(known.__getitem__, names))
+
+
+def _counts(
+    gradients: ViewGradients,
+    granularity: Granularity,
+    gramians: NDArray[np.float64],
+    present: NDArray[np.bool_],
+) -> dict[str, int]:
+    finite = gradients.finite(granularity)
+    pairs = present[:, :, None] & present[:, None, :]
+    disjoint = 0
+    if (pairs & (gramians == 0)).any():
+        disjoint = _some(pairs & ~gradients.overlap(granularity))
+    return {
+        "zero": _some(finite & ~present),
+        "disjoint": disjoint,
+        "dropped": _some(~finite),
+        "conflict": _some(gramians < 0),
+    }
+
+
+def _some(flags: NDArray[np.bool_]) -> int:
+    """In how many blocks any flag is set."""
+    return int(flags.reshape(len(flags), -1).any(axis=1).sum()) if flags.size else 0
+
+
+def _not_finite(
+    operator: Operator, context: OperatorContext, weights: NDArray[np.float64]
+) -> UserError:
+    block = context.blocks[int(np.argmax(~np.isfinite(weights).all(axis=1)))]
+    return UserError(
+        f"operator {type(operator).__name__} gave weights that are not finite",
+        where=f"block {block}, step {context.step}",
+        expected="finite weights for finite gradients",
+        todo="use another operator, or report this to the operator's author",
+    )

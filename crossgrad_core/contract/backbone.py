@@ -1,0 +1,92 @@
+"""The backbone slot: the trained representation."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.blocks import Block, Parameters
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.gaussians import Gaussians, Response
+from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.errors import UserError
+
+
+class Backbone(Component):
+    """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
+
+    Attributes:
+        default_densifier: Name of the densifier that is used unless the user names another.
+        response: How its Gaussians fill a pixel.
+        plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
+            PLY loses nothing.
+        own_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
+    """
+
+    slot: ClassVar[str] = "backbones"
+    default_densifier: ClassVar[str] = "adc"
+    response: ClassVar[Response] = "plain"
+    plain: ClassVar[bool] = False
+    own_dilation: ClassVar[bool] = False
+
+    @abstractmethod
+    def blocks(self) -> tuple[Block, ...]:
+        """The blocks; fixed for the life of the component."""
+
+    @abstractmethod
+    def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
+        """Initial parameters from the SfM points, float32 on the CPU."""
+
+    @abstractmethod
+    def decode(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Gaussians:
+        """The Gaussians that `camera` sees, differentiable in the parameters."""
+
+    def trained_blocks(self) -> tuple[Block, ...]:
+        """The blocks that get gradients."""
+        return tuple(block for block in self.blocks() if not block.frozen)
+
+    def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
+        """This backbone with options that the scene does not need left out, and what was left out.
+
+        Options that the user set are never changed.
+        """
+        return self, ()
+
+    def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
+        """Initial parameters from existing Gaussians (`--init FILE.ply`), float32 on the CPU.
+
+        Raises:
+            UserError: This backbone cannot start from Gaussians.
+        """
+        raise UserError(
+            "this backbone cannot start from a PLY of Gaussians",
+            where="--init",
+            found=type(self).__name__,
+            todo="use --init points, or a backbone of explicit Gaussians such as vanilla",
+        )
+
+    def prepare(self, parameters: Parameters, scene: Scene, phase: Phase) -> Parameters:
+        """Called before the first step and after every topology edit; returns the parameters.
+
+        A backbone that keeps derived tensors without gradient (filters, levels) renews them here.
+        """
+        return parameters
+
+    def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
+        """The tensor `opacities` [N] (logits) with no Gaussian drawn more opaque than `cap`."""
+        limit = torch.logit(torch.tensor(cap, dtype=torch.float64)).item()
+        return parameters["opacities"].detach().clamp(max=limit)
+
+    @abstractmethod
+    def bake(
+        self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
+    ) -> Gaussians:
+        """Plain SH Gaussians without a graph, for a standard PLY.
+
+        What depends on the view is baked as `cameras` (one or more) see it: on average, or as a
+        rule of the backbone's says.
+        """

@@ -1,0 +1,314 @@
+"""What the hooks are offered and what they answer with."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crossgrad_core.contract.blocks import Block, Parameters
+from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.topology import Edit, NoEdit
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.adam_state import AdamState
+    from crossgrad_core.contract.backbone import Backbone
+    from crossgrad_core.contract.gradients import ViewGradients
+    from crossgrad_core.contract.rasterizer import Rasterizer
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The views of one step.
+
+    Attributes:
+        views: K positions in `scene.train_views`.
+        labels: K group labels, or None where the sampler has no groups.
+    """
+
+    views: tuple[int, ...]
+    labels: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewRecord:
+    """One rendered view of a step, after its backward pass.
+
+    Attributes:
+        index: Position in `scene.train_views`.
+        view: The view.
+        label: Its group label, or None.
+        loss: Its own photometric loss.
+        gaussians: What was drawn, detached.
+        screen: Screen statistics, gradients included.
+        background: [3] RGB that it was drawn over.
+    """
+
+    index: int
+    view: View
+    label: str | None
+    loss: float
+    gaussians: Gaussians
+    screen: Screen
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What happened in a step; observers see it, samplers see the last one.
+
+    Attributes:
+        step: 1-based number of the step.
+        views: Positions in `scene.train_views`.
+        names: Their names.
+        labels: Their group labels, or None.
+        losses: Their photometric losses, in order.
+        primitives: Number after the step.
+        counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
+            `cloned`, `split`, `pruned`, `reset` primitives of the densification.
+        train_seconds: Training seconds since the start of the run, this step included.
+    """
+
+    step: int
+    views: tuple[int, ...]
+    names: tuple[str, ...]
+    labels: tuple[str, ...] | None
+    losses: tuple[float, ...]
+    primitives: int
+    counts: Mapping[str, int]
+    train_seconds: float
+
+
+#: The photo [H, W, 3] uint8 of a view and its mask [H, W] bool, None where every pixel counts.
+PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
+
+
+def decoded(view: View) -> tuple[Tensor, Tensor | None]:
+    """The photo and the mask of a view, decoded off any clock."""
+    return view.photo.image(), view.photo.mask()
+
+
+@dataclass(frozen=True, eq=False)
+class StepContext:
+    """What every seam may know about the step.
+
+    Attributes:
+        step: 1-based number of the step.
+        schedule: The schedule of the run.
+        scene: The scene.
+        states: State of every plugin by the plugin's name; read only.
+        rng: The generator of the seam. Every random number of a plugin must come from it.
+        photo: Gives the photo and the mask of a view on the run's device. The time for decoding
+            them counts as loading; `view.photo` would decode them in training time.
+    """
+
+    step: int
+    schedule: Schedule
+    scene: Scene
+    states: Mapping[str, PluginState]
+    rng: np.random.Generator
+    photo: PhotoOf = field(default=decoded, kw_only=True)
+
+    def state(self, plugin: str) -> PluginState:
+        """The state that the plugin of that name returned last; empty at first."""
+        return self.states.get(plugin, EMPTY_STATE)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleContext(StepContext):
+    """For `crossgrad_sample_views`.
+
+    Attributes:
+        views_per_step: K.
+        groups: Label of each training view, or None where no grouping was made.
+        centers: [N, 3] float64 camera centres of the training views, local frame.
+        last: Record of the step before, None in the first one.
+    """
+
+    views_per_step: int
+    groups: tuple[str, ...] | None
+    centers: NDArray[np.float64]
+    last: StepRecord | None
+
+
+@dataclass(frozen=True, eq=False)
+class AggregateContext(StepContext):
+    """For `crossgrad_aggregate_gradients`.
+
+    Attributes:
+        gradients: The gradients of the K views, opaque.
+        losses: [K] float64 photometric losses.
+        labels: K group labels, or None.
+        distances: [K] float64 distance of each camera from the mean training camera, local units.
+        reference_distance: Median of these distances over all training cameras.
+        blocks: The blocks, in the order of every Gramian's first dimension.
+    """
+
+    gradients: "ViewGradients"
+    losses: NDArray[np.float64]
+    labels: tuple[str, ...] | None
+    distances: NDArray[np.float64]
+    reference_distance: float
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RegularizeContext(StepContext):
+    """For `crossgrad_regularize`: called once per view, and once per step with `gaussians` None.
+
+    Attributes:
+        parameters: The parameters, requiring gradients.
+        backbone: The backbone.
+        gaussians: What the backbone decoded for this view, with its graph; None in the step's call.
+        view: The view; None in the step's call.
+    """
+
+    parameters: Parameters
+    backbone: "Backbone"
+    gaussians: Gaussians | None
+    view: View | None
+
+
+@dataclass(frozen=True, eq=False)
+class DensifyContext(StepContext):
+    """For `crossgrad_densify`, called after every step.
+
+    Attributes:
+        parameters: The parameters; to be changed through the answered edit only.
+        backbone: The backbone.
+        rasterizer: The rasterizer, for statistics of views that this step did not render.
+        views: The rendered views of the step with their screen statistics.
+        means_lr: Current learning rate of the primitives' positions.
+        room: How many primitives may still be added (`--max-gaussians`, memory guard).
+    """
+
+    parameters: Parameters
+    backbone: "Backbone"
+    rasterizer: "Rasterizer"
+    views: tuple[ViewRecord, ...]
+    means_lr: float
+    room: int
+
+
+@dataclass(frozen=True, eq=False)
+class AfterStepContext(StepContext):
+    """For `crossgrad_after_step`: noise, clamps, filters.
+
+    Attributes:
+        parameters: The parameters; to be changed through the answered edit only.
+        backbone: The backbone.
+        means_lr: Current learning rate of the primitives' positions.
+        edited: Whether density control changed the set of primitives in this step.
+    """
+
+    parameters: Parameters
+    backbone: "Backbone"
+    means_lr: float
+    edited: bool
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What every seam's answer carries: new states by plugin name."""
+
+    states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
+
+    def with_state(self, plugin: str, state: PluginState) -> Self:
+        """The same answer with a new state for the plugin of that name."""
+        return replace(self, states={**self.states, plugin: state})
+
+
+@dataclass(frozen=True)
+class Sampled(Answer):
+    """Answer of `crossgrad_sample_views`."""
+
+    draw: Draw
+
+
+@dataclass(frozen=True, eq=False)
+class Aggregated(Answer):
+    """Answer of `crossgrad_aggregate_gradients`.
+
+    Attributes:
+        gradients: Tensor name -> gradient, None where the optimizer must skip the tensor.
+        counts: Counted events of this step.
+    """
+
+    gradients: Mapping[str, Tensor | None]
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Regularized(Answer):
+    """Answer of `crossgrad_regularize`: a scalar to be minimised besides the photometric loss."""
+
+    loss: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Densified(Answer):
+    """Answer of `crossgrad_densify` and `crossgrad_after_step`: an edit, or an explicit NoEdit."""
+
+    edit: Edit | NoEdit
+
+
+@dataclass(frozen=True, eq=False)
+class RunInfo:
+    """What observers learn when a run starts.
+
+    Attributes:
+        folder: The output folder; None where nothing is written.
+        scene: The scene.
+        config: The resolved configuration as plain data.
+        schedule: The schedule.
+        blocks: The blocks of the backbone.
+        notes: What was chosen or left out, and why.
+    """
+
+    folder: Path | None
+    scene: Scene
+    config: Mapping[str, Any]
+    schedule: Schedule
+    blocks: tuple[Block, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The model between two steps, for those who measure it. Nothing in it may be changed.
+
+    Attributes:
+        phase: The moment, as training decodes in it; `phase.step` is the last complete step.
+        scene: The scene.
+        backbone: The backbone.
+        rasterizer: The rasterizer.
+        parameters: The parameters.
+        adam: The optimizer's moments.
+        background: [3] RGB that evaluated views are drawn over.
+        ssim_weight: Share of 1 - SSIM in the photometric loss.
+        groups: Group label of each training view, or None.
+    """
+
+    phase: Phase
+    scene: Scene
+    backbone: "Backbone"
+    rasterizer: "Rasterizer"
+    parameters: Parameters
+    adam: "AdamState"
+    background: Tensor
+    ssim_weight: float
+    groups: tuple[str, ...] | None
+
+
+@dataclass(frozen=True)
+class EvaluationReport:
+    """What observers learn after an evaluation: the new row of metrics.csv."""
+
+    step: int
+    row: Mapping[str, float | int | str | None]

@@ -1,0 +1,96 @@
+"""The hooks: specifications that plugins implement or wrap.
+
+The three seams of a training step, `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and
+`crossgrad_densify`, stop at the first answer: the selected component gives it. Any other plugin may
+wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A seam must answer
+with a value; None is an error.
+"""
+
+from typing import TYPE_CHECKING
+
+import pluggy
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.component import Selection
+    from crossgrad_core.contract.contexts import (
+        AfterStepContext,
+        AggregateContext,
+        Aggregated,
+        Densified,
+        DensifyContext,
+        EvaluationReport,
+        Model,
+        RegularizeContext,
+        Regularized,
+        RunInfo,
+        SampleContext,
+        Sampled,
+        StepRecord,
+    )
+
+PROJECT = "crossgrad"
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+class HookSpecs:
+    """All hooks in the order in which a run calls them."""
+
+    @hookspec
+    def crossgrad_objections(self, selection: "Selection") -> "list[str] | None":
+        """Before training: reasons why this selection of components cannot work.
+
+        Every plugin is asked; one reason is enough to refuse the run.
+        """
+
+    @hookspec
+    def crossgrad_run_start(self, run: "RunInfo") -> None:
+        """Event: the scene is read, the components are chosen, no step is taken yet."""
+
+    @hookspec(firstresult=True)
+    def crossgrad_sample_views(self, context: "SampleContext") -> "Sampled | None":
+        """Seam 1: the K views of this step. Answered by the selected sampler."""
+
+    @hookspec
+    def crossgrad_regularize(self, context: "RegularizeContext") -> "Regularized | None":
+        """Loss terms besides the photometric one, per view or per step.
+
+        Every plugin is asked, once per view (`context.gaussians` given) and once per step (None);
+        None means "no term here". The gradients join after aggregation.
+        """
+
+    @hookspec(firstresult=True)
+    def crossgrad_aggregate_gradients(self, context: "AggregateContext") -> "Aggregated | None":
+        """Seam 2: one gradient per tensor from the gradients of K views. The selected operator."""
+
+    @hookspec(firstresult=True)
+    def crossgrad_densify(self, context: "DensifyContext") -> "Densified | None":
+        """Seam 3: the topology edit of this step, or NoEdit. Answered by the selected densifier."""
+
+    @hookspec
+    def crossgrad_after_step(self, context: "AfterStepContext") -> "Densified | None":
+        """After optimizer and density control: an edit for noise, clamps, filters; or None."""
+
+    @hookspec
+    def crossgrad_step_end(self, record: "StepRecord") -> None:
+        """Event: the step is complete."""
+
+    @hookspec
+    def crossgrad_model(self, model: "Model") -> None:
+        """Event: the step is complete, and this is the model now. Read only; off the clock."""
+
+    @hookspec
+    def crossgrad_evaluation(self, report: "EvaluationReport") -> None:
+        """Event: the test views were evaluated."""
+
+    @hookspec
+    def crossgrad_length(self, step: int, total: int) -> None:
+        """Event: after `step`, a run with a time budget is to have `total` steps in all."""
+
+    @hookspec
+    def crossgrad_message(self, text: str) -> None:
+        """Event: the run says something to the user (one line of plain text)."""
+
+    @hookspec
+    def crossgrad_run_end(self, status: str) -> None:
+        """Event: training is over; status is `finished`, `stopped` or `failed`."""

@@ -1,0 +1,63 @@
+"""The rasterizer slot: Gaussians x Camera -> Render, differentiable."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contract.component import Component, Selection
+from crossgrad_core.contract.gaussians import Gaussians, Render, Response
+from crossgrad_core.contract.scene import Camera
+
+#: A Gaussian touches a pixel where its alpha reaches this value.
+ALPHA_THRESHOLD = 1.0 / 255.0
+#: Compositing stops before a blend that would bring the transmittance below this value.
+TRANSMITTANCE_STOP = 1e-4
+#: The Jacobian is evaluated inside the image plus this share of half its extent on either side.
+JACOBIAN_MARGIN = 0.3
+
+
+class Rasterizer(Component):
+    """Draws Gaussians by one common rule set (see docs/rasterizers.md).
+
+    Attributes:
+        max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
+        near: Gaussians whose centre is nearer than this camera depth are not drawn, local units.
+        dilation: Added to both diagonal entries of the 2-D covariance, px^2.
+        provides: Optional outputs it can give: `depth`, `pixels`, `abs_gradient`, `directions`.
+        responses: Pixel responses that it draws.
+        devices: Torch device types it runs on.
+    """
+
+    slot: ClassVar[str] = "rasterizers"
+    provides: ClassVar[frozenset[str]] = frozenset()
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
+    devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
+
+    max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
+    near: float = Field(1e-3, gt=0.0, description="near plane, local units")
+    dilation: float = Field(0.3, ge=0.0, description="dilation of the 2-D covariance, px^2")
+
+    @override
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        if not selection.backbone.own_dilation:
+            return {}
+        name = selection.names["backbone"]
+        return {"dilation": f"backbone {name} has a dilation of its own; leave it out"}
+
+    @abstractmethod
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        """Draws the Gaussians over `background` [3].
+
+        Image, alpha and (where asked for) depth are differentiable in all tensors of `gaussians`;
+        the backward pass fills `Render.screen`. `outputs` names the optional outputs to compute.
+        """

@@ -1,0 +1,71 @@
+"""The sampler slot: which views are rendered in a step."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+from crossgrad_core.contract.component import Component, Selection, ViewCounts
+from crossgrad_core.contract.contexts import Draw, SampleContext, Sampled
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.state import PluginState
+
+STATE = "sampler"
+
+
+class Sampler(Component):
+    """Chooses the K training views of a step, given its state and the last step's record.
+
+    Attributes:
+        views: For which K the sampler has a meaning, unless its options say otherwise.
+        default_views: K where the user names none, unless its options say otherwise.
+        default_grouping: Name of the grouping it needs unless the user names another; None where
+            it needs no groups.
+        own_labels: Labels of its draws where it makes its own groups and ignores the grouping.
+        reads_groups: Whether the groups of the training views make a difference to its draws.
+        groups: How many groups it needs; None for any number.
+    """
+
+    slot: ClassVar[str] = "samplers"
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 1
+    default_grouping: ClassVar[str | None] = None
+    own_labels: ClassVar[tuple[str, ...]] = ()
+    reads_groups: ClassVar[bool] = True
+    groups: ClassVar[int | None] = None
+
+    @property
+    def view_counts(self) -> ViewCounts:
+        """For which K the sampler has a meaning with its options as they are."""
+        return self.views
+
+    @property
+    def usual_views(self) -> int:
+        """K where the user names none."""
+        return self.default_views
+
+    @abstractmethod
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        """The views of this step and the new state. Random numbers come from `context.rng`."""
+
+    @hookimpl
+    def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
+        """Answers the seam with this sampler's draw."""
+        draw, state = self.sample(context, context.state(STATE))
+        return Sampled(draw, states={STATE: state})
+
+    @hookimpl
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Refuses numbers of views, and of groups, for which the sampler means nothing."""
+        name, views, labels = (
+            selection.names["sampler"],
+            selection.views_per_step,
+            selection.labels,
+        )
+        reasons = []
+        if not self.view_counts.admits(views):
+            reasons.append(f"sampler {name} needs {self.view_counts}; K = {views} was asked for")
+        if self.groups is not None and labels is not None and len(labels) != self.groups:
+            reasons.append(
+                f"sampler {name} draws from {self.groups} groups; grouping "
+                f"{selection.names['grouping']} gives {len(labels)}: {', '.join(labels)}"
+            )
+        return reasons

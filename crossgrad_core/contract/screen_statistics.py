@@ -1,0 +1,71 @@
+"""Reading the screen statistics of a rendered view, per primitive and in NDC units."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.state import PluginState
+
+
+def half_size(record: ViewRecord, like: Tensor) -> Tensor:
+    """[2] pixels per NDC unit: W/2, H/2 (3DGS)."""
+    camera = record.view.camera
+    return torch.tensor([camera.width / 2, camera.height / 2]).to(like)
+
+
+def ndc_gradient(record: ViewRecord) -> Tensor:
+    """[N, 2] gradient of the view's loss by the projected mean, per NDC unit."""
+    gradient = _present(record.screen.mean_gradient)
+    return gradient * half_size(record, gradient)
+
+
+def ndc_abs_gradient(record: ViewRecord) -> Tensor:
+    """[N, 2] the pixels' absolute gradients by the projected mean, summed, per NDC unit."""
+    gradient = _present(record.screen.abs_gradient)
+    return gradient * half_size(record, gradient)
+
+
+def pixels(record: ViewRecord) -> Tensor:
+    """[N] number of pixels in which the Gaussian was blended, as floating-point numbers."""
+    return _present(record.screen.pixels).to(record.gaussians.means)
+
+
+def visible(record: ViewRecord) -> Tensor:
+    """[N] 1 where the Gaussian touched a pixel, else 0."""
+    return (record.screen.radii > 0).to(record.gaussians.means)
+
+
+def _present(statistic: Tensor | None) -> Tensor:
+    if statistic is None:
+        raise RuntimeError("densification statistics were read before the backward pass")
+    return statistic
+
+
+def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> dict[str, Tensor]:
+    """Copies of the running sums [P] of these names, zeros at first."""
+    like = next(iter(state.per_primitive.values()), None)
+    if like is None:
+        backbone = context.backbone
+        name = next(b.tensors[0] for b in backbone.blocks() if b.per_primitive)
+        tensor = context.parameters[name]
+        like = torch.zeros(tensor.shape[0], device=tensor.device)
+    zeros = torch.zeros_like(like)
+    return {name: state.per_primitive.get(name, zeros).clone() for name in names}
+
+
+def add(record: ViewRecord, total: Tensor, values: Tensor) -> None:
+    """Adds a value of each Gaussian [N] to its primitive's sum [P], in place."""
+    origin = record.gaussians.origin
+    if origin is None:
+        total += values
+    else:
+        total.index_add_(0, origin, values)
+
+
+def mean(statistics: Mapping[str, Tensor], total: str, count: str) -> Tensor:
+    """[P] quotient of two sums, 0 where the count is 0."""
+    counts = statistics[count]
+    means = statistics[total] / counts.clamp(min=torch.finfo(counts.dtype).tiny)
+    return torch.where(counts > 0, means, torch.zeros_like(means))

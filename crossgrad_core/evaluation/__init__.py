@@ -1,0 +1,1 @@
+"""Drawing held-out views and measuring them."""

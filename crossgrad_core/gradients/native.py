@@ -1,0 +1,105 @@
+"""Passes over float32 gradients on the CPU: all tensors of a step in one parallel kernel call."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crossgrad_core.gradients.columns import Column
+
+#: Up to this many elements one core is done before the others are awake.
+SMALL: Final = 1 << 17
+
+
+def _addresses(columns: Sequence[Column]) -> NDArray[np.int64]:
+    return np.array(
+        [[0 if g is None or not g.numel() else g.data_ptr() for g in column] for column in columns],
+        np.int64,
+    )
+
+
+def _sizes(columns: Sequence[Column]) -> NDArray[np.int64]:
+    return np.array([max(_size(g) for g in column) for column in columns], np.int64)
+
+
+def _worth_waking(sizes: NDArray[np.int64]) -> bool:
+    return int(sizes.sum()) > SMALL
+
+
+def _size(gradient: Tensor | None) -> int:
+    return 0 if gradient is None else gradient.numel()
+
+
+def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
+    """[T, K, K] Gramian of each column; NaN or infinite in rows of views that are not finite."""
+    from crossgrad_core.gradients.numba_kernels import dense
+
+    sizes = _sizes(columns)
+    kernel = dense.gramians if _worth_waking(sizes) else dense.gramians_serial
+    return kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
+
+
+def combine(
+    columns: Sequence[Column],
+    weights: NDArray[np.float64],
+    plain: NDArray[np.bool_],
+    out: Sequence[Tensor],
+    divisor: float = 1.0,
+) -> None:
+    """Writes the weighted sum of each column in one pass over all of its gradients.
+
+    Args:
+        columns: T columns; a None is left out.
+        weights: [T, K].
+        plain: [T], columns to add without weights in the order of the views, in float32.
+        out: T results; each may be one of its column's gradients.
+        divisor: What plain sums are divided by, in float32.
+    """
+    from crossgrad_core.gradients.numba_kernels import dense
+
+    sizes = np.array([result.numel() for result in out], np.int64)
+    places = np.array([result.data_ptr() for result in out], np.int64)
+    table = dense.chunk_table(sizes)
+    kernel = dense.combine if _worth_waking(sizes) else dense.combine_serial
+    kernel(_addresses(columns), weights, plain, float(divisor), places, sizes, table)
+
+
+def overlap(column: Column, first: int, second: int) -> bool:
+    """Whether two views' gradients of a tensor share the place of a non-zero element."""
+    from crossgrad_core.gradients.numba_kernels import dense
+
+    a, b = column[first], column[second]
+    if a is None or b is None or not a.numel():
+        return False
+    return bool(dense.overlapping(a.data_ptr(), b.data_ptr(), a.numel()))
+
+
+def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
+    """[N, K, K] Gramians of the rows of a block's tensors."""
+    from crossgrad_core.gradients.numba_kernels import rows as kernels
+
+    sizes = _sizes(columns)
+    return kernels.row_gramians(_addresses(columns), sizes // max(rows, 1), rows)
+
+
+def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
+    """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
+    from crossgrad_core.gradients.numba_kernels import rows as kernels
+
+    if out.numel():
+        width = out.numel() // len(weights)
+        addresses = _addresses([column])[0]
+        kernels.row_combine(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
+
+
+def row_overlap(
+    column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
+) -> None:
+    """Sets `shared` [N] where two views' rows share the place of a non-zero element."""
+    from crossgrad_core.gradients.numba_kernels import rows as kernels
+
+    a, b = column[first], column[second]
+    if a is not None and b is not None and a.numel():
+        kernels.row_overlaps(a.data_ptr(), b.data_ptr(), rows, a.numel() // rows, shared)

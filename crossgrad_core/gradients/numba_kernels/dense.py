@@ -1,0 +1,346 @@
+"""One pass over the float32 gradients of K views: Gramians, weighted sums, overlaps.
+
+Tensors are handed over by address: `addresses` [T, K] int64 holds the place of the first element of
+view k's gradient of tensor t, 0 where the view does not touch the tensor; `sizes` [T] counts
+elements. The work is cut into chunks of `CHUNK` elements whatever the number of threads, and
+partial sums are added in the order of the chunks: same input, same bits.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import carray, prange  # type: ignore[attr-defined]
+from numpy.typing import NDArray
+
+from crossgrad_core.gradients.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
+from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_parallel_kernel
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Rows = NDArray[np.float32]
+
+#: Elements of one chunk, 64 kB per view: a chunk of sixteen views stays in the second cache.
+CHUNK = 16384
+#: Elements of a chunk that a weighted sum works on at a time.
+PIECE = 1024
+
+
+@strict_kernel
+def chunk_table(sizes: Ints) -> Ints:
+    """[C, 2] tensor and first element of each chunk."""
+    total = 0
+    for size in sizes:
+        total += (size + CHUNK - 1) // CHUNK
+    table = np.empty((total, 2), np.int64)
+    c = 0
+    for t in range(sizes.size):
+        for start in range(0, sizes[t], CHUNK):
+            table[c, 0] = t
+            table[c, 1] = start
+            c += 1
+    return table
+
+
+@strict_device
+def row(address: int, start: int, length: int) -> NDArray[np.float32]:
+    """Inside kernels: the `length` elements from element `start` of the tensor at `address`."""
+    pointer: Any = float32_pointer(address + 4 * start)  # type: ignore[call-arg]
+    return carray(pointer, (length,))
+
+
+@strict_device
+def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
+    """Gramian of more than four rows, in tiles of two by two; the chunk stays in cache."""
+    tile = np.empty((2, 2))
+    for i in range(0, count, 2):
+        i1 = min(i + 1, count - 1)
+        a, b = row(rows[i], start, length), row(rows[i1], start, length)
+        dots_2(a, b, tile)
+        out[i, i], out[i1, i1] = tile[0, 0], tile[1, 1]
+        if i1 > i:
+            out[i, i1] = tile[0, 1]
+        for j in range(i + 2, count, 2):
+            j1 = min(j + 1, count - 1)
+            dots_2x2(a, b, row(rows[j], start, length), row(rows[j1], start, length), tile)
+            out[i, j], out[i1, j] = tile[0, 0], tile[1, 0]
+            out[i, j1], out[i1, j1] = tile[0, 1], tile[1, 1]
+
+
+@strict_device
+def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, out: Floats) -> None:
+    """Upper triangle of one chunk's Gramian; rows of absent views stay as they are (zero)."""
+    views = addresses.size
+    rows = np.empty(views, np.int64)
+    places = np.empty(views, np.int64)
+    count = 0
+    for k in range(views):
+        if addresses[k] != 0:
+            rows[count] = addresses[k]
+            places[count] = k
+            count += 1
+    if count == 0:
+        return
+    a = row(rows[0], start, length)
+    if count == 1:
+        dots_1(a, compact)
+    elif count == 2:
+        dots_2(a, row(rows[1], start, length), compact)
+    elif count == 3:
+        dots_3(a, row(rows[1], start, length), row(rows[2], start, length), compact)
+    elif count == 4:
+        b, c = row(rows[1], start, length), row(rows[2], start, length)
+        dots_4(a, b, c, row(rows[3], start, length), compact)
+    else:
+        _many_dots(rows, count, start, length, compact)
+    for i in range(count):
+        for j in range(i, count):
+            out[places[i], places[j]] = compact[i, j]
+
+
+@strict_device
+def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
+    """Adds the chunks' Gramians with Neumaier's compensation, and mirrors the upper triangle."""
+    views = partial.shape[1]
+    total = np.zeros((tensors, views, views))
+    lost = np.zeros((tensors, views, views))
+    for c in range(partial.shape[0]):
+        t = table[c, 0]
+        for i in range(views):
+            for j in range(i, views):
+                old, x = total[t, i, j], partial[c, i, j]
+                new = old + x
+                larger, smaller = (old, x) if abs(old) >= abs(x) else (x, old)
+                lost[t, i, j] += (larger - new) + smaller
+                total[t, i, j] = new
+    for t in range(tensors):
+        for i in range(views):
+            for j in range(i, views):
+                total[t, i, j] += lost[t, i, j]
+                total[t, j, i] = total[t, i, j]
+    return total
+
+
+@strict_device
+def _gramian_task(addresses: Ints, sizes: Ints, table: Ints, c: int, partial: Floats) -> None:
+    t, start = table[c, 0], table[c, 1]
+    compact = np.empty(partial.shape[1:])
+    _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
+
+
+@strict_parallel_kernel
+def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+    """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
+    tensors, views = addresses.shape
+    partial = np.zeros((table.shape[0], views, views))
+    for c in prange(table.shape[0]):
+        _gramian_task(addresses, sizes, table, c, partial)
+    return _summed(partial, table, tensors)
+
+
+@strict_kernel
+def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
+    """The same bits without the cost of waking up other cores."""
+    tensors, views = addresses.shape
+    partial = np.zeros((table.shape[0], views, views))
+    for c in range(table.shape[0]):
+        _gramian_task(addresses, sizes, table, c, partial)
+    return _summed(partial, table, tensors)
+
+
+@strict_device
+def _weighted(
+    rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
+) -> None:
+    """Fills `narrow` with the sum of weights times rows, rounded once.
+
+    In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
+    """
+    n = narrow.size
+    a, u = row(rows[0], start, n), weights[0]
+    if count == 1:
+        for i in range(n):
+            narrow[i] = np.float32(u * np.float64(a[i]))
+        return
+    b, v = row(rows[1], start, n), weights[1]
+    if count == 2:
+        for i in range(n):
+            narrow[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
+        return
+    c, w = row(rows[2], start, n), weights[2]
+    if count == 3:
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            narrow[i] = np.float32(x + w * np.float64(c[i]))
+        return
+    d, z = row(rows[3], start, n), weights[3]
+    if count == 4:
+        for i in range(n):
+            x = u * np.float64(a[i]) + v * np.float64(b[i])
+            narrow[i] = np.float32((x + w * np.float64(c[i])) + z * np.float64(d[i]))
+        return
+    for i in range(n):
+        x = u * np.float64(a[i]) + v * np.float64(b[i])
+        wide[i] = (x + w * np.float64(c[i])) + z * np.float64(d[i])
+    for k in range(4, count):
+        e, s = row(rows[k], start, n), weights[k]
+        for i in range(n):
+            wide[i] += s * np.float64(e[i])
+    for i in range(n):
+        narrow[i] = np.float32(wide[i])
+
+
+@strict_device
+def _divide(a: Rows, divisor: float) -> None:
+    d = np.float32(divisor)
+    for i in range(a.size):
+        a[i] /= d
+
+
+@strict_device
+def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
+    """Fills `narrow` with the rows added in order in float32, the bits of accumulation, divided."""
+    n = narrow.size
+    a = row(rows[0], start, n)
+    if count == 1:
+        for i in range(n):
+            narrow[i] = a[i]
+    else:
+        b = row(rows[1], start, n)
+        for i in range(n):
+            narrow[i] = a[i] + b[i]
+    for k in range(2, count):
+        c = row(rows[k], start, n)
+        for i in range(n):
+            narrow[i] += c[i]
+    if divisor != 1.0:
+        _divide(narrow, divisor)
+
+
+@strict_device
+def _weighted_into(a: Rows, u: float, b: Rows, v: float) -> None:
+    for i in range(a.size):
+        a[i] = np.float32(u * np.float64(a[i]) + v * np.float64(b[i]))
+
+
+@strict_device
+def _plain_into(a: Rows, b: Rows, divisor: float) -> None:
+    if divisor == 1.0:
+        for i in range(a.size):
+            a[i] += b[i]
+    else:
+        d = np.float32(divisor)
+        for i in range(a.size):
+            a[i] = (a[i] + b[i]) / d
+
+
+@strict_device
+def _combine_pieces(
+    rows: Ints,
+    weights: Floats,
+    count: int,
+    plain: bool,
+    divisor: float,
+    out: int,
+    first: int,
+    end: int,
+) -> None:
+    """Results pass through a piece of fast memory, as they may overwrite one of the rows."""
+    wide = np.empty(PIECE)
+    narrow = np.empty(PIECE, np.float32)
+    for start in range(first, end, PIECE):
+        length = min(PIECE, end - start)
+        if plain:
+            _plain(rows, count, divisor, start, narrow[:length])
+        else:
+            _weighted(rows, weights, count, start, wide[:length], narrow[:length])
+        result = row(out, start, length)
+        for i in range(length):
+            result[i] = narrow[i]
+
+
+@strict_device
+def _combine_chunk(
+    addresses: Ints, weights: Floats, plain: bool, divisor: float, out: int, first: int, end: int
+) -> None:
+    views = addresses.size
+    rows = np.empty(views, np.int64)
+    used = np.empty(views)
+    count = 0
+    for k in range(views):
+        if addresses[k] != 0:
+            rows[count] = addresses[k]
+            used[count] = weights[k]
+            count += 1
+    if count == 0:
+        result = row(out, first, end - first)
+        for i in range(result.size):
+            result[i] = 0.0
+    elif count == 2 and (out == rows[0] or out == rows[1]):
+        # Two views, one of them overwritten: the commonest case. Both sums are commutative.
+        this = 0 if out == rows[0] else 1
+        a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
+        if plain:
+            _plain_into(a, b, divisor)
+        else:
+            _weighted_into(a, used[this], b, used[1 - this])
+    else:
+        _combine_pieces(rows, used, count, plain, divisor, out, first, end)
+
+
+@strict_parallel_kernel
+def combine(
+    addresses: Ints,
+    weights: Floats,
+    plain: Flags,
+    divisor: float,
+    out: Ints,
+    sizes: Ints,
+    table: Ints,
+) -> None:
+    """Writes the weighted sums of all tensors, in one pass over all views.
+
+    Args:
+        addresses: [T, K]; 0 leaves the view out.
+        weights: [T, K].
+        plain: [T] whether to add the rows in float32 in the order of the views instead.
+        divisor: What plain sums are divided by, in float32.
+        out: [T] addresses of the results; one may be that of a view.
+        sizes: [T].
+        table: From `chunk_table`.
+    """
+    for c in prange(table.shape[0]):
+        t, first = table[c, 0], table[c, 1]
+        end = min(first + CHUNK, sizes[t])
+        _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
+
+
+@strict_kernel
+def combine_serial(
+    addresses: Ints,
+    weights: Floats,
+    plain: Flags,
+    divisor: float,
+    out: Ints,
+    sizes: Ints,
+    table: Ints,
+) -> None:
+    """The same bits without the cost of waking up other cores."""
+    for c in range(table.shape[0]):
+        t, first = table[c, 0], table[c, 1]
+        end = min(first + CHUNK, sizes[t])
+        _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
+
+
+@strict_kernel
+def overlapping(a: int, b: int, size: int) -> bool:
+    """Whether two tensors share the place of a non-zero element."""
+    x, y = row(a, 0, size), row(b, 0, size)
+    for start in range(0, size, CHUNK):
+        shared = 0
+        for i in range(start, min(start + CHUNK, size)):
+            shared |= (x[i] != 0) & (y[i] != 0)
+        if shared:
+            return True
+    return False

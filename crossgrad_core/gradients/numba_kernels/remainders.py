@@ -1,0 +1,50 @@
+"""Gramians to twice the digits of float64, for operators that need them now and then.
+
+One product at a time, with what rounding takes from products and sums added up beside them (Ogita,
+Rump and Oishi 2005): as exact as 106-bit arithmetic, ten times as slow as plain sums.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.double_double import two_product, two_sum
+
+Floats = NDArray[np.float64]
+
+
+@njit(cache=True)
+def add_products(rows: Floats, high: Floats, low: Floats) -> None:
+    """Adds the Gramian of `rows` [K, P] to the upper triangle of high + low, [K, K] each."""
+    views, size = rows.shape
+    for i in range(views):
+        for j in range(i, views):
+            total, lost = high[i, j], low[i, j]
+            for e in range(size):
+                product, error = two_product(rows[i, e], rows[j, e])
+                total, more = two_sum(total, product)
+                lost += more + error
+            high[i, j], low[i, j] = total, lost
+
+
+@njit(cache=True)
+def add_row_products(rows: Floats, high: Floats, low: Floats) -> None:
+    """Adds the Gramians of `rows` [K, N, d], primitive by primitive, to high + low [N, K, K]."""
+    for n in range(rows.shape[1]):
+        add_products(rows[:, n], high[n], low[n])
+
+
+@njit(cache=True)
+def left_over(high: Floats, low: Floats, gramians: Floats) -> Floats:
+    """[B, K, K] high + low - gramians from the upper triangles of the first two.
+
+    Either triangle of a Gramian gets its own: matrix products may round them differently.
+    """
+    result = np.zeros(gramians.shape)
+    blocks, views, _ = gramians.shape
+    for b in range(blocks):
+        for i in range(views):
+            for j in range(views):
+                p, q = min(i, j), max(i, j)
+                result[b, i, j] = (high[b, p, q] - gramians[b, i, j]) + low[b, p, q]
+    return result

@@ -1,0 +1,96 @@
+"""Row-wise Gramians and weighted sums: one small Gramian per primitive.
+
+Addresses are those of `dense`; row i of a tensor of width d starts at element i * d.
+"""
+
+import numpy as np
+from numba import prange
+
+from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, row
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_parallel_kernel
+
+#: Rows that one task works on.
+ROWS = 2048
+
+
+@strict_device
+def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floats) -> None:
+    tensors, views = addresses.shape
+    for t in range(tensors):
+        d = widths[t]
+        for k in range(views):
+            for other in range(k, views):
+                if addresses[t, k] == 0 or addresses[t, other] == 0:
+                    continue
+                a = row(addresses[t, k], first * d, (end - first) * d)
+                b = row(addresses[t, other], first * d, (end - first) * d)
+                for i in range(end - first):
+                    total = 0.0
+                    for j in range(i * d, i * d + d):
+                        total += np.float64(a[j]) * np.float64(b[j])
+                    out[first + i, k, other] += total
+    for i in range(first, end):
+        for k in range(views):
+            for other in range(k):
+                out[i, k, other] = out[i, other, k]
+
+
+@strict_parallel_kernel
+def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
+    """[N, K, K] float64 Gramians of the rows of a block of T tensors.
+
+    Args:
+        addresses: [T, K]; 0 where a view does not touch the tensor.
+        widths: [T] elements per row.
+        count: N.
+    """
+    views = addresses.shape[1]
+    out = np.zeros((count, views, views))
+    for task in prange((count + ROWS - 1) // ROWS):
+        _gramian_task(addresses, widths, task * ROWS, min(task * ROWS + ROWS, count), out)
+    return out
+
+
+@strict_device
+def _combine_task(
+    addresses: Ints, weights: Floats, out: int, width: int, first: int, end: int
+) -> None:
+    wide = np.zeros((end - first) * width)
+    for k in range(addresses.size):
+        if addresses[k] == 0:
+            continue
+        a = row(addresses[k], first * width, wide.size)
+        for i in range(end - first):
+            w = weights[first + i, k]
+            if w != 0.0:
+                for j in range(i * width, i * width + width):
+                    wide[j] += w * np.float64(a[j])
+    result = row(out, first * width, wide.size)
+    for j in range(wide.size):
+        result[j] = np.float32(wide[j])
+
+
+@strict_parallel_kernel
+def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
+    """Writes sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
+
+    Args:
+        addresses: [K]; 0 leaves the view out.
+        weights: [N, K].
+        out: Address of the result; may be that of a view.
+        width: Elements per row.
+    """
+    count = weights.shape[0]
+    for task in prange((count + ROWS - 1) // ROWS):
+        end = min(task * ROWS + ROWS, count)
+        _combine_task(addresses, weights, out, width, task * ROWS, end)
+
+
+@strict_kernel
+def row_overlaps(a: int, b: int, count: int, width: int, out: Flags) -> None:
+    """Sets out[i] where row i of two tensors shares the place of a non-zero element."""
+    x, y = row(a, 0, count * width), row(b, 0, count * width)
+    for i in range(count):
+        for j in range(i * width, i * width + width):
+            if x[j] != 0 and y[j] != 0:
+                out[i] = True

@@ -1,0 +1,356 @@
+"""Gradients of K views as dense tensors, one per view and parameter tensor."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contract.blocks import Block
+from crossgrad_core.contract.gradients import Elementwise, ViewGradients
+from crossgrad_core.contract.operator import Granularity
+from crossgrad_core.gradients import exact, generic, native
+from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
+from crossgrad_core.gradients.squares import column_gramians, column_remainders
+from crossgrad_core.gradients.summed import AccumulatedGradients
+
+__all__ = ["AccumulatedGradients", "DenseViewGradients"]
+
+KINDS: Final = ("geometry", "appearance", "neutral")
+
+
+@dataclass(frozen=True)
+class Groups:
+    """How tensors (or rows of blocks) make up the Gramians of one granularity.
+
+    Attributes:
+        names: [B] name of each Gramian's block or group.
+        of_tensor: [T] which of them a tensor belongs to.
+    """
+
+    names: tuple[str, ...]
+    of_tensor: NDArray[np.int64]
+
+
+class DenseViewGradients(ViewGradients):
+    """The gradients of K views, one dense tensor per view and parameter tensor.
+
+    Gramians are accumulated in float64 (see `column_gramians` for gradients beyond its range).
+
+    Args:
+        views: For each view: tensor name -> gradient; None or no entry where the view does not
+            touch the tensor, which then counts as zero.
+        blocks: The blocks, in the order of every Gramian's first dimension.
+        overwrite: Allows `combine` and `total` to write their results over the gradients of one
+            view, which saves memory; the elements can be looked at only once then.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[Mapping[str, Tensor | None]],
+        blocks: Sequence[Block],
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        self._blocks = tuple(blocks)
+        self._views = len(views)
+        self._overwrite = overwrite
+        self._spent = False
+        self._known: dict[Granularity, NDArray[np.float64]] = {}
+        self._lost: dict[Granularity, NDArray[np.float64]] = {}
+        self._tensors = tuple(name for block in self._blocks for name in block.tensors)
+        self._columns: tuple[Column, ...] = tuple(
+            [_prepared(view.get(name)) for view in views] for name in self._tensors
+        )
+        self._native = tuple(is_native(column) for column in self._columns)
+        self._grouped: dict[Granularity, Groups] = {}
+
+    @property
+    @override
+    def views(self) -> int:
+        return self._views
+
+    @override
+    def names(self, granularity: Granularity) -> tuple[str, ...]:
+        if granularity == "gaussian":
+            names: tuple[str, ...] = ()
+            for block, rows in zip(self._blocks, self._rows, strict=True):
+                names += (block.name,) * rows
+            return names
+        return self._groups(granularity).names
+
+    @override
+    def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
+        raw = self._raw(granularity)
+        finite = _finite(raw)
+        if finite.all():
+            return raw.copy()
+        return np.where(finite[:, :, None] & finite[:, None, :], raw, 0.0)
+
+    @property
+    @override
+    def unit(self) -> float:
+        return unit_roundoff(self._columns)
+
+    @override
+    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        if granularity not in self._lost:
+            self._require_unspent()
+            # What is added to an infinity or a NaN makes no difference.
+            found = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
+            self._lost[granularity] = found
+        return self._lost[granularity]
+
+    @override
+    def present(self, granularity: Granularity) -> NDArray[np.bool_]:
+        squares = _diagonal(self._raw(granularity))
+        present: NDArray[np.bool_] = np.isfinite(squares) & (squares > 0)
+        return present
+
+    @override
+    def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
+        return _finite(self._raw(granularity))
+
+    @override
+    def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
+        gramians, present = self.gramians(granularity), self.present(granularity)
+        # Gradients with a product share an element; only pairs without one need a look.
+        shared: NDArray[np.bool_] = gramians != 0
+        doubtful = ~shared & present[:, :, None] & present[:, None, :]
+        for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():
+            found = self._overlap(granularity, i, j, doubtful[:, i, j])
+            shared[:, i, j] |= found
+            shared[:, j, i] = shared[:, i, j]
+        return shared
+
+    @override
+    def combine(
+        self, weights: NDArray[np.float64], granularity: Granularity
+    ) -> Mapping[str, Tensor | None]:
+        weights = np.where(self.finite(granularity), weights, 0.0)
+        if granularity == "gaussian":
+            return self._combine_rows(weights)
+        groups = self._groups(granularity)
+        finite = self.finite(granularity)[groups.of_tensor]
+        return self._combine(weights[groups.of_tensor], finite)
+
+    @override
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        finite = self.finite("tensor")
+        of_tensor = self._groups("tensor").of_tensor
+        return self._combine(finite.astype(np.float64)[of_tensor], finite[of_tensor], divisor)
+
+    @override
+    def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
+        finite = self.finite("tensor")[self._groups("tensor").of_tensor]
+        self._require_unspent()
+        return {
+            name: function(name, _selected(column, keep))
+            for name, column, keep in zip(self._tensors, self._columns, finite, strict=True)
+        }
+
+    @cached_property
+    def _rows(self) -> tuple[int, ...]:
+        """How many Gramians each block has under granularity `gaussian`."""
+        shapes = {
+            name: next((g.shape for g in column if g is not None), None)
+            for name, column in zip(self._tensors, self._columns, strict=True)
+        }
+        counts = []
+        for block in self._blocks:
+            rows = [int(s[0]) for name in block.tensors if (s := shapes[name]) is not None and s]
+            counts.append(rows[0] if block.per_primitive and rows else 1)
+        return tuple(counts)
+
+    @cached_property
+    def _squares(self) -> NDArray[np.float64]:
+        """[T, K, K] Gramians of the tensors; NaN or infinite where a view is not finite."""
+        self._require_unspent()
+        return column_gramians(self._columns, self._views)
+
+    def _groups(self, granularity: Granularity) -> Groups:
+        if granularity not in self._grouped:
+            self._grouped[granularity] = self._grouping(granularity)
+        return self._grouped[granularity]
+
+    def _grouping(self, granularity: Granularity) -> Groups:
+        counts = [len(block.tensors) for block in self._blocks]
+        if granularity == "tensor":
+            places = np.arange(len(self._blocks))
+            return Groups(tuple(block.name for block in self._blocks), np.repeat(places, counts))
+        if granularity == "global":
+            return Groups(("all",), np.zeros(len(self._tensors), np.int64))
+        kinds = tuple(kind for kind in KINDS if any(b.kind == kind for b in self._blocks))
+        places = np.array([kinds.index(block.kind) for block in self._blocks], np.int64)
+        return Groups(kinds, np.repeat(places, counts))
+
+    def _raw(self, granularity: Granularity) -> NDArray[np.float64]:
+        """[B, K, K] Gramians, computed once; NaN or infinite where a view is not finite."""
+        if granularity not in self._known:
+            self._known[granularity] = self._gathered(granularity)
+        return self._known[granularity]
+
+    def _gathered(self, granularity: Granularity) -> NDArray[np.float64]:
+        if granularity == "gaussian":
+            return self._row_squares()
+        groups = self._groups(granularity)
+        if len(groups.names) == len(self._tensors) and granularity == "tensor":
+            return self._squares
+        raw = np.zeros((len(groups.names), self._views, self._views))
+        # Infinities of both signs may meet; the sum is then rightly not a number.
+        with np.errstate(invalid="ignore"):
+            np.add.at(raw, groups.of_tensor, self._squares)
+        return raw
+
+    def _row_squares(self) -> NDArray[np.float64]:
+        self._require_unspent()
+        parts = []
+        for block, columns, rows in self._by_block():
+            touched = [c for c in columns if any(g is not None for g in c)]
+            passes = native if all(is_native(c) for c in touched) else generic
+            if touched and block.per_primitive:
+                parts.append(passes.row_gramians(touched, rows))
+            else:
+                places = [self._tensors.index(name) for name in block.tensors]
+                parts.append(self._squares[places].sum(axis=0)[None])
+        return np.concatenate(parts) if parts else np.zeros((0, self._views, self._views))
+
+    def _remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        raw = self._raw(granularity)
+        if granularity != "gaussian":
+            return column_remainders(self._columns, self._groups(granularity).of_tensor, raw)
+        parts, first = [np.zeros((0, self._views, self._views))], 0
+        for block, columns, rows in self._by_block():
+            part = raw[first : first + rows]
+            first += rows
+            if block.per_primitive:
+                parts.append(exact.row_remainders(columns, rows, part))
+            else:
+                group = np.array([0 if name in block.tensors else -1 for name in self._tensors])
+                parts.append(column_remainders(self._columns, group, part))
+        return np.concatenate(parts)
+
+    def _by_block(self) -> Sequence[tuple[Block, Sequence[Column], int]]:
+        result, place = [], 0
+        for block, rows in zip(self._blocks, self._rows, strict=True):
+            result.append((block, self._columns[place : place + len(block.tensors)], rows))
+            place += len(block.tensors)
+        return result
+
+    def _overlap(
+        self, granularity: Granularity, i: int, j: int, doubtful: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        self._require_unspent()
+        if granularity == "gaussian":
+            return self._row_overlap(i, j)
+        found = np.zeros_like(doubtful)
+        for group, column in zip(self._groups(granularity).of_tensor, self._columns, strict=True):
+            if doubtful[group] and not found[group]:
+                passes = native if is_native(column) else generic
+                found[group] = passes.overlap(column, i, j)
+        return found
+
+    def _row_overlap(self, i: int, j: int) -> NDArray[np.bool_]:
+        parts = []
+        for block, columns, rows in self._by_block():
+            shared = np.zeros(rows, np.bool_)
+            for column in columns:
+                passes = native if is_native(column) else generic
+                if block.per_primitive:
+                    passes.row_overlap(column, i, j, rows, shared)
+                else:
+                    shared |= passes.overlap(column, i, j)
+            parts.append(shared)
+        return np.concatenate(parts)
+
+    def _combine(
+        self, weights: NDArray[np.float64], finite: NDArray[np.bool_], divisor: int = 1
+    ) -> dict[str, Tensor | None]:
+        """Weighted sums of all tensors; `weights` and `finite` are [T, K]; plain sums divided."""
+        results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
+        used = weights != 0
+        plain = ((weights == 1) | ~used).all(axis=1) & used.any(axis=1)
+        order = self._order(weights, plain)
+        compiled: list[int] = []
+        chosen = list(self._columns)
+        for t, (name, column) in enumerate(zip(self._tensors, self._columns, strict=True)):
+            out = results[name] = self._result(column, finite[t])
+            if out is None:
+                continue
+            chosen[t] = [column[k] if used[t, k] else None for k in order[t].tolist()]
+            if self._native[t]:
+                compiled.append(t)
+            else:
+                generic.combine(chosen[t], weights[t, order[t]], bool(plain[t]), out, divisor)
+        if compiled:
+            outs = [results[self._tensors[t]] for t in compiled]
+            native.combine(
+                [chosen[t] for t in compiled],
+                np.take_along_axis(weights, order, axis=1)[compiled],
+                plain[compiled],
+                [out for out in outs if out is not None],
+                divisor,
+            )
+        self._spent = self._overwrite
+        return results
+
+    def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """[T, K] views with the longest summand first; those of plain sums stay in order."""
+        order = np.tile(np.arange(self._views), (len(self._tensors), 1))
+        # The order of two summands makes no difference.
+        if self._views > 2 and not plain.all():  # noqa: PLR2004
+            squares = _diagonal(self._squares)
+            norms = np.sqrt(np.where(np.isfinite(squares), squares, 0.0))
+            sorting = ~plain
+            order[sorting] = np.argsort(-np.abs(weights * norms)[sorting], axis=1, kind="stable")
+        return order
+
+    def _combine_rows(self, weights: NDArray[np.float64]) -> dict[str, Tensor | None]:
+        results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
+        first = 0
+        for block, columns, rows in self._by_block():
+            part = weights[first : first + rows]
+            first += rows
+            for name, column in zip(block.tensors, columns, strict=True):
+                out = self._result(column, np.ones(self._views, np.bool_))
+                if out is None:
+                    continue
+                results[name] = out
+                passes = native if is_native(column) else generic
+                passes.row_combine(column, part, out)
+        self._spent = self._overwrite
+        return results
+
+    def _result(self, column: Column, finite: NDArray[np.bool_]) -> Tensor | None:
+        """Room for a tensor's result; None where no view that counts touches it."""
+        self._require_unspent()
+        first = next((g for g in _selected(column, finite) if g is not None), None)
+        if first is None:
+            return None
+        return first if self._overwrite else torch.empty_like(first)
+
+    def _require_unspent(self) -> None:
+        if self._spent:
+            raise RuntimeError("the gradients of the views were overwritten by their sum")
+
+
+def _prepared(gradient: Tensor | None) -> Tensor | None:
+    return None if gradient is None else gradient.detach().contiguous()
+
+
+def _selected(column: Column, keep: NDArray[np.bool_]) -> list[Tensor | None]:
+    return [g if kept else None for g, kept in zip(column, keep, strict=True)]
+
+
+def _diagonal(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.diagonal(gramians, axis1=1, axis2=2)
+
+
+def _finite(gramians: NDArray[np.float64]) -> NDArray[np.bool_]:
+    finite: NDArray[np.bool_] = np.isfinite(_diagonal(gramians))
+    return finite

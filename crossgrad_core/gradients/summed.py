@@ -1,0 +1,175 @@
+"""The running sum of the gradients of K views, for operators that do not need them apart."""
+
+from collections.abc import Mapping, Sequence
+from typing import NoReturn, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contract.blocks import Block
+from crossgrad_core.contract.gradients import Elementwise, ViewGradients
+from crossgrad_core.contract.operator import Granularity
+from crossgrad_core.gradients.columns import unit_roundoff
+from crossgrad_core.gradients.plain import plain_sums
+from crossgrad_core.gradients.squares import column_gramians
+
+
+class AccumulatedGradients(ViewGradients):
+    """The sum of K views' gradients in the order of the views; single views are not kept.
+
+    Either given as a whole (one backward pass of a joint loss) or built view by view from `empty`
+    with `add`, which leaves a view out of the blocks in which it is not finite. The last view waits
+    for `total`, which adds and divides in one pass.
+
+    Args:
+        total: Tensor name -> sum; None or no entry where no view touches the tensor.
+        blocks: The blocks.
+        views: K.
+    """
+
+    def __init__(
+        self, total: Mapping[str, Tensor | None], blocks: Sequence[Block], views: int
+    ) -> None:
+        self._blocks = tuple(blocks)
+        self._sum = {n: _contiguous(total.get(n)) for block in blocks for n in block.tensors}
+        self._last: dict[str, Tensor] = {}
+        self._divisor = 0
+        self._views = self._expected = views
+        self._finite: list[NDArray[np.bool_]] = []
+        self._present: list[NDArray[np.bool_]] = []
+        if views:
+            finite, present = self._judged(self._sum)
+            self._finite, self._present = [finite] * views, [present] * views
+            self._forget(finite)
+
+    @classmethod
+    def empty(cls, blocks: Sequence[Block], views: int) -> Self:
+        """No view yet, of `views` to come."""
+        gradients = cls({}, blocks, 0)
+        gradients._expected = views
+        return gradients
+
+    def add(self, view: Mapping[str, Tensor | None]) -> None:
+        """Adds the gradients of one more view, and takes them over: they are written to.
+
+        Raises:
+            RuntimeError: All views that were to come are there.
+        """
+        if self._views == self._expected:
+            raise RuntimeError(f"one view more than the {self._expected} that were to come")
+        finite, present = self._judged(view)
+        self._views += 1
+        self._finite.append(finite)
+        self._present.append(present)
+        for block, kept in zip(self._blocks, finite, strict=True):
+            for name in block.tensors if kept else ():
+                gradient = _contiguous(view.get(name))
+                if gradient is not None:
+                    self._last[name] = gradient
+        if self._views < self._expected:
+            self._fold(1)
+
+    @property
+    @override
+    def views(self) -> int:
+        return self._views
+
+    @override
+    def names(self, granularity: Granularity) -> tuple[str, ...]:
+        self._require_blocks(granularity)
+        return tuple(block.name for block in self._blocks)
+
+    @override
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        """See `ViewGradients.total`.
+
+        Raises:
+            RuntimeError: The sum was already divided by something else.
+        """
+        if self._divisor in {0, divisor}:
+            if not self._divisor:
+                self._fold(divisor)
+            self._divisor = divisor
+            return self._sum
+        if self._divisor != 1:
+            raise RuntimeError("the sum of the views' gradients was overwritten by their mean")
+        columns = [[gradient] for gradient in self._sum.values()]
+        return dict(zip(self._sum, plain_sums(columns, divisor, keep=True), strict=True))
+
+    @override
+    def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
+        self._require_blocks(granularity)
+        return np.stack(self._finite, axis=1)
+
+    @override
+    def present(self, granularity: Granularity) -> NDArray[np.bool_]:
+        self._require_blocks(granularity)
+        return np.stack(self._present, axis=1)
+
+    @property
+    @override
+    def unit(self) -> float:
+        return unit_roundoff([list(self._sum.values())])
+
+    @override
+    def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
+        self._refuse()
+
+    @override
+    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        self._refuse()
+
+    @override
+    def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
+        self._refuse()
+
+    @override
+    def combine(
+        self, weights: NDArray[np.float64], granularity: Granularity
+    ) -> Mapping[str, Tensor | None]:
+        self._refuse()
+
+    @override
+    def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
+        self._refuse()
+
+    def _judged(
+        self, view: Mapping[str, Tensor | None]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """[B] whether each block's gradient is finite, and [B] whether it is also not zero."""
+        columns = [[_contiguous(view.get(name))] for b in self._blocks for name in b.tensors]
+        squares = column_gramians(columns, 1)[:, 0, 0]
+        places = np.repeat(np.arange(len(self._blocks)), [len(b.tensors) for b in self._blocks])
+        norms = np.zeros(len(self._blocks))
+        np.add.at(norms, places, squares)
+        finite = np.isfinite(norms)
+        return finite, finite & (norms > 0)
+
+    def _fold(self, divisor: int) -> None:
+        """Adds the view that waits, and divides."""
+        columns = [[gradient, self._last.get(name)] for name, gradient in self._sum.items()]
+        sums = plain_sums(columns, divisor, keep=False)
+        self._sum = dict(zip(self._sum, sums, strict=True))
+        self._last = {}
+
+    def _forget(self, finite: NDArray[np.bool_]) -> None:
+        for block, kept in zip(self._blocks, finite, strict=True):
+            if not kept:
+                self._sum |= dict.fromkeys(block.tensors)
+
+    def _require_blocks(self, granularity: Granularity) -> None:
+        if granularity != "tensor":
+            self._refuse()
+
+    @staticmethod
+    def _refuse() -> NoReturn:
+        raise RuntimeError(
+            "the views' gradients were accumulated and only their sum is known; an operator or "
+            "plugin that looks at single views must say so with `separate = True`"
+        )
+
+
+def _contiguous(gradient: Tensor | None) -> Tensor | None:
+    return None if gradient is None else gradient.detach().contiguous()

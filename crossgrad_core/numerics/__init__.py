@@ -1,0 +1,1 @@
+"""The kit for kernels: compilation, SIMD, threads, element-wise functions, rotations."""

@@ -1,0 +1,1 @@
+"""Gaussians in PLY files."""

@@ -1,0 +1,218 @@
+"""Plugins by name: listed from package metadata, imported only when a run asks for them.
+
+Listing reads entry points and imports no plugin, no torch and no pydantic. Loading is loud: an
+unknown name, a name that two distributions offer, a plugin that fails to import and an object of
+the wrong kind are errors that name the plugin and its distribution.
+"""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, reduce
+from importlib import import_module
+from inspect import isabstract
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.places import raised_at
+from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
+
+    from crossgrad_core.contract.component import Component
+
+_BASES: Final[dict[str, str]] = {
+    "backbones": "crossgrad_core.contract.backbone:Backbone",
+    "samplers": "crossgrad_core.contract.sampler:Sampler",
+    "groupings": "crossgrad_core.contract.grouping:Grouping",
+    "operators": "crossgrad_core.contract.operator:Operator",
+    "densifiers": "crossgrad_core.contract.densifier:Densifier",
+    "rasterizers": "crossgrad_core.contract.rasterizer:Rasterizer",
+    "readers": "crossgrad_core.contract.reader:Reader",
+    "observers": "crossgrad_core.contract.observer:Observer",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One plugin as its distribution announces it.
+
+    Attributes:
+        name: Name that users type.
+        slot: Slot that it fills, a key of `GROUPS`.
+        value: Where its class is: `module:Class`.
+        distribution: Name of the distribution that offers it.
+        version: Version of that distribution.
+    """
+
+    name: str
+    slot: str
+    value: str
+    distribution: str
+    version: str
+
+    @property
+    def package(self) -> str:
+        """The import package or module that holds its class."""
+        return self.value.partition(":")[0].partition(".")[0].strip()
+
+    @property
+    def origin(self) -> str:
+        """Where it comes from, for messages."""
+        return f"{self.value}, from {self.distribution} {self.version}"
+
+
+def offers(slot: str) -> tuple[Entry, ...]:
+    """All that installed distributions offer for a slot, by name; a name may occur twice.
+
+    Raises:
+        KeyError: There is no such slot.
+    """
+    return _offers(tuple(sys.path))[slot]
+
+
+def entries(slot: str) -> dict[str, Entry]:
+    """Name -> entry for a slot. Imports no plugin.
+
+    Raises:
+        KeyError: There is no such slot.
+    """
+    return {entry.name: entry for entry in offers(slot)}
+
+
+def find(slot: str, name: str) -> Entry:
+    """The one entry of that name.
+
+    Raises:
+        UserError: No distribution offers the name, or more than one does.
+    """
+    found = [entry for entry in offers(slot) if entry.name == name]
+    if not found:
+        raise _unknown(slot, name)
+    if len(found) > 1:
+        raise UserError(
+            f"{len(found)} installed packages offer a {singular(slot)} named {name!r}",
+            where=singular(slot),
+            expected="one package per name",
+            found=listed(f"{entry.distribution} {entry.version}" for entry in found),
+            todo="uninstall all but one of them",
+        )
+    return found[0]
+
+
+def load(slot: str, name: str) -> "type[Component]":
+    """The class that fills a slot under a name; imports its module.
+
+    Raises:
+        UserError: The name is unknown or ambiguous, the plugin fails to import, or what it offers
+            is no complete subclass of the slot's base class.
+    """
+    return load_entry(find(slot, name))
+
+
+def load_entry(entry: Entry) -> "type[Component]":
+    """The class that an entry points at; see `load`."""
+    try:
+        found = _resolve(entry.value)
+    except UserError:
+        raise
+    except Exception as error:
+        place = raised_at(error, entry.package)
+        raise UserError(
+            f"{singular(entry.slot)} {entry.name} cannot be imported",
+            where=sentences(entry.origin, place),
+            found=in_one_line(error),
+            todo=f"repair or uninstall {entry.distribution}; other runs are not affected",
+        ) from error
+    return _checked(entry, found)
+
+
+def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
+    """The component of that name with validated options.
+
+    Raises:
+        UserError: See `load`; or an option is unknown, missing or out of bounds.
+    """
+    from pydantic import ValidationError
+
+    from crossgrad_core.registry.validation import as_user_error
+
+    component = load(slot, name)
+    word = singular(slot)
+    try:
+        return component.model_validate(dict(options))
+    except ValidationError as error:
+        raise as_user_error(
+            error,
+            component,
+            subject=f"{word} {name}",
+            prefix=word if slot != "observers" else f"observers.{name}",
+            todo=f"`crossgrad plugins show {name}` explains the options",
+        ) from None
+
+
+@cache
+def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
+    """Slot -> entries; `path` is `sys.path`, so that a changed path is looked at again."""
+    from importlib.metadata import entry_points
+
+    # One unfiltered call: each one scans every installed distribution.
+    points = entry_points()
+    found: dict[str, tuple[Entry, ...]] = {}
+    for slot, group in GROUPS.items():
+        described = (
+            Entry(point.name, slot, point.value, *_identity(point.dist))
+            for point in points.select(group=group)
+        )
+        found[slot] = tuple(sorted(described, key=lambda entry: (entry.name, entry.distribution)))
+    return found
+
+
+@cache
+def _identity(distribution: "Distribution | None") -> tuple[str, str]:
+    """Name and version; cached because each look parses the distribution's metadata file."""
+    if distribution is None:
+        return "unknown", "unknown"
+    metadata = distribution.metadata
+    return metadata["Name"], metadata["Version"]
+
+
+def _unknown(slot: str, name: str) -> UserError:
+    names = list(entries(slot))
+    elsewhere = [other for other in GROUPS if other != slot and name in entries(other)]
+    hint = f"{name} is a {singular(elsewhere[0])}" if elsewhere else did_you_mean(name, names)
+    return UserError(
+        f"there is no {singular(slot)} named {name!r}",
+        where=singular(slot),
+        expected=f"one of {listed(names)}" if names else "an installed plugin; there is none",
+        todo=sentences(hint, f"`crossgrad plugins list --slot {slot}` lists them"),
+    )
+
+
+def _resolve(value: str) -> object:
+    """The object at `module:attribute.attribute`."""
+    module, _, attributes = value.partition(":")
+    path = filter(None, attributes.split("."))
+    return reduce(getattr, path, import_module(module.strip()))
+
+
+def _checked(entry: Entry, found: object) -> "type[Component]":
+    base = cast("type[Component]", _resolve(_BASES[entry.slot]))
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise _wrong_kind(entry, base, f"{found!r}")
+    if isabstract(found):
+        missing = sorted(getattr(found, "__abstractmethods__", ()))
+        raise _wrong_kind(entry, base, f"{found.__name__} without the methods {listed(missing)}")
+    return found
+
+
+def _wrong_kind(entry: Entry, base: type, found: str) -> UserError:
+    return UserError(
+        f"{singular(entry.slot)} {entry.name} cannot be used",
+        where=entry.origin,
+        expected=f"a complete subclass of crossgrad_core.plugin.{base.__name__}",
+        found=found,
+        todo=f"repair or uninstall {entry.distribution}",
+    )

@@ -1,0 +1,152 @@
+"""One plugin manager per run, and seams that must answer.
+
+pluggy is quiet about a hook that nobody specified, a hook method without its mark and a second
+plugin that answers first. All three are errors here, with the plugin's name.
+"""
+
+import inspect
+from collections.abc import Mapping
+from typing import TypeVar
+
+import pluggy
+
+from crossgrad_core.contract.contexts import Answer, Densified, Sampled, StepContext
+from crossgrad_core.contract.hooks import PROJECT, HookSpecs
+from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.errors import UserError
+from crossgrad_core.wording import did_you_mean, listed, sentences
+
+A = TypeVar("A", bound=Answer)
+
+_PREFIX = "crossgrad_"
+_HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith(_PREFIX))
+
+
+def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
+    """A fresh manager that knows the hooks and the given plugins.
+
+    Args:
+        plugins: Name -> plugin. Of two wrappers of one seam the later one is the outer one.
+
+    Raises:
+        UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, a
+            hook with other arguments than the hook's, or answers a seam that another plugin
+            answers.
+    """
+    manager = pluggy.PluginManager(PROJECT)
+    manager.add_hookspecs(HookSpecs)
+    for name, plugin in plugins.items():
+        _refuse_misspelt_hooks(manager, name, plugin)
+        try:
+            manager.register(plugin, name=name)
+        except (pluggy.PluginValidationError, ValueError) as error:
+            raise UserError(
+                f"plugin {name} cannot be registered",
+                where=_class_of(plugin),
+                found=" ".join(str(error).split()),
+                todo="docs/hooks.md lists every hook with its arguments",
+            ) from error
+    _refuse_second_answers(manager)
+    return manager
+
+
+def call_seam(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
+    """The answer of a seam, checked.
+
+    Args:
+        hook: A hook that stops at the first answer, such as `manager.hook.crossgrad_densify`.
+        context: What the plugins are offered.
+        answer: Type of the answer.
+
+    Raises:
+        UserError: Nobody answered, or the answer is of another type.
+    """
+    result: object = hook(context=context)
+    if isinstance(result, answer) and _complete(result):
+        return result
+    raise UserError(
+        f"the seam {hook.name} was not answered",
+        where=f"plugins {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
+        expected=f"a value of type {answer.__name__}; a seam must answer",
+        found=repr(result),
+        todo="return an explicit answer, NO_EDIT where nothing changes; "
+        "a wrapper must return what `yield` gave it or a replacement",
+    )
+
+
+def _complete(answer: Answer) -> bool:
+    """Whether an answer's own part is of its type: a None inside must not go unnoticed either."""
+    match answer:
+        case Sampled():
+            return bool(answer.draw)
+        case Densified():
+            return isinstance(answer.edit, Edit | NoEdit)
+        case _:
+            return True
+
+
+def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
+    """Raises for hooks that do not exist; replaces pluggy's own `check_pending`.
+
+    That one sees only marked methods and suggests no name.
+    """
+    for attribute in dir(plugin):
+        options = manager.parse_hookimpl_opts(plugin, attribute)
+        if options is None:
+            if attribute.startswith(_PREFIX) and _is_function(plugin, attribute):
+                raise _unmarked(name, plugin, attribute)
+        elif not options.get("optionalhook"):
+            hook = options.get("specname") or attribute
+            if hook not in _HOOKS:
+                raise _no_such_hook(name, plugin, hook)
+
+
+def _is_function(plugin: object, attribute: str) -> bool:
+    found = inspect.getattr_static(plugin, attribute, None)
+    return inspect.isroutine(found)
+
+
+def _unmarked(name: str, plugin: object, attribute: str) -> UserError:
+    if attribute not in _HOOKS:
+        return _no_such_hook(name, plugin, attribute)
+    return UserError(
+        f"plugin {name} has a method {attribute} that would never be called",
+        where=_class_of(plugin),
+        expected="a hook marked with @hookimpl",
+        found="a method without the mark",
+        todo="forgot @hookimpl? `from crossgrad_core.plugin import hookimpl`",
+    )
+
+
+def _no_such_hook(name: str, plugin: object, hook: str) -> UserError:
+    return UserError(
+        f"plugin {name} implements the hook {hook}, which does not exist",
+        where=_class_of(plugin),
+        expected=f"one of {listed(_HOOKS)}",
+        todo=sentences(
+            did_you_mean(hook, _HOOKS), f"names that begin with {_PREFIX} are kept for hooks"
+        ),
+    )
+
+
+def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
+    """Raises where two plugins answer one seam: the later one would silently replace the other."""
+    for hook in _HOOKS:
+        caller: pluggy.HookCaller = getattr(manager.hook, hook)
+        spec = caller.spec
+        answering = [
+            impl.plugin_name
+            for impl in caller.get_hookimpls()
+            if not impl.wrapper and not impl.hookwrapper
+        ]
+        if spec is not None and spec.opts["firstresult"] and len(answering) > 1:
+            raise UserError(
+                f"{len(answering)} plugins answer the seam {hook}: {listed(answering)}",
+                expected="one answer, from the component that fills the slot",
+                todo="let the others wrap it with @hookimpl(wrapper=True), or leave them out",
+            )
+
+
+def _class_of(plugin: object) -> str:
+    kind = type(plugin)
+    return f"{kind.__module__}:{kind.__qualname__}"

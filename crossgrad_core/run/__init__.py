@@ -1,0 +1,1 @@
+"""A run and its folder: from the configuration to the results."""

@@ -1,0 +1,192 @@
+"""What the commands do with a run that was trained: evaluate, render, export."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import evaluate as measured
+from crossgrad_core.run.export import described, export_ply, renderer
+from crossgrad_core.run.opening import opened, require_checkpoint
+from crossgrad_core.run.results.lock import RunInUseError, locked
+from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.run.results.panels import PanelWriter
+from crossgrad_core.run.results.per_view import FILE as PER_VIEW
+from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.summary import summarised_step
+from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.session import totals
+from crossgrad_core.system.writability import check_file, check_folder
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class How:
+    """How a run is opened.
+
+    Attributes:
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+    """
+
+    device: str | None = None
+    threads: int | None = None
+    accept_scene: bool = False
+
+    def open(self, folder: Path) -> tuple[Setup, TrainState]:
+        """The run's setup and its newest state."""
+        given = {"device": self.device, "threads": self.threads}
+        machine = {name: value for name, value in given.items() if value is not None}
+        return opened(folder, machine, -1, accept_scene=self.accept_scene)
+
+
+#: On the run's own device, with all threads and its own scene.
+AS_IT_IS = How()
+
+
+def evaluate(folder: Path, how: How = AS_IT_IS) -> None:
+    """Evaluates the held-out views of a run again; prints the table and renews per_view.csv.
+
+    The folder of a run that is training, and one that may not be written to, is only read.
+
+    Raises:
+        UserError: It is no run, or it has no checkpoint.
+    """
+    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    with _writing_if_possible(folder, "evaluating") as writes:
+        setup, state = how.open(folder)
+        result = measured(setup.scene.test_views, renderer(setup, state))
+        if writes:
+            write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
+        print(final_table(result, totals(setup, state)))  # noqa: T201
+
+
+def render(folder: Path, *, split: str, out: Path | None, how: How = AS_IT_IS) -> None:
+    """Draws photo | render | error of the views of a run.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, the split is empty, or it is training and no
+            other folder is named.
+    """
+    with _writing(folder, out, "rendering"):
+        check_folder(out or folder)
+        setup, state = how.open(folder)
+        scene = setup.scene
+        views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+        if not views:
+            raise UserError(
+                "there are no views to render",
+                where=f"--split {split}",
+                todo="choose another --split: train, test or all",
+            )
+        writer = PanelWriter.of(folder, state.step, views, len(views))
+        if out is not None:
+            writer = replace(writer, folder=out)
+        measured(views, renderer(setup, state), on_view=writer.write)
+        print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
+
+
+def export(
+    folder: Path,
+    *,
+    file_format: str,
+    out: Path | None,
+    camera: str | None = None,
+    how: How = AS_IT_IS,
+) -> None:
+    """Writes the trained scene to a file that viewers open.
+
+    Args:
+        folder: The run's folder.
+        file_format: `ply`.
+        out: The file; by default one in the run's folder that summary.json does not describe as
+            something else.
+        camera: Name of the view to bake for; by default the average over the training views.
+        how: How the run is opened.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, the file exists, there is no such view or
+            nothing to bake for it, or the run is training and no other file is named.
+    """
+    with _writing(folder, out, "exporting"):
+        if out is not None:
+            _check_new(out)
+            check_file(out)
+        setup, state = how.open(folder)
+        if camera is not None:
+            _check_bakes(setup)
+            path = out or folder / f"point_cloud_{_flat(setup, camera)}.{file_format}"
+            _check_new(path)
+        else:
+            path = out or folder / _own_name(folder, f"point_cloud.{file_format}", state.step)
+        exported = export_ply(setup, state, path, camera)
+        for line in described(exported, path):
+            print(line)  # noqa: T201
+        print(f"{exported.gaussians:,} Gaussians in {path}")  # noqa: T201
+
+
+@contextmanager
+def _writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
+    """Locks the run's folder, or says why it is only read; answers which."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder, doing))
+        except UserError as error:
+            found = f" ({error.found})" if error.found else ""
+            _LOG.warning("%s%s: results are shown, and none is written there", error.what, found)
+            yield False
+        else:
+            yield True
+
+
+@contextmanager
+def _writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
+    """Locks the run's folder, unless what is written goes elsewhere."""
+    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    if out is not None:
+        yield
+        return
+    try:
+        with locked(folder, doing):
+            yield
+    except RunInUseError as error:
+        raise UserError(
+            error.what, where=error.where, found=error.found, todo="name another place with --out"
+        ) from error
+
+
+def _own_name(folder: Path, name: str, step: int) -> str:
+    """A file name for results of a step, other than that of a file which describes another one.
+
+    The run may have gone on, and been killed, after summary.json and its files were written.
+    """
+    described = summarised_step(folder)
+    if described in {None, step}:
+        return name
+    path = Path(name)
+    return f"{path.stem}_step-{step:06d}{path.suffix}"
+
+
+def _flat(setup: Setup, camera: str) -> str:
+    """The view's name as a part of a file name; that of no view as it is, to be refused later."""
+    return flat_names([view.name for view in setup.scene.views]).get(camera, "view")
+
+
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise UserError("the file exists", where=path, todo="choose another --out, or remove it")
+
+
+def _check_bakes(setup: Setup) -> None:
+    if setup.backbone.plain:
+        raise UserError(
+            f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+            where="--camera",
+            todo="leave it out: the file is the same for every view",
+        )

@@ -1,0 +1,253 @@
+"""What `crossgrad run` does: a new run, or one that goes on."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import (
+    DEFAULT_STEPS,
+    growth_note,
+    schedule_of,
+)
+from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
+from crossgrad_core.run.ending import Course, last_words, resume_line
+from crossgrad_core.run.forecast import Forecast
+from crossgrad_core.run.opening import continued, parsed, set_up
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
+from crossgrad_core.run.results.folder import (
+    RUNS,
+    SMALLEST_NEED,
+    RunName,
+    check_out,
+    create_run_folder,
+    expected_bytes,
+)
+from crossgrad_core.run.results.lock import locked
+from crossgrad_core.run.results.log import RunLog
+from crossgrad_core.run.results.panels import FOLDER as RENDERS
+from crossgrad_core.run.results.scene_file import write_scene
+from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.session import Session, totals
+from crossgrad_core.run.settings_for_nothing import (
+    refuse_labels_for_nothing,
+    refuse_settings_for_nothing,
+)
+from crossgrad_core.scene.fingerprint import fingerprint_of
+from crossgrad_core.scene.photo_check import check_photos, fits
+from crossgrad_core.system.files import clear_leftovers
+from crossgrad_core.system.interrupts import exit_code, way_on
+from crossgrad_core.system.writability import check_folder
+from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state, initial_bytes, warm_up
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
+
+_LOG = logging.getLogger(__name__)
+#: Exit code of a run that failed; what it has is kept.
+FAILED = 1
+
+
+def run(
+    settings: Mapping[str, Any],
+    *,
+    resume: Path | None = None,
+    dry_run: bool = False,
+    verbosity: int = 0,
+    accept_scene: bool = False,
+) -> int:
+    """Trains, evaluates and exports.
+
+    Args:
+        settings: What the user set, in the shape of `RunConfig`.
+        resume: Folder of a stopped run to continue.
+        dry_run: Of a new run, check everything, print the resolved settings, train nothing.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Continue although photos, masks or points of the scene have changed.
+
+    Returns:
+        The exit code: 0, 1 where training failed, 130 where the user interrupted the run (128 and
+        the number of the signal).
+
+    Raises:
+        UserError: The input is bad; nothing was written.
+    """
+    if resume is not None:
+        take = partial(continued, resume, settings, verbosity, accept_scene=accept_scene)
+        return _resume(resume, take)
+    if accept_scene:
+        raise UserError(
+            "only a run that is continued has a scene to compare with",
+            where="--accept-scene",
+            todo="leave it out, or name the run with --resume",
+        )
+    config = with_defaults(parsed(settings))
+    check_out(config.out)
+    check_folder(config.out or RUNS, SMALLEST_NEED)
+    setup, load_seconds = set_up(config, verbosity)
+    refuse_labels_for_nothing(setup)
+    refuse_settings_for_nothing(config, setup)
+    load_seconds += _held_out_decoded(setup)
+    if dry_run:
+        _print_dry_run(setup)
+        return 0
+    check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
+    compile_seconds = warm_up(setup)
+    length: Length = Forecast(Planned(config.revisions))
+    if config.seconds is not None:
+        setup = _within(setup, config.seconds)
+        length = Timed(config.seconds)
+    setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
+    state = first_state(setup)
+    state.clock.load, state.clock.compile = load_seconds, compile_seconds
+    with _new_folder(setup, state) as folder:
+        setup = replace(setup, config=resolved(setup))
+        write_config(folder, setup.config)
+        _write_scene(folder, setup)
+        with way_on(resume_line(folder)):
+            return _train(setup, state, Session.fresh(folder, setup), length)
+
+
+def with_defaults(config: RunConfig) -> RunConfig:
+    """The configuration with scene and length filled in."""
+    if config.steps is not None and config.seconds is not None:
+        raise UserError(
+            "a run has either a number of steps or of seconds",
+            where="--steps, --seconds",
+            found=f"{config.steps} steps and {config.seconds:g} seconds",
+            todo="leave one of them out",
+        )
+    if config.scene is None:
+        config = config.model_copy(update={"scene": bundled_scene()})
+        if config.steps is None and config.seconds is None:
+            config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
+    elif config.steps is None and config.seconds is None:
+        config = config.model_copy(update={"steps": DEFAULT_STEPS})
+    return config
+
+
+def _within(setup: Setup, seconds: float) -> Setup:
+    """The setup with the length that fits into `seconds` of training."""
+    steps, note = steps_for(setup, seconds)
+    update = {"steps": steps, "seconds": None, "revisions": ()}
+    config = setup.config.model_copy(update=update)
+    schedule = schedule_of(config, setup.densifier, steps)
+    return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
+
+
+@contextmanager
+def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
+    """A folder for a new run, which nobody else writes into meanwhile."""
+    names = setup.selection.names
+    name = RunName(
+        setup.scene.name,
+        names["backbone"],
+        names["sampler"],
+        names["operator"],
+        datetime.now().astimezone(),
+    )
+    needed = expected_bytes(state.primitives(setup), 2)
+    folder = create_run_folder(name, setup.config.out, needed=needed)
+    with _held(folder):
+        # Another run may have begun and ended here meanwhile.
+        check_out(folder)
+        yield folder
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    with locked(folder, "training") as held:
+        if not held:
+            _LOG.warning(
+                "the file system of %s has no locks; nothing keeps a second process from writing "
+                "into it",
+                folder,
+            )
+        for place in (folder, *folder.glob(f"{RENDERS}/*")):
+            clear_leftovers(place)
+        yield
+
+
+def _train(setup: Setup, state: TrainState, session: Session, length: Length) -> int:
+    """Trains from `state` on and finishes the run's folder whatever happens."""
+    log = RunLog(session.folder)
+    setup.manager.register(log, name="log")
+    stopper = Stopper()
+    with stopper.installed():
+        course = Course(setup, state, session, log, stopper)
+        ending = course.to_the_end(length)
+        table = final_table(session.result(state.step), totals(course.setup, state))
+        log.write(table)
+        print(table)  # noqa: T201 - the result of the command
+        print(f"results in {session.folder}")  # noqa: T201
+        for line in last_words(course):
+            log.write(line)
+            print(line, file=sys.stderr)  # noqa: T201
+    if ending.status == "failed":
+        return FAILED
+    return 0 if stopper.signal is None else exit_code(stopper.signal)
+
+
+def _resume(folder: Path, take: Callable[[], tuple[Setup, TrainState]]) -> int:
+    """Continues a run.
+
+    Args:
+        folder: The run's folder.
+        take: Answers what it is made of and the state that it goes on from.
+    """
+    read_config(folder)  # Before a lock is laid into a folder that is no run's.
+    with way_on(resume_line(folder)), _held(folder):
+        setup, state = take()
+        if state.step >= setup.schedule.total and _is_described(folder, state.step):
+            raise UserError(
+                "the run is finished",
+                where=folder,
+                found=f"all {setup.schedule.total} steps done",
+                todo="start a new run; --init point_cloud.ply starts from its Gaussians",
+            )
+        if state.step < setup.schedule.total:
+            state.clock.load += _held_out_decoded(setup)
+            state.clock.compile += warm_up(setup, state)
+        _write_scene(folder, setup)
+        session = Session.resumed(folder, setup, state.step)
+        return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+
+
+def _held_out_decoded(setup: Setup) -> float:
+    """Finds held-out photos that cannot be decoded before training; answers the seconds."""
+    start = perf_counter()
+    keep = fits(setup.scene, setup.config.reading.cache_mib)
+    check_photos(setup.scene.test_views, keep=keep)
+    return perf_counter() - start
+
+
+def _write_scene(folder: Path, setup: Setup) -> None:
+    write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
+
+
+def _is_described(folder: Path, step: int) -> bool:
+    """Whether nothing is missing of a run that did all its steps, `step` in number."""
+    try:
+        summary = read_summary(folder)
+    except UserError:
+        return False
+    return summary.get("status") == "finished" and summary.get("step") == step
+
+
+def _print_dry_run(setup: Setup) -> None:
+    print(as_yaml(resolved(setup)), end="")  # noqa: T201
+    for note in setup.notes:
+        print(f"# {note}")  # noqa: T201
+    memory = initial_bytes(setup) / 2**20
+    print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201

@@ -1,0 +1,365 @@
+"""From a configuration to a Setup: load, fit to the scene, object, or say what was left out."""
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.component import Component, Selection
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.reader import Reader
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.registry.entries import build, entries, find, load
+from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.run.idle import idle_note
+from crossgrad_core.training.modes import mode_note
+from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.setup import Setup
+
+_LOG = logging.getLogger(__name__)
+#: Length of a run that asks for neither steps nor seconds (3DGS).
+DEFAULT_STEPS = 30_000
+
+
+def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
+    """The scene and the name of the reader that read it.
+
+    Raises:
+        UserError: No reader accepts the folder, or the one that does cannot read it.
+    """
+    _LOG.info("reading scene %s", path)
+    names = [config.reader.name] if config.reader.name != AUTO else list(entries("readers"))
+    for name in names:
+        reader = cast("Reader", build("readers", name, config.reader.options))
+        if config.reader.name != AUTO or reader.accepts(path):
+            return reader.read(path, config.reading), name
+    # No reader recognises it: the first one explains what it misses.
+    reader = cast("Reader", build("readers", "colmap", {}))
+    return reader.read(path, config.reading), "colmap"
+
+
+def check_names(config: RunConfig) -> None:
+    """Looks up every component and the device, before a large scene is read for nothing.
+
+    Raises:
+        UserError: A name does not exist, with the closest one that does.
+    """
+    choose_device(config.device)
+    named = [("operators", link) for link in config.operators]
+    named += [("observers", observer) for observer in config.observers]
+    for slot in ("backbone", "sampler", "grouping", "densifier", "rasterizer", "reader"):
+        named.append((f"{slot}s", getattr(config, slot)))
+    for slot, choice in named:
+        if choice is not None and choice.name != AUTO:
+            find(slot, choice.name)
+
+
+def choose_device(name: str) -> torch.device:
+    """The torch device of that name.
+
+    Raises:
+        UserError: There is no such device on this machine.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UserError(
+            f"there is no device {name!r}",
+            where="--device",
+            expected="cpu, cuda or cuda:N",
+            todo="leave --device out to run on the CPU",
+        ) from error
+    if device.type not in {"cpu", "cuda"}:
+        raise UserError(
+            f"device type {device.type!r} is not supported",
+            where="--device",
+            expected="cpu or cuda",
+            todo="use --device cpu",
+        )
+    if device.type == "cuda":
+        _require_cuda(device)
+    return device
+
+
+def _require_cuda(device: torch.device) -> None:
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if (device.index or 0) < count:
+        return
+    # A build of torch for AMD's GPUs calls them CUDA devices, too.
+    built_for = torch.version.cuda or torch.version.hip
+    if built_for is None:
+        found, todo = "a build for CPUs only", "install a CUDA build of torch"
+    elif count == 0:
+        found = f"a build for CUDA {built_for}, but no GPU that it can use"
+        todo = "run nvidia-smi: it tells whether there is a GPU and whether its driver works"
+    else:
+        found, todo = f"devices cuda:0 to cuda:{count - 1}", "choose one of them"
+    raise UserError(
+        f"torch sees no device {str(device)!r}",
+        where="--device",
+        found=f"torch {torch.__version__}: {found}",
+        todo=f"use --device cpu, or {todo}",
+    )
+
+
+def choose_rasterizer(choice: ComponentChoice, device: torch.device) -> tuple[str, str]:
+    """The name of the rasterizer and why it was chosen."""
+    if choice.name != AUTO:
+        return choice.name, f"rasterizer {choice.name}: asked for"
+    if device.type == "cpu":
+        return "numba", "rasterizer numba: the fast one on a CPU"
+    return "torch", "rasterizer torch: the only one here that runs on CUDA (a slow reference)"
+
+
+def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
+    """Loads and checks everything that the configuration names.
+
+    Raises:
+        UserError: A name or option is wrong, or the components cannot work together.
+    """
+    config = _with_first_degree(config)
+    selection, notes = select(config, scene, reader)
+    components = selection.components
+    observers = {choice.name: _built("observers", choice) for choice in config.observers}
+    plugins = _plugins(components, observers)
+    manager = make_manager(plugins)
+    answers = manager.hook.crossgrad_objections(selection=selection)
+    refuse(reasons_against(config, selection, answers))
+    groups = _groups(config, scene, selection, notes)
+    densifier = cast("Densifier", components["densifier"])
+    setup = Setup(
+        config=config,
+        scene=scene,
+        selection=selection,
+        densifier=densifier,
+        manager=manager,
+        plugins=plugins,
+        groups=groups,
+        schedule=schedule_of(config, densifier, config.steps or DEFAULT_STEPS),
+        device=choose_device(config.device),
+        notes=tuple(notes),
+    )
+    return replace(setup, notes=(*setup.notes, *_linear_note(setup), *idle_note(setup)))
+
+
+def _with_first_degree(config: RunConfig) -> RunConfig:
+    """The configuration that says at which SH degree the run starts.
+
+    Written down, so that a run goes on without the file that it started from.
+    """
+    path = config.reading.init_file
+    if config.sh_from is not None or path is None:
+        return config
+    from crossgrad_core.ply.file import sh_degree_of
+
+    return config.model_copy(update={"sh_from": sh_degree_of(path)})
+
+
+def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
+    """The components, loaded and fitted to the scene, and notes on what was chosen or left out.
+
+    Raises:
+        UserError: A name or option is wrong.
+    """
+    _require_points(config, scene)
+    device = choose_device(config.device)
+    notes: list[str] = list(scene.notes)
+    sampler = cast("Sampler", _built("samplers", config.sampler))
+    operator, operator_name = _operator(config)
+    backbone = cast("Backbone", _built("backbones", config.backbone))
+    backbone, left_out = backbone.fitted_to(scene)
+    notes += left_out
+    densifier_choice = _or_default(config.densifier, backbone.default_densifier)
+    densifier = cast("Densifier", _built("densifiers", densifier_choice))
+    rasterizer_name, why = choose_rasterizer(config.rasterizer, device)
+    notes.append(why)
+    rasterizer = cast(
+        "Rasterizer",
+        build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
+    )
+    views = config.views or sampler.usual_views
+    grouping_choice = _grouping_choice(config, sampler, notes)
+    components: dict[str, Component] = {
+        "backbone": backbone,
+        "sampler": sampler,
+        "operator": operator,
+        "densifier": densifier,
+        "rasterizer": rasterizer,
+    }
+    names = {
+        "backbone": config.backbone.name,
+        "sampler": config.sampler.name,
+        "operator": operator_name,
+        "densifier": densifier_choice.name,
+        "rasterizer": rasterizer_name,
+        "reader": reader,
+    }
+    if grouping_choice is not None:
+        components["grouping"] = _built("groupings", grouping_choice)
+        names["grouping"] = grouping_choice.name
+    return Selection(components, names, views, device.type), notes
+
+
+def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
+    """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
+    names = ("densify_from", "densify_until", "densify_every", "reset_every", "sh_from")
+    given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
+    return replace(densifier.window(Schedule.for_run(steps, config.schedule)), **given)
+
+
+def growth_note(setup: Setup) -> tuple[str, ...]:
+    """Says that density control is left out, where the run is too short for it."""
+    name = setup.selection.names["densifier"]
+    if name == "none" or setup.schedule.grows:
+        return ()
+    start, end = setup.schedule.densify_from, setup.schedule.densify_until
+    return (
+        f"no density control: in {setup.schedule.total} steps it would end (step {end}) before the "
+        f"first transient is over (step {start}); --set densify_from=N forces it",
+    )
+
+
+def _require_points(config: RunConfig, scene: Scene) -> None:
+    if scene.points.shape[0] == 0 and config.reading.init == "points":
+        raise UserError(
+            "the scene has no SfM points to start from",
+            where=scene.name,
+            todo="use --init random, or --init FILE.ply",
+        )
+
+
+def _built(slot: str, choice: ComponentChoice) -> Component:
+    return build(slot, choice.name, choice.options)
+
+
+def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
+    """The choice, where its name is left open with the default one."""
+    if choice is None:
+        return ComponentChoice(name=name)
+    return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
+
+
+def _operator(config: RunConfig) -> tuple[Operator, str]:
+    links = config.operators
+    if len(links) == 1:
+        return cast("Operator", _built("operators", links[0])), links[0].name
+    built = tuple(_built("operators", link) for link in links)
+    chain = build("operators", "chain", {"links": built})
+    return cast("Operator", chain), "+".join(link.name for link in links)
+
+
+def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:
+    options = dict(config.rasterizer.options)
+    if config.preset == "inria":
+        if "footprint" not in load("rasterizers", name).model_fields:
+            raise UserError(
+                f"rasterizer {name} does not have the footprint of the original code",
+                where="--preset inria",
+                expected="a rasterizer with the option footprint (numba, torch)",
+                todo="choose another rasterizer, or leave the preset out",
+            )
+        options.setdefault("footprint", "3-sigma")
+        # The published near plane is 0.2 units of the input frame.
+        options.setdefault("near", 0.2 * scene.similarity.scale)
+    return options
+
+
+def _grouping_choice(
+    config: RunConfig, sampler: Sampler, notes: list[str]
+) -> ComponentChoice | None:
+    if config.grouping is not None and config.grouping.name != AUTO:
+        return config.grouping
+    if sampler.default_grouping is not None:
+        return _or_default(config.grouping, sampler.default_grouping)
+    if config.grouping is not None:
+        raise UserError(
+            f"sampler {config.sampler.name} uses no grouping that could have options",
+            where="grouping",
+            todo="name the grouping with --grouping, or leave its options out",
+        )
+    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
+    return None
+
+
+def _groups(
+    config: RunConfig, scene: Scene, selection: Selection, notes: list[str]
+) -> tuple[str, ...] | None:
+    if "grouping" not in selection.components:
+        return None
+    grouping = cast("Grouping", selection.components["grouping"])
+    rng = make_streams(config.seed)["grouping"]
+    labelling = grouping.label(scene, scene.train_views, rng)
+    notes += labelling.notes
+    notes += mode_note(selection.names["grouping"], grouping, scene)
+    counts = {label: labelling.labels.count(label) for label in dict.fromkeys(labelling.labels)}
+    listed = ", ".join(f"{label} {count}" for label, count in counts.items())
+    notes.append(f"groups of training views: {listed}")
+    return labelling.labels
+
+
+def _plugins(
+    components: Mapping[str, Component], observers: Mapping[str, Component]
+) -> dict[str, object]:
+    plugins: dict[str, object] = {**components}
+    for name, observer in observers.items():
+        plugins[f"observer:{name}"] = observer
+    return plugins
+
+
+def reasons_against(
+    config: RunConfig, selection: Selection, answers: Iterable[list[str]]
+) -> tuple[str, ...]:
+    """Why the selection cannot work: what its components object, and what the core does."""
+    reasons = [reason for answer in answers for reason in answer]
+    device, rasterizer = selection.device, selection.rasterizer
+    if device not in rasterizer.devices:
+        reasons.append(
+            f"rasterizer {selection.names['rasterizer']} does not run on device {device}"
+        )
+    if selection.backbone.response not in rasterizer.responses:
+        reasons.append(
+            f"rasterizer {selection.names['rasterizer']} does not draw the pixel response "
+            f"{selection.backbone.response} of backbone {selection.names['backbone']}"
+        )
+    if config.backward == "joint" and selection.operator.separate:
+        reasons.append(
+            f"--backward joint makes one gradient of all views, but operator "
+            f"{selection.names['operator']} needs them apart"
+        )
+    return tuple(sorted(set(reasons)))
+
+
+def refuse(reasons: tuple[str, ...]) -> None:
+    """Ends the start of a run for these reasons, if there are any.
+
+    Raises:
+        IncompatibleSelectionError: There are.
+    """
+    if reasons:
+        raise IncompatibleSelectionError(
+            "these components cannot work together",
+            found="; ".join(reasons),
+            todo="choose another combination (crossgrad plugins show NAME tells what each needs)",
+        )
+
+
+def _linear_note(setup: Setup) -> tuple[str, ...]:
+    name = setup.selection.names["operator"]
+    if setup.operator.separate:
+        return ()
+    if setup.watchers:
+        return (
+            f"gradients of single views kept apart for {', '.join(setup.watchers)} (same bits)",
+        )
+    return (f"no separate gradients: operator {name} is linear, the backward passes accumulate",)

@@ -1,0 +1,190 @@
+"""A run from its first step to its last file: whatever ends it, what there is gets kept."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from shlex import quote
+
+from crossgrad_core.contract.contexts import RunInfo
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
+from crossgrad_core.run.results.config_file import write_config
+from crossgrad_core.run.results.log import FILE as LOG
+from crossgrad_core.run.results.log import RunLog
+from crossgrad_core.run.results.summary import Status
+from crossgrad_core.run.session import PANELS, Session
+from crossgrad_core.scene.photo_check import checked_meanwhile, fits
+from crossgrad_core.training.budget import Length
+from crossgrad_core.training.loop import evaluates_after, train
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended.
+
+    Attributes:
+        status: `finished`, `stopped` (resumable) or `failed`.
+        error: What went wrong and what there is not therefore; None where nothing did.
+        traced: Whether log.txt holds a traceback.
+    """
+
+    status: Status
+    error: str | None = None
+    traced: bool = False
+
+
+@dataclass
+class Course:
+    """A run under way.
+
+    Attributes:
+        setup: What it is made of; a run that follows the clock revises it.
+        state: Its state; after an exception the last good one.
+        session: Where its results go.
+        log: Its log.txt.
+        stopper: Whether it is to stop.
+        ending: How it ends, as far as that is known.
+    """
+
+    setup: Setup
+    state: TrainState
+    session: Session
+    log: RunLog
+    stopper: Stopper
+    ending: Ending = Ending("finished")
+
+    def to_the_end(self, length: Length) -> Ending:
+        """Trains, and then saves and describes the last state.
+
+        Part by part: none that fails costs another, and the ending says which did.
+        """
+        self._attempt("", lambda: self._train(length))
+        self._attempt("", lambda: self.session.align(self.setup, self.state))
+        if self.state.step > 0:
+            self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
+            self._describe()
+        self._summarise()
+        described = self.ending
+        self._attempt("", lambda: self.setup.hook.crossgrad_run_end(status=described.status))
+        if self.ending != described:
+            self._summarise()
+        return self.ending
+
+    def _train(self, length: Length) -> None:
+        setup = self.setup
+        keep = fits(setup.scene, setup.config.reading.cache_mib)
+        with (
+            self.stopper.interruptible(),
+            checked_meanwhile(setup.train_views, self.stopper.fail, keep=keep),
+        ):
+            setup.hook.crossgrad_run_start(run=self._info())
+            self._catch_up()
+            while True:
+                ended = train(self.setup, self.state, self.session, self.stopper, length.due)
+                if ended != "paused":
+                    self.ending = Ending(ended)
+                    return
+                revised = length.revised(self.setup, self.state)
+                if revised.config is not self.setup.config:  # A planned length is written already.
+                    write_config(self.session.folder, revised.config)
+                self.setup = revised
+
+    def _catch_up(self) -> None:
+        """Evaluates where an earlier session ended before it could."""
+        if evaluates_after(self.setup, self.state.step) and not self.session.has_row(
+            self.state.step
+        ):
+            self.session.evaluate(self.setup, self.state)
+
+    def _describe(self) -> None:
+        setup, state, session = self.setup, self.state, self.session
+        parts: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("no evaluation", lambda: session.evaluate(setup, state, panels=PANELS)),
+            ("no per_view.csv", lambda: session.write_views(state)),
+            ("no curve.png", lambda: session.draw(setup, state)),
+            ("no point_cloud.ply", lambda: session.export(setup, state)),
+        )
+        for missing, write in parts:
+            self._attempt(missing, partial(self._unless_interrupted, write))
+
+    def _unless_interrupted(self, write: Callable[[], None]) -> None:
+        with self.stopper.interruptible():
+            if self.stopper.at_once:
+                raise KeyboardInterrupt
+            write()
+
+    def _summarise(self) -> None:
+        ending = self.ending
+        self._attempt(
+            "no summary.json",
+            lambda: self.session.summarise(self.setup, self.state, ending.status, ending.error),
+        )
+
+    def _attempt(self, missing: str, part: Callable[[], None]) -> None:
+        """Does a part of the run; where it fails, the ending says so.
+
+        Args:
+            missing: What there is not where the part fails.
+            part: The part.
+        """
+        try:
+            part()
+        except KeyboardInterrupt:
+            if self.ending.error is None:
+                self.ending = replace(self.ending, status="stopped")
+        except (Exception, SystemExit) as error:  # Third-party code may raise anything.
+            self._note(error, missing)
+
+    def _note(self, error: BaseException, missing: str) -> None:
+        reason, traced = reason_of(error), is_unexpected(error)
+        if traced:
+            self.log.write(traceback_of(error))
+        known = self.ending.error
+        if known is None or reason not in known:
+            parts = [known, ": ".join(part for part in (missing, *steps_of(error), reason) if part)]
+            known = "\n".join(part for part in parts if part)
+        self.ending = Ending("failed", known, self.ending.traced or traced)
+
+    def _info(self) -> RunInfo:
+        setup = self.setup
+        return RunInfo(
+            folder=self.session.folder,
+            scene=setup.scene,
+            config=setup.config.model_dump(mode="json"),
+            schedule=setup.schedule,
+            blocks=setup.blocks,
+            notes=setup.notes,
+        )
+
+
+def last_words(course: Course) -> list[str]:
+    """What the user is told of a run that did not finish: why, what is kept, how to go on."""
+    ending, folder = course.ending, course.session.folder
+    lines = []
+    if ending.error is not None:
+        lines += f"training failed: {ending.error}".splitlines()
+    if ending.traced:
+        lines.append(f"the traceback is in {folder / LOG}")
+    lines += _kept(course)
+    if ending.status != "finished":
+        lines.append(resume_line(folder))
+    return lines
+
+
+def resume_line(folder: Path) -> str:
+    """How a run goes on."""
+    return f"continue with: crossgrad run --resume {quote(str(folder))}"
+
+
+def _kept(course: Course) -> list[str]:
+    """What to say about the state, where not all of it is in the newest checkpoint."""
+    step = course.state.step
+    saved = max(complete_checkpoints(course.session.folder / CHECKPOINTS), default=0)
+    if saved >= step:
+        return []
+    there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"
+    return [f"the state of step {step} could not be saved; {there}"]

@@ -1,0 +1,197 @@
+"""From settings, or from a run's folder, to a run that can go on."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+from pydantic import ValidationError
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.validation import as_user_error
+from crossgrad_core.run.assemble import assemble, check_names, read_scene
+from crossgrad_core.run.checkpoint.checkpoint import load_latest
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.persist import from_checkpoint
+from crossgrad_core.run.results.config_file import FILE as CONFIG
+from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.lock import writer_of
+from crossgrad_core.run.results.scene_file import check_scene
+from crossgrad_core.run.resumable import CHANGEABLE
+from crossgrad_core.scene.differences import Weight
+from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
+from crossgrad_core.training.budget import caught_up
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
+
+#: What a run says that has to begin again.
+BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
+
+
+def parsed(settings: Mapping[str, Any]) -> RunConfig:
+    """The validated configuration.
+
+    Raises:
+        UserError: A setting does not exist or has a wrong value.
+    """
+    try:
+        return RunConfig.model_validate(settings)
+    except ValidationError as error:
+        raise as_user_error(
+            error, RunConfig, subject="a run", todo="crossgrad run --help lists every setting"
+        ) from error
+
+
+def set_up(
+    config: RunConfig, verbosity: int, check: Callable[[Fingerprint], tuple[str, ...]] | None = None
+) -> tuple[Setup, float]:
+    """The assembled run and the seconds that reading the scene took.
+
+    Args:
+        config: The configuration, with a scene.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+        check: Refuses a scene that is not the run's; answers with notes on one that it takes.
+
+    Raises:
+        UserError: The scene cannot be read, or the components cannot work together.
+    """
+    check_names(config)
+    configure_threads(config.threads)
+    start = perf_counter()
+    scene, reader = read_scene(config, cast("Path", config.scene))
+    notes = () if check is None else check(fingerprint_of(scene, cast("Path", config.scene)))
+    scene = replace(scene, notes=(*notes, *scene.notes))
+    seconds = perf_counter() - start
+    level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
+    if not any(choice.name == "progress" for choice in config.observers):
+        progress = ComponentChoice.model_validate({"name": "progress", "level": level})
+        config = config.model_copy(update={"observers": (*config.observers, progress)})
+    return assemble(config, scene, reader), seconds
+
+
+def require_checkpoint(folder: Path) -> None:
+    """Refuses a folder in which there is nothing to look at yet; writes nothing there.
+
+    Raises:
+        UserError: It is no run, or it has no checkpoint.
+    """
+    read_config(folder)
+    if not _has_checkpoint(folder):
+        writer = writer_of(folder)
+        raise UserError(
+            "the run has no checkpoint yet",
+            where=folder,
+            found=writer or "a run that was ended before its first checkpoint",
+            todo="wait for the first one"
+            if writer
+            else f"crossgrad run --resume {folder} begins it again",
+        )
+
+
+def opened(
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int = 0,
+    *,
+    accept_scene: bool = False,
+) -> tuple[Setup, TrainState]:
+    """A run's setup and its newest state, to look at; the run may be training meanwhile.
+
+    Args:
+        folder: The run's folder.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, a setting would change the training, or the
+            scene is another one.
+    """
+    require_checkpoint(folder)
+    check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
+    return _from(folder, settings, verbosity, check)
+
+
+def continued(
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int,
+    *,
+    accept_scene: bool = False,
+) -> tuple[Setup, TrainState]:
+    """A run's setup and the state that it goes on from.
+
+    That is the newest one, or, where the run was ended before its first checkpoint, the first.
+
+    Args:
+        folder: The run's folder.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+        accept_scene: Take a scene of which photos, masks or points have changed.
+
+    Raises:
+        UserError: It is no run, a setting would change the training, or the scene is another one.
+    """
+    check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
+    if _has_checkpoint(folder):
+        return _from(folder, settings, verbosity, check)
+    setup, seconds = set_up(_config(folder, settings), verbosity)
+    state = first_state(setup)
+    state.clock.load = seconds
+    return replace(setup, notes=(BEGINS_AGAIN, *setup.notes)), state
+
+
+def _from(
+    folder: Path,
+    settings: Mapping[str, Any],
+    verbosity: int,
+    check: Callable[[Fingerprint], tuple[str, ...]],
+) -> tuple[Setup, TrainState]:
+    checkpoint = load_latest(folder)
+    # Read after the checkpoint: a run that follows the clock only adds to its configuration.
+    setup, seconds = set_up(_config(folder, settings), verbosity, check)
+    state = from_checkpoint(setup, checkpoint)
+    state.clock.load += seconds
+    return caught_up(setup, state.step), state
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    return bool(complete_checkpoints(folder / CHECKPOINTS))
+
+
+def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
+    """The run's own configuration with what may differ."""
+    frozen = sorted(set(settings) - CHANGEABLE)
+    if frozen:
+        raise UserError(
+            "a resumed run keeps its settings",
+            where=f"settings {listed(frozen)}",
+            expected=f"none but {listed(sorted(CHANGEABLE))}",
+            todo="leave them out, or start a new run",
+        )
+    stored = read_config(folder)
+    stored.pop("stop_after", None)
+    # The degree that a run started with is written down; where it is not, it was 0.
+    stored["sh_from"] = stored.get("sh_from") or 0
+    config = parsed({**stored, **settings})
+    if "device" not in settings:
+        _check_device(config.device, folder)
+    return config
+
+
+def _check_device(name: str, folder: Path) -> None:
+    """Says what to do where the run's own device is not on this machine."""
+    import torch
+
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(
+            "the run was trained on CUDA, and torch sees no CUDA device here",
+            where=f"{folder / CONFIG}, device: {name}",
+            todo="add --device cpu, or go on where there is one",
+        )

@@ -1,0 +1,49 @@
+"""The configuration as it was carried out: every decision written down."""
+
+from pathlib import Path
+from typing import Any
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.component import Component
+from crossgrad_core.training.setup import Setup
+
+
+def resolved(setup: Setup) -> RunConfig:
+    """The configuration that repeats the run: components with all options, K and steps fixed.
+
+    The output folder is left out, so that the repetition gets its own.
+    """
+    config, selection = setup.config, setup.selection
+    components, names = selection.components, selection.names
+    chosen: dict[str, Any] = {
+        slot: _choice(names[slot], components[slot])
+        for slot in ("backbone", "sampler", "densifier", "rasterizer")
+    }
+    if "grouping" in components:
+        chosen["grouping"] = _choice(names["grouping"], components["grouping"])
+    scene = None if config.scene is None else Path(config.scene).resolve()
+    path = config.reading.init_file
+    init = config.reading.init if path is None else str(path.resolve())
+    return config.model_copy(
+        update={
+            **chosen,
+            "operator": _operator(config, setup),
+            "reader": ComponentChoice(name=names["reader"]),
+            "observers": tuple(c for c in config.observers if c.name != "progress"),
+            "scene": scene,
+            "reading": config.reading.model_copy(update={"init": init}),
+            "out": None,
+            "views": selection.views_per_step,
+            "steps": config.steps or setup.schedule.total,
+        }
+    )
+
+
+def _choice(name: str, component: Component) -> ComponentChoice:
+    return ComponentChoice.model_validate({"name": name, **component.model_dump(mode="json")})
+
+
+def _operator(config: RunConfig, setup: Setup) -> ComponentChoice | tuple[ComponentChoice, ...]:
+    if isinstance(config.operator, tuple) and len(config.operator) > 1:
+        return config.operator
+    return _choice(setup.selection.names["operator"], setup.operator)

@@ -1,0 +1,38 @@
+"""config.yaml: the resolved configuration, which repeats the run."""
+
+from pathlib import Path
+from typing import Any
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.yaml_values import read_mapping, write_yaml
+
+FILE = "config.yaml"
+
+
+def write_config(folder: Path, config: RunConfig) -> None:
+    """Writes what repeats the run; a run that follows the clock renews it as it goes."""
+    write_atomically(folder / FILE, as_yaml(config).encode())
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The settings in a run's config.yaml.
+
+    Raises:
+        UserError: There is none, so it is not the folder of a run, or it is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UserError(
+            "this is not the folder of a run",
+            where=folder,
+            expected=f"a folder with {FILE}",
+            todo="name the folder that `crossgrad run` printed",
+        )
+    return read_mapping(path, "the configuration of the run", "start a new run")
+
+
+def as_yaml(config: RunConfig) -> str:
+    """The configuration as a user would write it."""
+    return write_yaml(config.model_dump(mode="json"))

@@ -1,0 +1,123 @@
+"""The output folder of a run: named, new, writable and with room, before any work is done."""
+
+import re
+import tempfile
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.results.lock import FILE as LOCK
+from crossgrad_core.run.results.lock import writer_of
+from crossgrad_core.system.files import disk_errors, disk_full, free_bytes, is_leftover
+
+#: Space that a run with a small scene and few renders may take, in bytes.
+SMALLEST_NEED = 64 * 2**20
+#: Where runs are kept, below the working folder.
+RUNS = Path("runs")
+_UNSAFE = re.compile(r"[^\w.+-]+")
+
+
+@dataclass(frozen=True)
+class RunName:
+    """What a run is called after.
+
+    Attributes:
+        scene: Name of the scene.
+        backbone: Name of the backbone.
+        sampler: Name of the sampler.
+        operator: Name of the operator.
+        started: Local time of the start.
+    """
+
+    scene: str
+    backbone: str
+    sampler: str
+    operator: str
+    started: datetime
+
+    @property
+    def folder(self) -> Path:
+        """<scene>/<backbone>-<sampler>-<operator>/<YYYYmmdd-HHMMSS>."""
+        method = f"{self.backbone}-{self.sampler}-{self.operator}"
+        parts = (self.scene, method, self.started.strftime("%Y%m%d-%H%M%S"))
+        return Path(*(_safe(part) for part in parts))
+
+
+def create_run_folder(
+    name: RunName, out: Path | None = None, root: Path = RUNS, needed: int = SMALLEST_NEED
+) -> Path:
+    """Creates the output folder of a new run.
+
+    Args:
+        name: Gives the folder its name below `root`; of two runs that start in the same second
+            the later one gets the suffix -2.
+        out: The folder itself, where the user named one; it must be new or empty.
+        root: Where runs are kept.
+        needed: Bytes that the run may write.
+
+    Raises:
+        UserError: `out` holds something, the folder cannot be written to, or the disk is too full.
+    """
+    check_out(out)
+    wanted = out if out is not None else root / name.folder
+    if free_bytes(wanted) < needed:
+        raise disk_full(wanted, needed)
+    with disk_errors(wanted):
+        folder = _made(wanted, taken=out is not None)
+        # Permission bits do not tell the truth on network file systems; writing does.
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"crossgrad")
+    return folder
+
+
+def check_out(out: Path | None) -> None:
+    """Refuses a folder that holds something; makes nothing, so that it can be asked at once.
+
+    What a run leaves that was killed before it wrote anything does not count.
+
+    Raises:
+        UserError: `out` is a file or is not empty.
+    """
+    if out is None or not out.exists():
+        return
+    if not out.is_dir():
+        raise UserError(
+            "the output folder is a file", where=out, todo="choose another --out, or remove it"
+        )
+    there = sorted(p.name for p in out.iterdir() if p.name != LOCK and not is_leftover(p))
+    if there:
+        writer = writer_of(out)
+        raise UserError(
+            "the output folder is not empty, and results are never overwritten",
+            where=out,
+            expected="a new or empty folder",
+            found=", ".join(there[:4]) + (f" of {writer}" if writer else ""),
+            todo="choose another --out, or continue that run with --resume",
+        )
+
+
+def expected_bytes(primitives: int, checkpoints: int) -> int:
+    """Bytes that a run of that size writes: SH degree 3, two Adam moments, one PLY file."""
+    floats = 59 * 3 * (checkpoints + 1) + 62  # one more checkpoint exists while it is written
+    return max(SMALLEST_NEED, 4 * floats * primitives)
+
+
+def _safe(part: str) -> str:
+    """A path component that every file system takes."""
+    return _UNSAFE.sub("_", part).strip(".") or "_"
+
+
+def _made(wanted: Path, *, taken: bool) -> Path:
+    if taken:
+        wanted.mkdir(parents=True, exist_ok=True)
+        return wanted
+    folder, number = wanted, 1
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = wanted.with_name(f"{wanted.name}-{number}")
+        else:
+            return folder

@@ -1,0 +1,149 @@
+"""One writer per run folder: a lock that dies with its process."""
+
+import errno
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import disk_errors
+
+#: The file that is locked. It stays when its process is gone; then nobody holds the lock on it.
+FILE = "run.lock"
+
+_TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
+# Windows locks ranges of bytes, which nobody else can read: one far behind the content.
+_FAR = 2**30
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds the lock.
+
+    Attributes:
+        pid: Number of the process.
+        host: Name of its machine.
+        since: Local time, to the second.
+        doing: What it does in the folder.
+    """
+
+    pid: int
+    host: str
+    since: str
+    doing: str
+
+    @classmethod
+    def me(cls, doing: str) -> "Holder":
+        """This process, now."""
+        now = datetime.now().astimezone()
+        return cls(os.getpid(), platform.node(), now.strftime("%Y-%m-%d %H:%M:%S"), doing)
+
+    @override
+    def __str__(self) -> str:
+        where = "" if self.host == platform.node() else f" on {self.host}"
+        return f"process {self.pid}{where}, {self.doing} since {self.since}"
+
+
+class RunInUseError(UserError):
+    """Another process writes into the folder of a run."""
+
+
+@contextmanager
+def locked(folder: Path, doing: str) -> Iterator[bool]:
+    """Keeps every other process from writing into a run's folder inside the block.
+
+    The lock lies on an open file, so that it is gone when its process is, however that ends.
+
+    Args:
+        folder: The run's folder.
+        doing: What this process does there, for those that are refused.
+
+    Yields:
+        Whether the folder is locked: some network file systems have no locks.
+
+    Raises:
+        RunInUseError: Another process holds the lock; says which and since when.
+        UserError: The folder may not be written to.
+    """
+    path = folder / FILE
+    with disk_errors(path):
+        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
+    with file:
+        taken = _take(file)
+        if taken == "by another":
+            raise _in_use(folder, _read(file))
+        with disk_errors(path):
+            _write(file, json.dumps(asdict(Holder.me(doing))))
+        try:
+            yield taken == "by us"
+        finally:
+            with suppress(OSError):
+                _write(file, "")
+
+
+def writer_of(folder: Path) -> str | None:
+    """Which process writes into the folder now; None where none does, or nobody can tell."""
+    try:
+        with (folder / FILE).open("r+b") as file:
+            return _named(_read(file)) if _take(file) == "by another" else None
+    except OSError:
+        return None
+
+
+def _in_use(folder: Path, holder: Holder | None) -> RunInUseError:
+    return RunInUseError(
+        "another process writes into this folder",
+        where=folder,
+        found=_named(holder),
+        todo="wait until it ends, or stop it",
+    )
+
+
+def _named(holder: Holder | None) -> str:
+    return "a process that holds the folder's lock" if holder is None else str(holder)
+
+
+def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:
+    """Who has the lock after we tried to take it; nobody where the file system knows no locks."""
+    try:
+        _lock(file)
+    except OSError as error:
+        return "by another" if error.errno in _TAKEN else "not at all"
+    return "by us"
+
+
+def _lock(file: BinaryIO) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(_FAR)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _write(file: BinaryIO, text: str) -> None:
+    file.seek(0)
+    file.truncate()
+    file.write(text.encode())
+    file.flush()
+
+
+def _read(file: BinaryIO) -> Holder | None:
+    """What the holder wrote; None where it has not written yet."""
+    file.seek(0)
+    try:
+        return Holder(**json.loads(file.read()))
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,185 @@
+"""metrics.csv: one row per evaluation, on the disk as soon as it is known."""
+
+import csv
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import EvaluationResult
+from crossgrad_core.run.results.totals import Totals
+from crossgrad_core.system.files import disk_errors, write_atomically
+from crossgrad_core.system.text_files import parse_number, read_rows
+
+FILE = "metrics.csv"
+
+#: Column -> value; None where it was not measured.
+Row: TypeAlias = dict[str, int | float | None]
+
+_FIRST = ("step", "views", "backward_passes", "train_seconds")
+_METRICS = ("psnr", "ssim", "ssim_skimage", "lpips")
+_LAST = ("primitives", "peak_memory_mib", "loss")
+_MILLISECONDS = 3
+_TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
+
+
+def columns_for(regimes: Sequence[str]) -> tuple[str, ...]:
+    """The columns of a run whose test views fall into these regimes."""
+    split = [f"{metric}_{regime}" for regime in sorted(regimes) for metric in ("psnr", "ssim")]
+    return (*_FIRST, *_METRICS, *split, *_LAST)
+
+
+def regimes_of(columns: Sequence[str]) -> tuple[str, ...]:
+    """The regimes that a table's columns tell apart."""
+    return tuple(
+        name.removeprefix("psnr_")
+        for name in columns
+        if name.startswith("psnr_") and f"ssim_{name.removeprefix('psnr_')}" in columns
+    )
+
+
+def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
+    """The row of one evaluation."""
+    row: Row = dict(asdict(totals))
+    row["train_seconds"] = round(totals.train_seconds, _MILLISECONDS)
+    peak = totals.peak_memory_mib
+    row["peak_memory_mib"] = None if peak is None else round(peak, 1)
+    row |= {metric: getattr(result.overall, metric) for metric in _METRICS}
+    for regime, means in result.regimes.items():
+        row[f"psnr_{regime}"] = means.psnr
+        row[f"ssim_{regime}"] = means.ssim
+    return {name: row[name] for name in columns_for(list(result.regimes))}
+
+
+@dataclass(frozen=True)
+class MetricsCsv:
+    """The table of one run.
+
+    Attributes:
+        path: The file.
+        columns: Its columns.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+
+    @classmethod
+    def create(cls, folder: Path, regimes: Sequence[str]) -> "MetricsCsv":
+        """A new table with its header and no row."""
+        table = cls(folder / FILE, columns_for(regimes))
+        table.rewrite(())
+        return table
+
+    @classmethod
+    def resume(cls, folder: Path, regimes: Sequence[str], step: int) -> "MetricsCsv":
+        """The table of a run that continues after `step`: rows beyond it are dropped.
+
+        Raises:
+            UserError: The table cannot be read, or has other columns, so it belongs to another run.
+        """
+        path = folder / FILE
+        if not path.is_file():
+            return cls.create(folder, regimes)
+        table = cls(path, columns_for(regimes))
+        lines = _lines(path)
+        if not lines or tuple(lines[0]) != table.columns:
+            raise UserError(
+                "cannot continue the table of another run",
+                where=path,
+                expected=",".join(table.columns),
+                found=",".join(lines[0]) if lines else "an empty file",
+                todo="resume with the scene and split of that run",
+            )
+        # A row that a crash cut short has fewer cells; the resumed run writes it again.
+        whole = [line for line in lines[1:] if len(line) == len(table.columns)]
+        steps = [row["step"] for row in _rows(path, lines[0], whole)]
+        known = zip(whole, steps, strict=True)
+        table.rewrite([line for line, at in known if at is not None and at <= step])
+        return table
+
+    def append(self, row: Mapping[str, int | float | str | None]) -> None:
+        """Writes a row and waits until it is on the disk; a row that does not fit leaves nothing.
+
+        Raises:
+            ValueError: The row has a column that the table lacks.
+            UserError: The disk is full.
+        """
+        unknown = set(row) - set(self.columns)
+        if unknown:
+            message = f"{FILE} has no columns {sorted(unknown)}"
+            raise ValueError(message)
+        text = _csv_text([[_cell(row.get(name)) for name in self.columns]])
+        with disk_errors(self.path, len(text)):
+            _append(self.path, text.encode())
+
+    def rewrite(self, lines: Sequence[Sequence[str]]) -> None:
+        """Replaces the whole table by the header and these rows."""
+        write_atomically(self.path, _csv_text([self.columns, *lines]).encode())
+
+
+def read_metrics(folder: Path) -> tuple[Row, ...]:
+    """The rows of a run's metrics.csv in order.
+
+    Raises:
+        UserError: There is none, or it does not hold numbers.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UserError(
+            f"no {FILE}",
+            where=folder,
+            expected="the folder of a crossgrad run",
+            todo="name the folder that `crossgrad run` printed",
+        )
+    header, *lines = _lines(path) or [[]]
+    if len(set(header)) < len(header):
+        raise _unreadable(path, "a column that occurs twice")
+    return _rows(path, header, lines)
+
+
+def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> tuple[Row, ...]:
+    try:
+        return tuple(
+            {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
+        )
+    except ValueError as error:
+        raise _unreadable(path, str(error)) from error
+
+
+def _unreadable(path: Path, found: str) -> UserError:
+    return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
+
+
+def _append(path: Path, content: bytes) -> None:
+    with path.open("ab", buffering=0) as file:
+        size = file.tell()
+        try:
+            left = memoryview(content)
+            while left:  # The system may take a part of it only.
+                left = left[file.write(left) :]
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(size)
+            raise
+
+
+def _lines(path: Path) -> list[list[str]]:
+    """All whole lines: one that a crash cut short has no end."""
+    return read_rows(path, FILE, _TODO, whole=True)
+
+
+def _csv_text(lines: Sequence[Sequence[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
+
+
+def _cell(value: float | str | None) -> str:
+    return "" if value is None else str(value)
+
+
+def _number(cell: str) -> int | float | None:
+    return None if cell == "" else parse_number(cell)

@@ -1,0 +1,84 @@
+"""scene.json: the fingerprint of the scene that a run was trained on."""
+
+import json
+import logging
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.differences import Weight, differences
+from crossgrad_core.scene.fingerprint import Fingerprint
+from crossgrad_core.system.files import write_atomically
+
+FILE = "scene.json"
+#: What to do about the heaviest difference; None stands for one that can be accepted.
+_WAYS_OUT = {
+    None: "put it back as it was, or add --accept-scene to go on with it as it is",
+    Weight.HELD_OUT: "put it back as it was; eval, render and export take it with --accept-scene, "
+    "but a run goes on only with the views that it began with",
+    Weight.PLACE: "put it back as it was, or start a new run: the parameters of this one would be "
+    "in the wrong place, or views that it was trained on would be measured",
+}
+_LOG = logging.getLogger(__name__)
+
+
+def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
+    """Writes a run's scene.json, one line for each view.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    data = fingerprint.model_dump(mode="json")
+    views = data.pop("views")
+    head = json.dumps(data, indent=1, ensure_ascii=True).removesuffix("\n}")
+    lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(view)}" for name, view in views.items())
+    write_atomically(folder / FILE, f'{head},\n "views": {{\n{lines}\n }}\n}}\n'.encode())
+
+
+def read_scene_file(folder: Path) -> Fingerprint | None:
+    """The scene that a run was trained on; None, with a note, where that cannot be told."""
+    path = folder / FILE
+    try:
+        fingerprint = Fingerprint.model_validate_json(path.read_bytes())
+    except OSError:
+        why = f"{folder} has no {FILE}: the run is of an older version"
+    except ValidationError:
+        why = f"{path} is damaged, or of another version"
+    else:
+        return fingerprint
+    _LOG.warning("%s; whether its scene is still the same cannot be told", why)
+    return None
+
+
+def check_scene(
+    folder: Path, now: Fingerprint, tolerated: Weight, *, accept: bool
+) -> tuple[str, ...]:
+    """Holds the scene as it is against the one that the run was trained on.
+
+    Args:
+        folder: The run's folder.
+        now: The scene as it is.
+        tolerated: The heaviest differences that the command can live with ...
+        accept: ... where the user says so (`--accept-scene`).
+
+    Returns:
+        A note on the differences, if there are any.
+
+    Raises:
+        UserError: The scene differs in more than is tolerated, or the user did not accept it.
+    """
+    was = read_scene_file(folder)
+    found = [] if was is None else differences(was, now)
+    if not found:
+        return ()
+    text = "; ".join(each.text for each in found)
+    heaviest = max(each.weight for each in found)
+    if heaviest <= tolerated and accept:
+        return (f"the scene is not the one that the run was trained on, accepted: {text}",)
+    raise UserError(
+        "the scene is not the one that the run was trained on",
+        where=folder / FILE,
+        found=text,
+        todo=_WAYS_OUT[heaviest if heaviest > tolerated else None],
+    )

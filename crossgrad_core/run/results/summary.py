@@ -1,0 +1,154 @@
+"""summary.json: the final figures of a run with all that is needed to understand them."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from crossgrad_core.contract.state import Json
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import EvaluationResult
+from crossgrad_core.run.results.metrics_csv import Row
+from crossgrad_core.run.results.totals import Seconds, Totals
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import read_json
+
+FILE = "summary.json"
+
+Status = Literal["finished", "stopped", "failed"]
+
+#: How the metrics are defined; they compare only with figures of the same definition.
+DEFINITIONS: Mapping[str, str] = {
+    "psnr": "dB; 20 log10(1 / sqrt(mse)) per image over all channels, mean over images",
+    "ssim": "3DGS form: 11 x 11 window, sigma 1.5, zero padding, mean over images",
+    "ssim_skimage": "scikit-image: gaussian_weights, sigma 1.5, use_sample_covariance off",
+    "renders": "rounded to 8 bits per channel before comparison; masked pixels do not count",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What summary.json says.
+
+    Attributes:
+        status: How the run ended.
+        scene: Name of the scene.
+        totals: Steps, views, backward passes, training seconds, primitives, memory.
+        result: The last evaluation; None where there was none.
+        rows: All rows of metrics.csv, to find the best one.
+        seconds: Wall-clock seconds by what they were spent on.
+        config: The resolved configuration as plain data, the seed included.
+        environment: Machine and versions.
+        ply: What is in the PLY; None where none was written.
+        notes: What was chosen or left out, and why.
+        error: Why the run failed; None otherwise.
+    """
+
+    status: Status
+    scene: str
+    totals: Totals
+    result: EvaluationResult | None
+    rows: Sequence[Row]
+    seconds: Seconds
+    config: Mapping[str, Any]
+    environment: Mapping[str, Json]
+    ply: Mapping[str, Json] | None = None
+    notes: Sequence[str] = ()
+    error: str | None = None
+
+
+def write_summary(folder: Path, summary: Summary) -> None:
+    """Writes summary.json; numbers that JSON does not know (NaN, infinite) become null.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    text = json.dumps(_finite(_as_data(summary)), indent=2, ensure_ascii=False, default=str)
+    write_atomically(folder / FILE, (text + "\n").encode())
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of a run's summary.json.
+
+    Raises:
+        UserError: There is none, or it is not JSON.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UserError(
+            f"no {FILE}",
+            where=folder,
+            expected="the folder of a crossgrad run",
+            todo="name the folder of a run that has ended",
+        )
+    try:
+        content, found = read_json(path), "something else than an object"
+    except ValueError as error:
+        content, found = None, str(error)
+    if isinstance(content, dict):
+        return content
+    raise UserError(
+        f"unreadable {FILE}",
+        where=path,
+        found=found,
+        todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+    )
+
+
+def summarised_step(folder: Path) -> int | None:
+    """The step that a run's summary.json and the files beside it describe; None without one."""
+    try:
+        step = read_summary(folder).get("step")
+    except UserError:
+        return None
+    return step if isinstance(step, int) else None
+
+
+def _as_data(summary: Summary) -> dict[str, Any]:
+    return {
+        "status": summary.status,
+        "error": summary.error,
+        "scene": summary.scene,
+        **asdict(summary.totals),
+        **_metrics(summary.result),
+        "best": _best(summary.rows),
+        "ply": None if summary.ply is None else dict(summary.ply),
+        "seconds": asdict(summary.seconds),
+        "seed": summary.config.get("seed"),
+        "notes": list(summary.notes),
+        "definitions": dict(DEFINITIONS),
+        "environment": dict(summary.environment),
+        "config": dict(summary.config),
+    }
+
+
+def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
+    if result is None:
+        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation took place"}}
+    return {
+        "overall": asdict(result.overall),
+        "regimes": {name: asdict(means) for name, means in result.regimes.items()},
+        "null": dict(result.reasons),
+    }
+
+
+def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
+    """Step, training seconds and PSNR of the evaluation with the highest PSNR."""
+    scored = [(psnr, row) for row in rows if (psnr := row.get("psnr")) is not None]
+    valid = [(psnr, row) for psnr, row in scored if not math.isnan(psnr)]
+    if not valid:
+        return None
+    _, best = max(valid, key=lambda pair: pair[0])
+    return {name: best[name] for name in ("step", "train_seconds", "psnr", "ssim")}
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

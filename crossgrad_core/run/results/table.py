@@ -1,0 +1,68 @@
+"""The final table that a run shows in the terminal."""
+
+from collections.abc import Sequence
+
+from crossgrad_core.evaluation.evaluation import EvaluationResult, Means
+from crossgrad_core.run.results.totals import Totals
+
+_HEADER = ("", "views", "PSNR", "SSIM", "SSIM (skimage)", "LPIPS")
+_NULL = "-"
+
+
+def final_table(result: EvaluationResult | None, totals: Totals) -> str:
+    """Metrics overall and per regime, and what they cost, as plain text without a final newline."""
+    lines = [] if result is None else _aligned(_rows(result))
+    if result is not None:
+        lines += [f"no {metric}: {reason}" for metric, reason in _shown(result)]
+    return "\n".join([*lines, cost_line(totals)])
+
+
+def cost_line(totals: Totals) -> str:
+    """Training seconds, steps, rendered views, primitives and memory in one line."""
+    peak = totals.peak_memory_mib
+    memory = "" if peak is None else f", peak memory {peak:,.0f} MiB"
+    return (
+        f"{totals.train_seconds:,.1f} s training, {totals.step:,} steps, "
+        f"{totals.views:,} views rendered, {totals.backward_passes:,} backward passes, "
+        f"{totals.primitives:,} primitives{memory}"
+    )
+
+
+def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
+    rows = [_HEADER, _row("overall", result.overall)]
+    # A single regime would only repeat the first row.
+    if len(result.regimes) > 1:
+        rows += [_row(name, means) for name, means in result.regimes.items()]
+    # LPIPS has a column only where it was measured.
+    width = len(_HEADER) - (result.overall.lpips is None)
+    return [row[:width] for row in rows]
+
+
+def _row(name: str, means: Means) -> tuple[str, ...]:
+    return (
+        name,
+        str(means.views),
+        _number(means.psnr, ".2f"),
+        _number(means.ssim, ".4f"),
+        _number(means.ssim_skimage, ".4f"),
+        _number(means.lpips, ".4f"),
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return _NULL if value is None else format(value, form)
+
+
+def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
+    """Why PSNR and SSIM are missing; that LPIPS was not asked for is no news."""
+    return [(metric, why) for metric, why in result.reasons.items() if metric in {"psnr", "ssim"}]
+
+
+def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [row[0].ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return lines

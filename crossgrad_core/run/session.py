@@ -1,0 +1,190 @@
+"""Where the results of a run go while it trains and when it ends."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+
+from crossgrad_core.contract.contexts import EvaluationReport
+from crossgrad_core.evaluation.evaluation import EvaluationResult, evaluate
+from crossgrad_core.run.checkpoint.checkpoint import drop_later, save
+from crossgrad_core.run.checkpoint.folders import Keep
+from crossgrad_core.run.export import Exported, described, export_ply, renderer
+from crossgrad_core.run.persist import to_checkpoint
+from crossgrad_core.run.results.curve import draw_curve
+from crossgrad_core.run.results.environment import environment
+from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row, read_metrics
+from crossgrad_core.run.results.panels import PanelWriter
+from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.summary import Status, Summary, write_summary
+from crossgrad_core.run.results.totals import Seconds, Totals
+from crossgrad_core.training.memory import peak_mebibytes
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+#: The trained scene, for viewers.
+PLY = "point_cloud.ply"
+#: Held-out views of which panels are drawn.
+PANELS = 4
+
+
+class Session:
+    """Writes one run's folder; the sink of the training loop.
+
+    Args:
+        folder: The run's folder.
+        table: Its metrics.csv.
+    """
+
+    def __init__(self, folder: Path, table: MetricsCsv) -> None:
+        self.folder = folder
+        self._table = table
+        self._result: tuple[int, EvaluationResult] | None = None
+        self._exported: Exported | None = None
+        self._saved_step = -1
+        self._evaluated_step = -1
+
+    @classmethod
+    def fresh(cls, folder: Path, setup: Setup) -> "Session":
+        """The session of a new run."""
+        return cls(folder, MetricsCsv.create(folder, regimes_of(setup)))
+
+    @classmethod
+    def resumed(cls, folder: Path, setup: Setup, step: int) -> "Session":
+        """The session of a run that continues after `step`."""
+        session = cls(folder, MetricsCsv.resume(folder, regimes_of(setup), step))
+        session._saved_step = step
+        rows = read_metrics(folder)
+        if rows:
+            session._evaluated_step = int(rows[-1]["step"] or 0)
+        return session
+
+    def has_row(self, step: int) -> bool:
+        """Whether metrics.csv has a row of that step or a later one."""
+        return self._evaluated_step >= step
+
+    def result(self, step: int) -> EvaluationResult | None:
+        """What the evaluation after that step found; None where there was none."""
+        return self._result[1] if self._result is not None and self._result[0] == step else None
+
+    def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
+        """Evaluates the held-out views and records a row; draws `panels` of them."""
+        start = perf_counter()
+        writer = None
+        if panels > 0:
+            views = setup.scene.test_views
+            writer = PanelWriter.of(self.folder, state.step, views, panels)
+        result = evaluate(
+            setup.scene.test_views,
+            renderer(setup, state),
+            on_view=None if writer is None else writer.write,
+        )
+        state.clock.evaluate += perf_counter() - start
+        self._result = (state.step, result)
+        if self._evaluated_step == state.step:
+            return
+        row = metrics_row(totals(setup, state), result)
+        self._table.append(row)
+        self._evaluated_step = state.step
+        setup.hook.crossgrad_evaluation(report=EvaluationReport(state.step, row))
+
+    def save(self, setup: Setup, state: TrainState) -> None:
+        """Writes a checkpoint."""
+        if self._saved_step == state.step:
+            return
+        with reporting(state):
+            save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
+        self._saved_step = state.step
+
+    def rewind(self, setup: Setup, step: int) -> None:
+        """Drops rows and checkpoints of steps that training went back behind."""
+        self._table = MetricsCsv.resume(self.folder, regimes_of(setup), step)
+        drop_later(self.folder, step)
+        self._saved_step = self._evaluated_step = -1
+
+    def align(self, setup: Setup, state: TrainState) -> None:
+        """Drops what was recorded after the state's step, if anything was."""
+        if max(self._saved_step, self._evaluated_step) > state.step:
+            self.rewind(setup, state.step)
+
+    def write_views(self, state: TrainState) -> None:
+        """Writes per_view.csv, where the state was evaluated."""
+        result = self.result(state.step)
+        if result is not None:
+            write_per_view(self.folder, result)
+
+    def draw(self, setup: Setup, state: TrainState) -> None:
+        """Draws curve.png, where there is anything to draw."""
+        rows = read_metrics(self.folder)
+        if rows:
+            with reporting(state):
+                draw_curve(self.folder, rows, title(setup), view_counts(setup))
+
+    def export(self, setup: Setup, state: TrainState) -> None:
+        """Writes the trained scene and says what the file is."""
+        path = self.folder / PLY
+        with reporting(state):
+            self._exported = export_ply(setup, state, path)
+        for line in described(self._exported, path):
+            setup.hook.crossgrad_message(text=line)
+
+    def summarise(
+        self, setup: Setup, state: TrainState, status: Status, error: str | None = None
+    ) -> None:
+        """Writes what describes the run as a whole."""
+        summary = Summary(
+            status=status,
+            scene=setup.scene.name,
+            totals=totals(setup, state),
+            result=self.result(state.step),
+            ply=None if self._exported is None else self._exported.as_data(),
+            rows=read_metrics(self.folder),
+            seconds=Seconds(**asdict(state.clock)),
+            config=setup.config.model_dump(mode="json"),
+            environment=environment(str(setup.device)),
+            notes=setup.notes,
+            error=error,
+        )
+        write_summary(self.folder, summary)
+
+
+@contextmanager
+def reporting(state: TrainState) -> Iterator[None]:
+    """Counts the seconds of the block as reporting."""
+    start = perf_counter()
+    yield
+    state.clock.report += perf_counter() - start
+
+
+def totals(setup: Setup, state: TrainState) -> Totals:
+    """What the run has cost so far."""
+    losses = state.last.losses if state.last is not None else ()
+    return Totals(
+        step=state.step,
+        views=state.counters.views,
+        backward_passes=state.counters.backward_passes,
+        train_seconds=state.clock.train,
+        primitives=state.primitives(setup),
+        peak_memory_mib=peak_mebibytes(setup.device),
+        loss=sum(losses) / len(losses) if losses else None,
+    )
+
+
+def regimes_of(setup: Setup) -> list[str]:
+    """The regimes of the held-out views."""
+    return sorted({view.regime for view in setup.scene.test_views})
+
+
+def view_counts(setup: Setup) -> dict[str, int]:
+    """Number of held-out views overall and per regime."""
+    views = setup.scene.test_views
+    counts = {regime: sum(v.regime == regime for v in views) for regime in regimes_of(setup)}
+    return {"overall": len(views), **counts}
+
+
+def title(setup: Setup) -> str:
+    """What the curve is called."""
+    names = setup.selection.names
+    parts = f"{names['backbone']}, {names['sampler']}, {names['operator']}"
+    return f"{setup.scene.name}: {parts}, K = {setup.selection.views_per_step}"

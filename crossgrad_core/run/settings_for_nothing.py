@@ -1,0 +1,125 @@
+"""Settings of a new run that would change nothing are refused, with the reason and the way out.
+
+A run that goes on is not asked: what it has lived with so far must not keep it from going on.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import reasons_against, refuse
+from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import listed
+
+_SLOTS = ("backbone", "sampler", "grouping", "densifier", "rasterizer")
+_TIMES = ("densify_from", "densify_until", "densify_every", "max_gaussians")
+
+
+def refuse_labels_for_nothing(setup: Setup) -> None:
+    """Asks the components again, now that it is known which labels the training views have.
+
+    Raises:
+        IncompatibleSelectionError: Some component looks for labels that no view has.
+    """
+    if setup.groups is None:
+        return
+    labels = tuple(dict.fromkeys(setup.groups))
+    selection = replace(setup.selection, labels=labels)
+    answers = setup.hook.crossgrad_objections(selection=selection)
+    refuse(reasons_against(setup.config, selection, answers))
+
+
+def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
+    """Refuses what the user set and what does nothing in this run.
+
+    Args:
+        config: What the user set, before anything was decided.
+        setup: The assembled run.
+
+    Raises:
+        UserError: Some setting would change nothing.
+    """
+    found = [
+        *_of_components(config, setup),
+        *_of_density_control(config, setup),
+        *_of_groups(config, setup),
+        *_of_the_split(config),
+    ]
+    if found:
+        raise UserError(
+            "settings that would do nothing",
+            where=listed(name for name, _ in found),
+            found="; ".join(f"{name}: {why}" for name, why in found),
+            todo="leave them out, or change what keeps them from doing something",
+        )
+
+
+def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    for slot in _SLOTS:
+        yield from _of_choice(slot, slot, getattr(config, slot), setup)
+    links = config.operators
+    for link in links:
+        # A link of a chain is set by its name.
+        place = "operator" if len(links) == 1 else f"operator.{link.name}"
+        yield from _of_choice("operator", place, link, setup)
+
+
+def _of_choice(
+    slot: str, place: str, choice: ComponentChoice | None, setup: Setup
+) -> Iterator[tuple[str, str]]:
+    if choice is None or not choice.options:
+        return
+    name = setup.selection.names[slot] if choice.name == AUTO else choice.name
+    # As the user set it: fitted to the scene, it may have lost what the scene does not need.
+    component = build(f"{slot}s", name, choice.options)
+    for option, why in component.set_for_nothing(setup.selection).items():
+        yield f"{place}.{option}", why
+
+
+def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    densifier: Densifier = setup.densifier
+    name = setup.selection.names["densifier"]
+    for setting in _TIMES:
+        if getattr(config, setting) is not None and not densifier.edits:
+            yield setting, f"densifier {name} never edits"
+    if config.reset_every is not None and not densifier.resets:
+        yield "reset_every", f"densifier {name} resets no opacities"
+
+
+def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """A grouping that somebody named and nobody looks at."""
+    selection = setup.selection
+    sampler, operator = selection.sampler, selection.operator
+    watched = any(choice.name != "progress" for choice in config.observers)
+    named = config.grouping is not None and config.grouping.name != AUTO
+    if not named or sampler.reads_groups or watched:
+        return
+    if sampler.own_labels:
+        yield "grouping", f"sampler {selection.names['sampler']} makes its own groups"
+    elif not operator.reads_labels():
+        yield (
+            "grouping",
+            f"sampler {selection.names['sampler']} draws from all views alike, and operator "
+            f"{selection.names['operator']} reads no labels; --sampler near-far draws from groups",
+        )
+
+
+def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
+    reading = config.reading
+    if reading.test_every == SceneOptions.model_fields["test_every"].default:
+        return
+    if reading.split == "none":
+        yield "reading.test_every", "--split none holds no photo out"
+    lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
+    if reading.split == "auto" and lists:
+        yield "reading.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+
+
+def _is_there(scene: Path | None, name: str) -> bool:
+    return scene is not None and (scene / name).is_file()

@@ -1,0 +1,136 @@
+"""Files that appear complete or not at all, and disk errors in words that a user understands."""
+
+import errno
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.interrupts import UNFINISHED
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+_FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+
+
+def size_text(count: int) -> str:
+    """A number of bytes for people, in MiB or GiB."""
+    if count < 2**30:
+        return f"{count / 2**20:,.1f} MiB"
+    return f"{count / 2**30:,.1f} GiB"
+
+
+def free_bytes(path: Path) -> int:
+    """Free bytes of the file system that `path`, which need not exist yet, lies or will lie on."""
+    place = path.absolute()
+    while not place.exists():
+        place = place.parent
+    return shutil.disk_usage(place).free
+
+
+def disk_full(path: Path, needed: int | None) -> UserError:
+    """The error for a full disk; `needed` is the size in bytes of what should be written."""
+    return UserError(
+        "not enough disk space",
+        where=path,
+        expected=f"{size_text(needed)} free" if needed is not None else "",
+        found=f"{size_text(free_bytes(path))} free",
+        todo="free some space, or choose another disk with --out",
+    )
+
+
+def read_only(path: Path) -> UserError:
+    """The error for a place that must not be written to."""
+    return UserError(
+        "cannot write here",
+        where=path,
+        expected="a folder that you may write to",
+        todo="check its permissions, or choose another place with --out",
+    )
+
+
+def is_full(error: OSError) -> bool:
+    """Whether there is no room for what should have been written."""
+    return error.errno in _FULL
+
+
+@contextmanager
+def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
+    """Turns a full disk or missing permission inside the block into a `UserError`.
+
+    Args:
+        path: What is being written.
+        needed: Its size in bytes, where known.
+    """
+    try:
+        yield
+    except OSError as error:
+        if is_full(error):
+            raise disk_full(path, needed) from error
+        if error.errno in _FORBIDDEN:
+            raise read_only(path) from error
+        raise
+
+
+@contextmanager
+def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
+    """A binary file that takes the place of `path` when the block ends without an error.
+
+    The bytes reach the disk before the name does, so that a crash leaves either the old file or
+    the new one.
+
+    Raises:
+        UserError: The disk is full or the folder may not be written to; an old file is untouched.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with disk_errors(path, needed):
+        UNFINISHED.add(str(temporary))
+        try:
+            with temporary.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+            sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+            UNFINISHED.discard(str(temporary))
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether `atomic_file` left this behind in a process that was killed, or is writing it now."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Deletes what killed processes left half-written in a folder that nobody else writes into."""
+    for path in folder.glob(".*.tmp"):
+        if is_leftover(path):
+            path.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Writes a whole file through `atomic_file`."""
+    with atomic_file(path, len(content)) as file:
+        file.write(content)
+
+
+def sync_file(path: Path) -> None:
+    """Makes sure that a written file's content is on the disk."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes sure that new names in the folder are on the disk, where the system can do that."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,56 @@
+"""Whether results can be written, asked before the work that leads to them; nothing stays."""
+
+import tempfile
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import disk_errors, disk_full, free_bytes, read_only
+
+
+def check_folder(folder: Path, needed: int = 0) -> None:
+    """Refuses a folder that cannot be made or written to, or whose disk is too full.
+
+    Args:
+        folder: The folder, which need not exist yet.
+        needed: Bytes that will be written.
+
+    Raises:
+        UserError: What is in the way, and what to do.
+    """
+    place = folder.absolute()
+    while not (place.exists() or place.is_symlink()):
+        place = place.parent
+    if not place.is_dir():
+        raise UserError(
+            "cannot make this folder",
+            where=folder,
+            found=f"{place} is no folder",
+            todo="choose another place, or remove that file",
+        )
+    try:
+        # Permission bits do not tell the truth on network file systems; writing does.
+        with disk_errors(folder), tempfile.TemporaryFile(dir=place) as probe:
+            probe.write(b"crossgrad")
+    except OSError as error:  # Of a kind of its own, as in /proc.
+        raise read_only(folder) from error
+    if needed and free_bytes(place) < needed:
+        raise disk_full(folder, needed)
+
+
+def check_file(path: Path) -> None:
+    """Refuses a file that cannot be written because of its folder or because it is one.
+
+    Raises:
+        UserError: What is in the way, and what to do.
+    """
+    if path.is_dir():
+        raise UserError(
+            "a file is to be written, and this is a folder", where=path, todo="name a file in it"
+        )
+    if not path.parent.is_dir():
+        raise UserError(
+            "the folder of this file is not there",
+            where=path,
+            todo=f"make {path.parent}, or choose another place",
+        )
+    check_folder(path.parent)

@@ -1,0 +1,1 @@
+"""Adam for named tensors, with per-tensor step counts and learning rates."""

@@ -1,0 +1,156 @@
+"""Adam on named tensors, in place, without building an optimizer object."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.adam_state import AdamState
+
+#: Added to the root of the second moment (3DGS).
+EPS = 1e-15
+# Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
+# less than 1e-14 of its learning rate, but as they decay they would become subnormal.
+TINY = 1e-30
+# Second moments below float32's smallest normal number count as 0: their root, 1e-19, is nothing
+# against eps = 1e-15, and subnormal numbers are slow on most processors.
+SMALLEST_NORMAL = 2.0**-126
+# Gradients are clamped to this size, because the square of a larger one overflows float32 and an
+# infinite second moment would stop its parameter for good.
+LARGEST = 1e18
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """The numbers of one tensor's step; bias correction is folded in.
+
+    Attributes:
+        beta1: Decay of the first moment.
+        beta2: Decay of the second moment.
+        step_size: Learning rate / (1 - beta1^t).
+        root_scale: 1 / sqrt(1 - beta2^t).
+        eps: Added to the root of the corrected second moment.
+        square_floor: Gradients below it would give a subnormal contribution to the second moment.
+        scale: What the gradient is multiplied by.
+    """
+
+    beta1: float
+    beta2: float
+    step_size: float
+    root_scale: float
+    eps: float
+    square_floor: float
+    scale: float = 1.0
+
+
+@torch.no_grad()
+def adam_step(
+    params: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor | None],
+    state: AdamState,
+    lrs: Mapping[str, float],
+    betas: tuple[float, float] = (0.9, 0.999),
+    scales: Mapping[str, float] | None = None,
+) -> None:
+    """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
+
+    A tensor without gradient (None or absent) keeps value, moments and step count. Gradients too
+    small or too large for float32 arithmetic are treated as the constants of this module say;
+    within [1e-17, 1e18] the result is that of `torch.optim.Adam` to rounding. A NaN in a gradient
+    spreads to its element, as it does there.
+
+    Args:
+        params: Floating-point tensors of any shape, by name.
+        grads: Gradients of the same shapes and types.
+        state: Moments and step counts; missing ones start at zero.
+        lrs: Learning rate of every tensor that has a gradient.
+        betas: Decay of the first and the second moment, each in [0, 1).
+        scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
+
+    Raises:
+        ValueError: If an argument is out of range or a gradient does not fit its tensor.
+
+    Source: Kingma and Ba 2015, algorithm 1.
+    """
+    _check(params, grads, betas)
+    for name, param in params.items():
+        grad = grads.get(name)
+        if grad is None:
+            continue
+        if name not in state.steps:
+            state.exp_avg[name] = torch.zeros_like(param, memory_format=torch.contiguous_format)
+            state.exp_avg_sq[name] = torch.zeros_like(state.exp_avg[name])
+            state.steps[name] = 0
+        state.steps[name] += 1
+        coefficients = _coefficients(state.steps[name], lrs[name], betas)
+        if scales is not None:
+            coefficients = replace(coefficients, scale=scales[name])
+        update_tensor(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
+
+
+def update_tensor(
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
+) -> None:
+    """Applies one step to a tensor and its moments: fused on the CPU in float32, else by torch."""
+    tensors = (param, exp_avg, exp_avg_sq)
+    on_cpu = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, grad))
+    if on_cpu and all(t.is_contiguous() for t in tensors):
+        from crossgrad_core.training.adam.numba_kernels.fused import update_arrays
+
+        flat = [t.detach().view(-1).numpy() for t in tensors]
+        update_arrays(flat[0], grad.detach().contiguous().view(-1).numpy(), flat[1], flat[2], step)
+        # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
+        for tensor in tensors:  # Older versions of torch take one at a time.
+            torch.autograd.graph.increment_version(tensor)
+    else:
+        update_reference(param, grad, exp_avg, exp_avg_sq, step)
+
+
+def update_reference(
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
+) -> None:
+    """The same step in plain torch; any device and floating type."""
+    grad = grad if step.scale == 1.0 else grad * step.scale
+    grad = _without(grad.clamp(-LARGEST, LARGEST), TINY)
+    exp_avg.mul_(step.beta1).add_(grad, alpha=1 - step.beta1)
+    exp_avg.copy_(_without(exp_avg, TINY))
+    grad = _without(grad, step.square_floor)
+    exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
+    exp_avg_sq.copy_(_without(exp_avg_sq, SMALLEST_NORMAL))
+    root = exp_avg_sq.sqrt().mul_(step.root_scale).add_(step.eps)
+    param.addcdiv_(exp_avg, root, value=-step.step_size)
+
+
+def _without(values: Tensor, floor: float) -> Tensor:
+    """The values, 0 where the absolute value lies below `floor`; NaN stays."""
+    return torch.where(values.abs() < floor, torch.zeros_like(values), values)
+
+
+def _coefficients(count: int, lr: float, betas: tuple[float, float]) -> Coefficients:
+    beta1, beta2 = betas
+    return Coefficients(
+        beta1=beta1,
+        beta2=beta2,
+        step_size=lr / (1 - beta1**count),
+        root_scale=1 / math.sqrt(1 - beta2**count),
+        eps=EPS,
+        square_floor=math.sqrt(SMALLEST_NORMAL / (1 - beta2)),
+    )
+
+
+def _check(
+    params: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor | None],
+    betas: tuple[float, float],
+) -> None:
+    if not all(0 <= beta < 1 for beta in betas):
+        raise ValueError(f"`betas` must lie in [0, 1); found {betas}")
+    for name, param in params.items():
+        grad = grads.get(name)
+        if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):
+            found = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
+            raise ValueError(
+                f"gradient of `{name}` must have the shape and type of the tensor; {found}"
+            )

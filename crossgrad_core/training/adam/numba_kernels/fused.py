@@ -1,0 +1,73 @@
+"""Adam's update of one float32 tensor in a single pass over memory (Numba, CPU)."""
+
+from typing import TypeAlias
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import kernel, parallel_kernel
+from crossgrad_core.training.adam.adam import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
+
+_CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
+
+_ZERO = np.float32(0)
+_TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
+
+_Floats: TypeAlias = NDArray[np.float32]
+_Number: TypeAlias = np.float32
+_Numbers: TypeAlias = tuple[
+    _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number
+]
+
+
+@kernel
+def _update(
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+) -> None:
+    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
+    for i in range(len(param)):
+        g = scale * grad[i]
+        g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes
+        g = _ZERO if abs(g) < _TINY else g
+        m = beta1 * exp_avg[i] + new1 * g
+        m = _ZERO if abs(m) < _TINY else m
+        g = _ZERO if abs(g) < square_floor else g
+        v = beta2 * exp_avg_sq[i] + new2 * g * g
+        v = _ZERO if v < _SMALLEST_NORMAL else v
+        exp_avg[i] = m
+        exp_avg_sq[i] = v
+        param[i] -= step_size * (m / (np.sqrt(v) * root_scale + eps))
+
+
+@parallel_kernel
+def _update_chunks(
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+) -> None:
+    for chunk in prange((len(param) + _CHUNK - 1) // _CHUNK):
+        a, b = chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK)
+        _update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
+
+
+def update_arrays(
+    param: NDArray[np.float32],
+    grad: NDArray[np.float32],
+    exp_avg: NDArray[np.float32],
+    exp_avg_sq: NDArray[np.float32],
+    step: Coefficients,
+) -> None:
+    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
+    numbers: _Numbers = (
+        np.float32(step.beta1),
+        np.float32(1 - step.beta1),
+        np.float32(step.beta2),
+        np.float32(1 - step.beta2),
+        np.float32(step.step_size),
+        np.float32(step.root_scale),
+        np.float32(step.eps),
+        np.float32(step.square_floor),
+        np.float32(step.scale),
+    )
+    # A single chunk is not worth waking other threads for.
+    update = _update if len(param) <= _CHUNK else _update_chunks
+    update(param, grad, exp_avg, exp_avg_sq, numbers)

@@ -1,0 +1,83 @@
+"""The training loss: the fused kernel where it applies, plain torch elsewhere."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from typing_extensions import override
+
+from crossgrad_core.training.loss.reference import l1_ssim_loss
+
+
+def photometric_loss(
+    image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """(1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
+
+    On the CPU in float32 value and gradient come from one fused pass (the gradient is first order
+    only); every other device and type takes the differentiable torch path.
+
+    Args:
+        image: [H, W, 3] floating point, the render.
+        target: [H, W, 3] floating point or uint8, the photo, on the same device.
+        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        ssim_weight: w in [0, 1].
+
+    Returns:
+        Scalar of the image's type.
+
+    Raises:
+        ValueError: If the shapes do not fit.
+    """
+    _check(image, target, mask)
+    on_cpu = all(t is None or t.device.type == "cpu" for t in (image, target, mask))
+    if on_cpu and image.dtype == torch.float32:
+        loss: Tensor = _FusedLoss.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
+        return loss
+    return l1_ssim_loss(image, target, mask, ssim_weight)
+
+
+class _FusedLoss(torch.autograd.Function):
+    """Stores the gradient by the image in the forward pass and scales it in the backward pass."""
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
+    ) -> Tensor:
+        from crossgrad_core.training.loss.numba_kernels.fused import loss_terms
+
+        image = image.detach().contiguous()
+        target = target.detach().contiguous()
+        if target.dtype != torch.uint8:
+            target = target.to(torch.float32)
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        absolute, dissimilarity = loss_terms(
+            image.numpy(),
+            target.numpy(),
+            None if mask is None else mask.contiguous().numpy(),
+            None if gradient is None else gradient.numpy(),
+            ssim_weight,
+        )
+        if gradient is not None:
+            ctx.save_for_backward(gradient)
+        return image.new_tensor((1 - ssim_weight) * absolute + ssim_weight * dissimilarity)
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None, None
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.ndim != 3 or image.shape[-1] != 3:  # noqa: PLR2004 - [H, W, 3]
+        raise ValueError(f"`image` must be [H, W, 3]; found {list(image.shape)}")
+    if target.shape != image.shape:
+        shapes = f"{list(target.shape)} and {list(image.shape)}"
+        raise ValueError(f"`target` must have the shape of `image`; found {shapes}")
+    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
+        found = f"{list(mask.shape)} {mask.dtype}"
+        raise ValueError(f"`mask` must be [H, W] bool; found {found} for {list(image.shape)}")

@@ -1,0 +1,160 @@
+"""The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
+
+With s = x + y and d = x - y (x the image, y the target) SSIM needs four windowed means instead of
+five, M_s, M_d, E[s^2], E[d^2], and factors without cancellation between the two images:
+
+    SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
+
+with V = E[.^2] - M^2. Its gradient is G * a + s (G * b) + d (G * c), where G * is the same window
+and a, b, c hold the derivatives by M_s + M_d, V_s and V_d. Variances are differences of nearly
+equal numbers where the image is smooth, so s and d are taken relative to a centre: their means over
+the tile (per channel).
+
+The image is cut into tiles whose size depends on the image's size only. A tile runs down its rows
+with ring buffers of sixteen rows (s, d, mask; a, b, c), so that the working set stays in the
+second-level cache and memory does not grow with the image. Every tile recomputes its halo, so
+tiles are independent and the result has the same bits for any number of threads.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+from numba import get_num_threads, prange
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import kernel, parallel_kernel
+from crossgrad_core.training.loss.numba_kernels.layout import (
+    CHANNELS,
+    DIFFERENCE,
+    HALO,
+    LINE,
+    SCRATCH,
+    SLOTS,
+    STRIDE,
+    TILE_COLUMNS,
+    TILE_ROWS,
+)
+from crossgrad_core.training.loss.numba_kernels.rows import copy, load_row, set_centres
+from crossgrad_core.training.loss.numba_kernels.terms import (
+    clear_row,
+    gradient_row,
+    ssim_row,
+    sum_absolute,
+    sum_of,
+)
+from crossgrad_core.training.loss.reference import RADIUS
+
+_Floats: TypeAlias = NDArray[np.float32]  # 1-D
+_Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
+_Flags: TypeAlias = NDArray[np.bool_]  # 1-D
+_Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
+
+
+@kernel
+def _tile(
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
+    box: _Box, height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
+) -> tuple[float, float]:  # fmt: skip
+    """Sums of |x - y| and 1 - SSIM over a tile; its gradient is written to `gradient`."""
+    top, bottom, left, right = box
+    columns = right - left
+    halo = RADIUS if with_gradient else 0
+    absolute, dissimilarity = 0.0, 0.0
+    set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
+    loaded = top - halo - RADIUS
+    for row in range(top - halo, bottom + halo):
+        while loaded <= row + RADIUS:
+            load_row(
+                scratch, image, target, target_8bit, is_8bit, mask, is_masked, loaded, box,
+                height, width,
+            )  # fmt: skip
+            loaded += 1
+        if 0 <= row < height:
+            ssim_row(scratch, row, columns)
+        else:
+            clear_row(scratch, row, columns)
+        if top <= row < bottom:
+            dissimilarity += sum_of(scratch, LINE + HALO, CHANNELS * columns)
+            slot = DIFFERENCE + (row & (SLOTS - 1)) * STRIDE + 2 * HALO
+            absolute += sum_absolute(scratch, slot, CHANNELS * columns)
+        if with_gradient and row - RADIUS >= top:
+            gradient_row(scratch, row - RADIUS, columns, l1_weight, ssim_weight)
+            destination = ((row - RADIUS) * width + left) * CHANNELS
+            copy(gradient, destination, scratch, LINE, CHANNELS * columns)
+    return absolute, dissimilarity
+
+
+@parallel_kernel
+def _all_tiles(
+    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
+    height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
+    sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Runs every tile; tile t uses row t % step of `scratch` [step, SCRATCH]."""
+    step = scratch.shape[0]
+    down, across = sums.shape[0], sums.shape[1]
+    rows, columns = (height + down - 1) // down, (width + across - 1) // across
+    for first in prange(step):
+        for t in range(np.int64(first), down * across, step):
+            top, left = t // across * rows, t % across * columns
+            box = (top, min(height, top + rows), left, min(width, left + columns))
+            if box[0] < box[1] and box[2] < box[3]:
+                absolute, dissimilarity = _tile(
+                    scratch[first], image, target, target_8bit, is_8bit, mask, is_masked, gradient,
+                    with_gradient, box, height, width, l1_weight, ssim_weight,
+                )  # fmt: skip
+                sums[t // across, t % across, 0] = absolute
+                sums[t // across, t % across, 1] = dissimilarity
+
+
+def loss_terms(
+    image: NDArray[np.float32],
+    target: NDArray[np.float32] | NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None = None,
+    gradient: NDArray[np.float32] | None = None,
+    ssim_weight: float = 0.2,
+) -> tuple[float, float]:
+    """Means of |x - y| and of 1 - SSIM over the kept pixels, and the gradient by the image.
+
+    Args:
+        image: [H, W, 3], C-contiguous.
+        target: [H, W, 3], C-contiguous; 8-bit values are divided by 255.
+        mask: [H, W], True where the pixel counts; None keeps all.
+        gradient: [H, W, 3], C-contiguous, receives the gradient of (1 - w) * L1 + w * (1 - SSIM);
+            None leaves out that half of the work.
+        ssim_weight: w.
+
+    Returns:
+        L1 and 1 - SSIM; both 0 if no pixel is kept.
+    """
+    height, width, _ = image.shape
+    kept = height * width if mask is None else int(np.count_nonzero(mask))
+    if kept == 0:
+        if gradient is not None:
+            gradient.fill(0)
+        return 0.0, 0.0
+    count = kept * CHANNELS
+    down, across = -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
+    sums = np.zeros((down, across, 2))
+    threads = min(get_num_threads(), down * across)
+    is_8bit = target.dtype == np.uint8
+    _all_tiles(
+        np.zeros((threads, SCRATCH), np.float32),
+        image.reshape(-1),
+        np.empty(0, np.float32) if is_8bit else target.reshape(-1).view(np.float32),
+        target.reshape(-1).view(np.uint8) if is_8bit else np.empty(0, np.uint8),
+        is_8bit,
+        np.empty(0, np.bool_) if mask is None else mask.reshape(-1),
+        mask is not None,
+        np.empty(0, np.float32) if gradient is None else gradient.reshape(-1),
+        gradient is not None,
+        height,
+        width,
+        np.float32((1 - ssim_weight) / count),
+        np.float32(ssim_weight / count),
+        sums,
+    )
+    absolute, dissimilarity = sums.sum(axis=(0, 1)) / count
+    return float(absolute), float(dissimilarity)

@@ -1,0 +1,134 @@
+"""SSIM, its derivatives and the gradient of the loss, one row of a tile at a time."""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import kernel, sum_kernel
+from crossgrad_core.numerics.simd import LANES, fma, fnma, load, splat, store, where
+from crossgrad_core.training.loss.numba_kernels.layout import (
+    BACK,
+    BY_DIFFERENCE_VARIANCE,
+    BY_MEAN,
+    BY_SUM_VARIANCE,
+    CENTRE_DIFFERENCE,
+    CENTRE_SUM,
+    CHANNELS,
+    DIFFERENCE,
+    HALO,
+    KEEP,
+    LINE,
+    PARTIAL,
+    SLOTS,
+    STRIDE,
+    SUM,
+)
+from crossgrad_core.training.loss.numba_kernels.rows import fill
+from crossgrad_core.training.loss.numba_kernels.windows import across, down, down_with_squares
+from crossgrad_core.training.loss.reference import C1, C2, RADIUS
+
+_Floats: TypeAlias = NDArray[np.float32]  # 1-D
+
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
+
+
+@kernel
+def ssim_row(scratch: _Floats, row: int, columns: int) -> None:
+    """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts."""
+    for j in range(0, CHANNELS * (columns + 4 * RADIUS), LANES):
+        values, squares = down_with_squares(scratch, SUM + j, row)
+        store(scratch, PARTIAL + j, values)
+        store(scratch, PARTIAL + STRIDE + j, squares)
+        values, squares = down_with_squares(scratch, DIFFERENCE + j, row)
+        store(scratch, PARTIAL + 2 * STRIDE + j, values)
+        store(scratch, PARTIAL + 3 * STRIDE + j, squares)
+    slot = (row & (SLOTS - 1)) * STRIDE
+    zero, one, two = splat(_ZERO), splat(_ONE), splat(_TWO)
+    twice_c1, twice_c2 = splat(_TWICE_C1), splat(_TWICE_C2)
+    for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
+        keep = load(scratch, KEEP + slot + HALO + j)
+        local_s = across(scratch, PARTIAL + j)
+        local_d = across(scratch, PARTIAL + 2 * STRIDE + j)
+        variance_s = fnma(local_s, local_s, across(scratch, PARTIAL + STRIDE + j))
+        variance_d = fnma(local_d, local_d, across(scratch, PARTIAL + 3 * STRIDE + j))
+        # Rounding may take a variance of nothing slightly below zero.
+        variance_s = where(zero < variance_s, variance_s, zero) + twice_c2
+        variance_d = where(zero < variance_d, variance_d, zero)
+        mean_s = local_s + load(scratch, CENTRE_SUM + j)
+        mean_d = local_d + load(scratch, CENTRE_DIFFERENCE + j)
+        bright = fma(mean_s, mean_s, twice_c1)
+        dark = mean_d * mean_d
+        over_mean = one / (bright + dark)
+        over_variance = one / (variance_s + variance_d)
+        # 1 minus the luminance term and 1 minus the contrast-structure term: exactly 0 where x = y.
+        luminance_loss = two * dark * over_mean
+        contrast_loss = two * variance_d * over_variance
+        dissimilarity = fnma(luminance_loss, contrast_loss, luminance_loss + contrast_loss)
+        store(scratch, LINE + j, where(zero < keep, dissimilarity, zero))
+        by_variance = two * (one - luminance_loss) * over_variance * over_variance
+        by_sum = by_variance * variance_d
+        by_difference = zero - by_variance * variance_s
+        by_mean = two * two * (one - contrast_loss) * over_mean * over_mean
+        by_mean = by_mean * fnma(mean_d, bright, mean_s * dark)
+        by_mean = fnma(two, fma(local_s, by_sum, local_d * by_difference), by_mean)
+        store(scratch, BY_MEAN + slot + j, where(zero < keep, by_mean, zero))
+        store(scratch, BY_SUM_VARIANCE + slot + j, where(zero < keep, two * by_sum, zero))
+        store(
+            scratch,
+            BY_DIFFERENCE_VARIANCE + slot + j,
+            where(zero < keep, two * by_difference, zero),
+        )
+
+
+@kernel
+def clear_row(scratch: _Floats, row: int, columns: int) -> None:
+    """Sets a, b, c of a row outside the image to 0."""
+    slot = (row & (SLOTS - 1)) * STRIDE
+    for ring in (BY_MEAN, BY_SUM_VARIANCE, BY_DIFFERENCE_VARIANCE):
+        fill(scratch, ring + slot, CHANNELS * (columns + 2 * RADIUS), _ZERO)
+
+
+@kernel
+def gradient_row(
+    scratch: _Floats, row: int, columns: int, l1_weight: np.float32, ssim_weight: np.float32
+) -> None:
+    """Writes the loss's gradient at a row of the tile to the line."""
+    for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
+        store(scratch, BACK + j, down(scratch, BY_MEAN + j, row))
+        store(scratch, BACK + STRIDE + j, down(scratch, BY_SUM_VARIANCE + j, row))
+        store(scratch, BACK + 2 * STRIDE + j, down(scratch, BY_DIFFERENCE_VARIANCE + j, row))
+    slot = (row & (SLOTS - 1)) * STRIDE + 2 * HALO
+    zero, plus, weight = splat(_ZERO), splat(l1_weight), splat(ssim_weight)
+    minus = zero - plus
+    for j in range(0, CHANNELS * columns, LANES):
+        s = load(scratch, SUM + slot + j)
+        d = load(scratch, DIFFERENCE + slot + j)
+        difference = d + load(scratch, CENTRE_DIFFERENCE + j)
+        ssim = across(scratch, BACK + j)
+        ssim = fma(s, across(scratch, BACK + STRIDE + j), ssim)
+        ssim = fma(d, across(scratch, BACK + 2 * STRIDE + j), ssim)
+        l1 = where(zero < difference, plus, where(zero < zero - difference, minus, zero))
+        keep = load(scratch, KEEP + slot + j)
+        store(scratch, LINE + j, where(zero < keep, fnma(ssim, weight, l1), zero))
+
+
+@sum_kernel
+def sum_of(array: _Floats, start: int, count: int) -> float:
+    """Sum of `count` elements in float64."""
+    view = array[start : start + count]
+    total = 0.0
+    for j in range(count):
+        total += np.float64(view[j])
+    return total
+
+
+@sum_kernel
+def sum_absolute(scratch: _Floats, start: int, count: int) -> float:
+    """Sum of |d| from element `start` of the ring on; the pixel at `start` begins a period."""
+    view, centre = scratch[start : start + count], scratch[CENTRE_DIFFERENCE:]
+    total = 0.0
+    for j in range(count):
+        total += np.float64(abs(view[j] + centre[j]))
+    return total

@@ -1,0 +1,217 @@
+"""`crossgrad stress`: operators against exact arithmetic on stiff and extreme gradients."""
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+
+import typer
+
+from crossgrad_core.cli.startup import announce
+from crossgrad_core.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+    from crossgrad_operators.stress.runner import Cell
+    from crossgrad_operators.stress.search.tally import Tally
+
+#: Elements of the largest gradients.
+LARGE = 10_000_000
+#: Option -> the kinds of run that it does something for; "" are the fixed cases.
+_USED: Final[Mapping[str, tuple[str, ...]]] = {
+    "--case": ("",),
+    "--elements": ("",),
+    "--type": ("--search", "--matrices", "--rows"),
+    "--seed": ("--search", "--matrices"),
+}
+#: Seconds between two lines about the progress of a search.
+PAUSE = 10.0
+
+
+#: Types of gradients, as torch has them.
+Types: TypeAlias = "tuple[torch.dtype, ...]"
+
+
+class Precision(StrEnum):
+    """Types of gradients that a search runs."""
+
+    FLOAT32 = "float32"
+    FLOAT64 = "float64"
+    BOTH = "both"
+
+    @property
+    def dtypes(self) -> Types:
+        """As torch has them."""
+        import torch
+
+        both = {"float32": torch.float32, "float64": torch.float64}
+        return tuple(both.values()) if self == Precision.BOTH else (both[self.value],)
+
+
+def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
+    operators: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="OPERATOR...", help="Names of operators. Default: all installed."),
+    ] = None,
+    case: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Only cases whose name contains this text.")
+    ] = None,
+    elements: Annotated[
+        int | None,
+        typer.Option(
+            min=1000, metavar="N", help=f"Elements of the largest gradients. Default: {LARGE:,}."
+        ),
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write the table to a CSV file.")
+    ] = None,
+    search: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Instead of the fixed cases: look at random for the worst gradients, that long.",
+        ),
+    ] = None,
+    matrices: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Instead of the fixed cases: whether results are finite on N short random ones.",
+        ),
+    ] = None,
+    rows: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[[...],...]",
+            help="Instead of the fixed cases: this one, a row per view, as a search prints it.",
+        ),
+    ] = None,
+    precision: Annotated[
+        Precision | None,
+        typer.Option(
+            "--type", help="Type of gradients for --search, --matrices and --rows. Default: both."
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="Seed of --search and --matrices. Default: 0."),
+    ] = None,
+) -> None:
+    """Hold operators against 50-digit arithmetic; exit status 1 if one breaks its promise."""
+    announce()
+    modes = {"--search": search, "--matrices": matrices, "--rows": rows}
+    given = {"--case": case, "--elements": elements, "--type": precision, "--seed": seed}
+    _refuse_idle(modes, {name: value for name, value in given.items() if value is not None})
+    from crossgrad_core.system.writability import check_file
+    from crossgrad_operators.stress.suite import installed
+
+    if csv is not None:
+        check_file(csv)
+    names = operators or installed()
+    dtypes = (precision or Precision.BOTH).dtypes
+    if search is not None:
+        right = _search(names, dtypes, (seed or 0, search), csv)
+    elif matrices is not None:
+        right = _matrices(names, dtypes, (seed or 0, matrices), csv)
+    elif rows is not None:
+        right = _rows(names, dtypes, rows, csv)
+    else:
+        right = _cases(names, case, elements or LARGE, csv)
+    if not right:
+        raise typer.Exit(1)
+
+
+def _refuse_idle(modes: Mapping[str, object], others: Mapping[str, object]) -> None:
+    """Refuses options that the chosen kind of run does nothing with."""
+    chosen = [name for name, value in modes.items() if value is not None]
+    if len(chosen) > 1:
+        raise UserError(
+            f"{' and '.join(chosen)} do not go together",
+            todo="leave all but one of them out; each is a run of its own",
+        )
+    mode = chosen[0] if chosen else ""
+    idle = [name for name in others if mode not in _USED[name]]
+    if idle:
+        raise UserError(
+            f"{' and '.join(idle)} does nothing with {mode or 'the fixed cases'}",
+            todo="leave it out",
+        )
+
+
+def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | None) -> bool:
+    from crossgrad_operators.stress.cases import cases
+    from crossgrad_operators.stress.suite import run_suite
+
+    chosen = [each for each in cases(large=elements) if (case or "") in each.name]
+    return _table(list(run_suite(names, chosen, progress=_progress)), csv)
+
+
+def _rows(names: Sequence[str], dtypes: Types, rows: str, csv: Path | None) -> bool:
+    from crossgrad_operators.stress.search.repeat import read_rows, run_rows
+    from crossgrad_operators.stress.search.subject import subjects
+
+    chosen = [read_rows(rows, dtype) for dtype in dtypes]
+    return _table([cell for each in chosen for cell in run_rows(subjects(names), each)], csv)
+
+
+def _table(cells: "list[Cell]", csv: Path | None) -> bool:
+    from crossgrad_operators.stress.table import as_text, failed, write_csv
+
+    typer.echo(as_text(cells))
+    if csv is not None:
+        write_csv(cells, csv)
+    return not failed(cells)
+
+
+def _search(
+    names: Sequence[str], dtypes: Types, extent: tuple[int, float], csv: Path | None
+) -> bool:
+    from crossgrad_operators.stress.search.loop import Extent, search
+    from crossgrad_operators.stress.search.report import as_text, failed, write_csv
+    from crossgrad_operators.stress.search.subject import subjects
+
+    seed, seconds = extent
+    wanted = Extent(seed=seed, seconds=seconds, dtypes=dtypes)
+    tallies = search(subjects(names), wanted, progress=_Clock(PAUSE).tick)
+    typer.echo(as_text(tallies))
+    if csv is not None:
+        write_csv(tallies, csv)
+    return not any(map(failed, tallies))
+
+
+def _matrices(
+    names: Sequence[str], dtypes: Types, extent: tuple[int, int], csv: Path | None
+) -> bool:
+    from crossgrad_operators.stress.search.finite import as_text, run_finite, write_csv
+    from crossgrad_operators.stress.search.subject import subjects
+
+    seed, matrices = extent
+    found = []
+    for subject in subjects(names):
+        _progress(subject.name)
+        found.append(run_finite(subject, matrices, seed, dtypes))
+    typer.echo(as_text(found))
+    if csv is not None:
+        write_csv(found, csv)
+    return not any(each.not_finite for each in found)
+
+
+class _Clock:
+    """Prints how far a search is, now and then."""
+
+    def __init__(self, pause: float) -> None:
+        self._pause = pause
+        self._last = monotonic()
+
+    def tick(self, turn: int, tallies: "Sequence[Tally]") -> None:
+        if monotonic() - self._last >= self._pause:
+            self._last = monotonic()
+            matrices, broken = (sum(getattr(t, n) for t in tallies) for n in ("matrices", "broken"))
+            _progress(f"round {turn}: {matrices} matrices, {broken} break a promise")
+
+
+def _progress(name: str) -> None:
+    typer.echo(f"... {name}", err=True)

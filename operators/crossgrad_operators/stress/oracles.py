@@ -1,0 +1,265 @@
+"""Every method in 50 digits, from its formulas: what the operators are held against.
+
+An oracle gets the exact Gramian of the views that have a gradient and answers with their weights.
+Thresholds that are part of a method's definition here (exact opposition up to 1 + cos = 1e-12, the
+eigenvalue floor of Aligned-MTL) are part of its oracle.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from crossgrad_operators.stress.algebra import Vector, apply, form
+from crossgrad_operators.stress.exact import Matrix, Number, require_mpmath
+
+#: 1 + cos up to which two directions are exactly opposite.
+OPPOSITE = "1e-12"
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What an oracle is asked.
+
+    Attributes:
+        gramian: [n][n] exact Gramian of the views that have a gradient.
+        places: [n] their positions among the K views.
+        views: K.
+        options: Options of the operator.
+        labels: [n] group labels.
+        ratios: [n] camera distances over the reference distance.
+        rng: A generator in the state of the operator's.
+        memory: What the oracle remembered at the last step; it may write to it.
+    """
+
+    gramian: Matrix
+    places: Sequence[int]
+    views: int
+    options: Mapping[str, Any]
+    labels: Sequence[str]
+    ratios: Sequence[float]
+    rng: np.random.Generator
+    memory: dict[Any, Any] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        """Number n of views that have a gradient."""
+        return len(self.places)
+
+
+#: [n] weights.
+Oracle = Callable[[Question], Vector]
+
+
+def number(value: object) -> Number:
+    """A 50-digit number."""
+    return require_mpmath().mp.mpf(value)
+
+
+def lengths(gramian: Matrix) -> Vector:
+    """[n] norms."""
+    mp = require_mpmath().mp
+    return [mp.sqrt(gramian[k][k]) for k in range(len(gramian))]
+
+
+def cosines(gramian: Matrix) -> Matrix:
+    """[n][n] cosines."""
+    n = lengths(gramian)
+    size = range(len(n))
+    return [[gramian[i][j] / n[i] / n[j] for j in size] for i in size]
+
+
+def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
+    """Whether sum x_k e_k is what exactly opposite directions leave."""
+    largest = max(abs(v) for v in x)
+    return bool(form(cosine, x) <= 2 * number(OPPOSITE) * largest**2)
+
+
+def zeros(count: int) -> Vector:
+    """[n] zero weights."""
+    return [number(0)] * count
+
+
+def sum_of(question: Question) -> Vector:
+    """Ones."""
+    return [number(1)] * question.count
+
+
+def mean_of(question: Question) -> Vector:
+    """1 / K with the K of all views."""
+    return [number(1) / question.views] * question.count
+
+
+def preconditioned(question: Question) -> Vector:
+    """(r / r_ref)^2, the geometry's exponent, with the ratio within [1e-2, 1e2]."""
+    power = number(question.options["geometry"])
+    limited = (min(max(number(r), number("0.01")), number(100)) for r in question.ratios)
+    return [r**power for r in limited]
+
+
+def projected_rows(
+    question: Question,
+    gate: Callable[[int, int], bool] = lambda _i, _j: True,
+    *,
+    threshold: Number = 0,
+    strength: Number = 1,
+    shuffled: bool = False,
+) -> Matrix:
+    """[n][n] rows v_i of pairwise projection."""
+    return [
+        _projected_row(question, i, partners, gate, (threshold, strength))
+        for i, partners in enumerate(partners_of(question, shuffled=shuffled))
+    ]
+
+
+def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
+    """For each view that has a gradient, the others in the order in which they are met."""
+    order = np.tile(np.arange(question.views), (question.views, 1))
+    if shuffled and question.views > 2:  # noqa: PLR2004
+        order = question.rng.permuted(order, axis=1)
+    place = {view: i for i, view in enumerate(question.places)}
+    return [
+        [place[j] for j in order[view].tolist() if j in place and j != view]
+        for view in question.places
+    ]
+
+
+def _projected_row(
+    question: Question,
+    i: int,
+    partners: Sequence[int],
+    gate: Callable[[int, int], bool],
+    rule: tuple[Number, Number],
+) -> Vector:
+    mp = require_mpmath().mp
+    threshold, strength = rule
+    gramian = question.gramian
+    v = [number(int(k == i)) for k in range(question.count)]
+    for j in partners:
+        length = mp.sqrt(form(gramian, v))
+        if not length or not gate(i, j):
+            continue
+        along = apply(gramian, v)[j]
+        cosine = along / length / mp.sqrt(gramian[j][j])
+        if not (cosine < 0 and cosine < -threshold):
+            continue
+        if strength == 1 and 1 + cosine <= number(OPPOSITE):
+            return zeros(question.count)
+        v[j] -= strength * along / gramian[j][j]
+    return v
+
+
+def column_sums(rows: Matrix) -> Vector:
+    """Weights of a matrix whose rows are added."""
+    return [sum(row[k] for row in rows) for k in range(len(rows[0]))] if rows else []
+
+
+def pcgrad(question: Question) -> Vector:
+    """PCGrad with the operator's random order."""
+    return column_sums(projected_rows(question, shuffled=True))
+
+
+def symmetric(question: Question) -> Vector:
+    """Pairwise projection in the order of the slots."""
+    return column_sums(projected_rows(question))
+
+
+def soft(question: Question) -> Vector:
+    """With threshold and strength."""
+    threshold, strength = (number(question.options[n]) for n in ("threshold", "strength"))
+    return column_sums(projected_rows(question, threshold=threshold, strength=strength))
+
+
+def anchors(question: Question) -> Vector:
+    """Projection only between a near and a far view."""
+    pair = set(question.labels) == {question.options["near"], question.options["far"]}
+    return symmetric(question) if pair else sum_of(question)
+
+
+def confgate(question: Question) -> Vector:
+    """Projection where the averaged cosine says so."""
+    cosine = cosines(question.gramian)
+    confident = {
+        (i, j): i != j
+        and question.gramian[i][j] != 0
+        and _believed(question, (question.places[i], question.places[j]), cosine[i][j])
+        for i in range(question.count)
+        for j in range(question.count)
+    }
+    return column_sums(projected_rows(question, lambda i, j: confident[i, j]))
+
+
+def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
+    """Whether a pair has probably been conflicting, this step's cosine included."""
+    mp, options = require_mpmath().mp, question.options
+    beta = number(options["beta"])
+    tau = {"v2": 0.9, "low": 0.6}[options["preset"]] if options["tau"] is None else options["tau"]
+    seen: tuple[Number, Number, int] = question.memory.get(pair, (number(0), number(0), 0))
+    first = beta * seen[0] + (1 - beta) * cosine
+    second = beta * seen[1] + (1 - beta) * cosine**2
+    updates = seen[2] + 1
+    question.memory[pair] = (first, second, updates)
+    missing = 1 - beta**updates
+    mean = first / missing
+    variance = max(second / missing - mean**2, number(0))
+    score = -mean / mp.sqrt(variance * (1 - beta) / (1 + beta) + number("1e-12"))
+    return bool(mp.ncdf(score) >= tau) and updates > options["warmup"]
+
+
+def gradvac(question: Question) -> Vector:
+    """GradVac with the operator's random order and remembered targets."""
+    rows = [
+        _vaccinated(question, i, partners)
+        for i, partners in enumerate(partners_of(question, shuffled=True))
+    ]
+    return column_sums(rows)
+
+
+def _vaccinated(question: Question, i: int, partners: Sequence[int]) -> Vector:
+    mp = require_mpmath().mp
+    gramian, beta = question.gramian, number(question.options["beta"])
+    v = [number(int(k == i)) for k in range(question.count)]
+    for j in partners:
+        length, other = mp.sqrt(form(gramian, v)), mp.sqrt(gramian[j][j])
+        if not length:
+            break
+        key = (question.places[i], question.places[j])
+        t: Number = question.memory.get(key, number(0))
+        phi = apply(gramian, v)[j] / length / other
+        if phi < t and 1 + phi <= number(OPPOSITE):
+            v = zeros(question.count)
+        elif phi < t:
+            root = mp.sqrt(1 - t * t)
+            v[j] += length * (t * mp.sqrt(1 - phi**2) - phi * root) / (other * root)
+        limit = number("0.999")
+        question.memory[key] = min(max((1 - beta) * t + beta * phi, -limit), limit)
+    return v
+
+
+def gradnorm(question: Question) -> Vector:
+    """GradNorm at constant losses: all groups at their starting loss."""
+    mp = require_mpmath().mp
+    groups = list(dict.fromkeys(question.labels))
+    members = {g: [i for i, label in enumerate(question.labels) if label == g] for g in groups}
+    norms = {}
+    for group, inside in members.items():
+        indicator = [number(int(k in inside)) for k in range(question.count)]
+        norms[group] = mp.sqrt(max(form(question.gramian, indicator), number(0)))
+    groups = [g for g in groups if norms[g] > 0]
+    logs = {g: question.memory.get(g, number(0)) for g in groups}
+    weights = _adding_up(logs)
+    mean = sum(weights[g] * norms[g] for g in groups) / max(len(groups), 1)
+    if len(groups) > 1:
+        step = number(question.options["lr"])
+        off = {g: weights[g] * norms[g] - mean for g in groups}
+        signs = {g: mp.sign(v) if abs(v) > number("1e-9") * mean else 0 for g, v in off.items()}
+        logs = {g: mp.log(weights[g]) - step * signs[g] for g in groups}
+    question.memory.update({g: mp.log(w) for g, w in _adding_up(logs).items()})
+    return [weights.get(label, number(1)) for label in question.labels]
+
+
+def _adding_up(logs: Mapping[str, Number]) -> dict[str, Number]:
+    mp = require_mpmath().mp
+    total = sum(mp.exp(log) for log in logs.values())
+    return {g: mp.exp(log) * len(logs) / total for g, log in logs.items()}

@@ -1,0 +1,148 @@
+"""Runs one operator on one case."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+from torch import Tensor
+
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_operators.stress.case import Case
+from crossgrad_operators.stress.oracles import Oracle
+from crossgrad_operators.stress.promises import ALL, Promise
+from crossgrad_operators.stress.reference import Answer, Views, answer, usual_views
+from crossgrad_operators.stress.solvers import UnprovenError
+from crossgrad_operators.stress.verdict import ElementRule, ExactCase, Finding, judge
+
+#: The one block of a case.
+BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
+#: Elements up to which a case is repeated for its time.
+REPEATED = 100_000
+#: Steps that operators with a memory are run for.
+STEPS = 3
+#: Why a case fails whose oracle finds no answer.
+UNPROVEN = "the reference is not proven"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One operator on one case (or under one law).
+
+    Attributes:
+        operator: Name of the operator.
+        case: Name of the case.
+        finding: The worst finding of its steps.
+        microseconds: Time of one aggregation, Gramians and weighted sum included.
+    """
+
+    operator: str
+    case: str
+    finding: Finding
+    microseconds: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What an operator is held against.
+
+    Attributes:
+        oracle: Exact weights, for operators that have them.
+        options: Options of the operator, for the oracle.
+        rule: A rule for elements, for operators that work on them.
+        promise: The set on which an error is promised, and what holds outside.
+    """
+
+    oracle: Oracle | None
+    options: Mapping[str, Any]
+    rule: ElementRule | None = None
+    promise: Promise = ALL
+
+
+def run_case(name: str, operator: Operator, exact: ExactCase, reference: Reference) -> Cell:
+    """Runs an operator (a few steps, if it remembers) and judges every result."""
+    case = exact.case
+    if not operator.views.admits(case.views):
+        return Cell(name, case.name, Finding("refused"))
+    finding, times = judged(operator, exact, reference)
+    if times and case.size <= REPEATED:
+        times += [timed(operator, case, usual_views(case.views))[2] for _ in range(3)]
+    return Cell(name, case.name, finding, 1e6 * min(times, default=float("nan")))
+
+
+def judged(
+    operator: Operator,
+    exact: ExactCase,
+    reference: Reference,
+    views_of: Callable[[int, int], Views] = usual_views,
+) -> tuple[Finding, list[float]]:
+    """The worst finding of the steps of an operator, and their seconds; none if it failed.
+
+    Args:
+        operator: The operator.
+        exact: The case.
+        reference: What the results are held against.
+        views_of: (K, step) -> the circumstances of the views.
+    """
+    state = EMPTY_STATE
+    memory: dict[Any, Any] = {}
+    findings, times = [], []
+    for step in range(STEPS):
+        views = views_of(exact.case.views, step)
+        try:
+            found, state, seconds = timed(operator, exact.case, views, state)
+        except Exception as error:
+            # Third-party code may raise anything.
+            return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
+        times.append(seconds)
+        try:
+            expected = _expected(reference, exact, views, memory)
+        except UnprovenError:
+            return Finding("failed", reason=UNPROVEN), []
+        findings.append(judge(exact, found, expected, reference.promise))
+        if not (state.values or state.tensors or state.per_primitive):
+            break
+    return max(findings, key=lambda finding: finding.severity), times
+
+
+def _expected(
+    reference: Reference, exact: ExactCase, views: Views, memory: dict[Any, Any]
+) -> Answer | ElementRule | None:
+    if reference.oracle is None:
+        return reference.rule
+    return answer(reference.oracle, exact.gramian, views, memory, reference.options)
+
+
+def timed(
+    operator: Operator, case: Case, views: Views, state: PluginState = EMPTY_STATE
+) -> tuple[Tensor | None, PluginState, float]:
+    """What the operator makes of the gradients of a case, its new state, and seconds."""
+    gradients = [{BLOCK.name: gradient} for gradient in case.gradients()]
+    context = context_of(gradients, (BLOCK,), views)
+    start = perf_counter()
+    aggregated, state = operator.aggregate(context, state)
+    return aggregated.gradients[BLOCK.name], state, perf_counter() - start
+
+
+def context_of(
+    gradients: Sequence[Mapping[str, Tensor | None]], blocks: tuple[Block, ...], views: Views
+) -> AggregateContext:
+    """What the seam is offered; no operator may need the scene or the schedule."""
+    return AggregateContext(
+        step=1,
+        schedule=cast("Any", None),
+        scene=cast("Any", None),
+        states={},
+        rng=np.random.default_rng(views.seed),
+        gradients=DenseViewGradients(gradients, blocks),
+        losses=np.ones(len(views.labels)),
+        labels=views.labels,
+        distances=np.array(views.ratios),
+        reference_distance=1.0,
+        blocks=blocks,
+    )

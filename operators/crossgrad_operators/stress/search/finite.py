@@ -1,0 +1,109 @@
+"""Whether results are finite, over very many short gradients."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+import torch
+
+from crossgrad_core.numerics.threads import on_one_thread
+from crossgrad_operators.stress.search.batch import Batch, results
+from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, rounded
+from crossgrad_operators.stress.search.specimens import Specimen
+from crossgrad_operators.stress.search.subject import Subject
+
+#: Types of gradients.
+BOTH: Final = (torch.float32, torch.float64)
+#: Cases of a batch, and their largest number of elements.
+BATCH, ELEMENTS = 1000, 20
+
+
+@dataclass(frozen=True, eq=False)
+class Finite:
+    """What was found of one operator.
+
+    Attributes:
+        operator: Its name.
+        matrices: Cases that were run.
+        not_finite: Of these, those with a result that is not finite.
+        longest: Largest |u| over the longest gradient.
+        seconds: What it took.
+        example: A case whose result is not finite.
+    """
+
+    operator: str
+    matrices: int
+    not_finite: int
+    longest: float
+    seconds: float
+    example: Specimen | None
+
+
+@on_one_thread()
+def run_finite(
+    subject: Subject, matrices: int, seed: int = 0, dtypes: Sequence[torch.dtype] = BOTH
+) -> Finite:
+    """Runs an operator on `matrices` cases of K 2 to 20, of the types in turn."""
+    start = perf_counter()
+    bad, longest, example = 0, 0.0, None
+    for turn, first in enumerate(range(0, matrices, BATCH)):
+        dtype = dtypes[turn % len(dtypes)]
+        batch = _batch(subject, dtype, min(BATCH, matrices - first), (seed, turn))
+        found = results(subject.operator, batch)
+        wrong = np.asarray(~np.isfinite(found).all(axis=1))
+        bad += int(wrong.sum())
+        if wrong.any() and example is None:
+            rows = batch.rows[int(np.argmax(wrong))].copy()
+            example = Specimen(rows, batch.dtype, batch.family, turn, float("inf"))
+        longest = max(longest, _longest(batch, np.where(wrong[:, None], 0.0, found)))
+    return Finite(subject.name, matrices, bad, longest, perf_counter() - start, example)
+
+
+def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
+    rng = np.random.default_rng(seed)
+    # Two batches of a family at a time: one of each type.
+    family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
+    views = int(rng.integers(2, VIEWS + 1))
+    if not subject.operator.views.admits(views):
+        views = 2
+    rows = FAMILIES[family](rng, count, views, int(rng.integers(1, ELEMENTS + 1)))
+    return Batch(rounded(rows, dtype), dtype, family)
+
+
+def _longest(batch: Batch, found: np.ndarray) -> float:
+    """The largest |u| over the longest gradient."""
+    length = np.linalg.norm(batch.rows, axis=2).max(axis=1)
+    ratio = np.linalg.norm(found, axis=1) / np.where(length > 0, length, 1.0)
+    return float(ratio.max(initial=0.0))
+
+
+def as_text(found: Sequence[Finite]) -> str:
+    """One line per operator, and the rows of what is not finite."""
+    head = f"{'operator':<16}{'matrices':>10}{'not finite':>12}{'longest |u|':>13}{'seconds':>9}"
+    lines = [
+        f"{each.operator:<16}{each.matrices:>10}{each.not_finite:>12}{each.longest:>13.3g}"
+        f"{each.seconds:>9.1f}"
+        for each in found
+    ]
+    bad = [
+        f"{each.operator}, {each.example.precision}, {each.example.family}, batch "
+        f"{each.example.turn}: not finite\n  --rows '{each.example.text()}'"
+        for each in found
+        if each.example is not None
+    ]
+    legend = "longest |u|: over the longest gradient of its case"
+    return "\n".join([head, *lines, legend, *bad])
+
+
+def write_csv(found: Sequence[Finite], path: Path) -> None:
+    """One row per operator."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["operator", "matrices", "not_finite", "u_longest", "seconds"])
+        for each in found:
+            row = [each.matrices, each.not_finite, each.longest, round(each.seconds, 1)]
+            writer.writerow([each.operator, *row])

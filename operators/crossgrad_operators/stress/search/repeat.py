@@ -1,0 +1,55 @@
+"""One case that the user gives, held against 50 digits."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from crossgrad_core.errors import UserError
+from crossgrad_operators.stress.case import Case, short
+from crossgrad_operators.stress.exact import DIGITS, require_mpmath
+from crossgrad_operators.stress.runner import Cell, judged
+from crossgrad_operators.stress.search.batch import search_views
+from crossgrad_operators.stress.search.subject import Subject
+from crossgrad_operators.stress.verdict import ExactCase, Finding
+
+
+def read_rows(text: str, dtype: torch.dtype) -> Case:
+    """The case that a text such as [[1,2],[3,4]] describes: a row per view.
+
+    Raises:
+        UserError: It is no matrix of numbers.
+    """
+    try:
+        rows = np.array(json.loads(text), np.float64)
+    except (ValueError, TypeError) as error:
+        raise _no_matrix(text) from error
+    if rows.ndim != 2 or not rows.size:  # noqa: PLR2004
+        raise _no_matrix(text)
+    return short(str(dtype).removeprefix("torch."), rows, dtype)
+
+
+def run_rows(subjects: Sequence[Subject], case: Case) -> list[Cell]:
+    """Every operator on one case, as the search ran it."""
+    mpmath = require_mpmath()
+    with mpmath.mp.workdps(DIGITS):
+        exact = ExactCase(case)
+        return [_cell(subject, exact) for subject in subjects]
+
+
+def _cell(subject: Subject, exact: ExactCase) -> Cell:
+    if not subject.operator.views.admits(exact.case.views):
+        return Cell(subject.name, exact.case.name, Finding("refused"))
+    finding, times = judged(subject.operator, exact, subject.reference, search_views)
+    return Cell(subject.name, exact.case.name, finding, 1e6 * min(times, default=float("nan")))
+
+
+def _no_matrix(text: str) -> UserError:
+    return UserError(
+        "the gradients are no matrix of numbers",
+        where="--rows",
+        expected="a row of equal length for each view, such as [[1,2],[3,4]]",
+        found=text if len(text) <= 80 else f"{text[:80]} ...",  # noqa: PLR2004
+        todo="copy what a search printed after --rows, quotes included",
+    )

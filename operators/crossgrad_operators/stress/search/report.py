@@ -1,0 +1,109 @@
+"""What a search found, as text."""
+
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from crossgrad_operators.stress.search.specimens import Specimen
+from crossgrad_operators.stress.search.tally import Tally
+
+#: Share of usual gradients that may lie outside a set, and gradients from which it is judged.
+SHARE, ENOUGH = 0.01, 2000
+
+#: Counts of a tally, as a CSV file has them.
+COUNTS = (
+    "matrices",
+    "outside",
+    "usual",
+    "usual_outside",
+    "unproven",
+    "not_finite",
+    "sampled",
+    "broken",
+)
+
+_HEAD = (
+    f"{'operator':<16}{'type':<9}{'matrices':>9}{'outside':>9}{'usual':>8}{'error':>10}"
+    f"{'|u|':>10}{'jump':>10}{'infinite':>9}{'unproven':>9}{'sampled':>8}{'broken':>8}"
+)
+LEGEND = (
+    "outside: share outside the operator's set (docs/operators.md); usual: the same of gradients\n"
+    "  with K 2 to 20, P 1 to 50 and norms over seven decades; 1 % of these is allowed.\n"
+    "error: the worst inside the set, in units of u kappa; |u|: the longest outside it, over the\n"
+    "  longest gradient; jump: how far a result moves, over the longest gradient, where gradients\n"
+    "  move by 1e-12 of themselves and the method is continuous.\n"
+    "infinite: results that are not finite; unproven: cases without a proven 32-digit answer;\n"
+    "  sampled: cases that were also held against 50 digits, over several steps."
+)
+
+
+def as_text(tallies: Sequence[Tally]) -> str:
+    """The table, the worst case of each operator, and what broke a promise."""
+    used = [tally for tally in tallies if tally.matrices]
+    worst = [line for tally in used for line in _worst(tally)]
+    parts = ["\n".join([_HEAD, *map(_line, used)]), LEGEND, "\n".join(["worst cases:", *worst])]
+    return "\n\n".join([*parts, _failures(used)])
+
+
+def write_csv(tallies: Sequence[Tally], path: Path) -> None:
+    """One row per operator and type."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["operator", "type", *COUNTS, "error_u_kappa", "u_longest", "jump"])
+        for tally in tallies:
+            worst = [p[0] if p else None for p in (tally.inside_pool, tally.outside_pool)]
+            values = [each.value if each else "" for each in (*worst, tally.jump)]
+            counts = [getattr(tally, name) for name in COUNTS]
+            writer.writerow([tally.operator, tally.precision, *counts, *values])
+
+
+def failed(tally: Tally) -> bool:
+    """Whether a promise was broken."""
+    return tally.broken > 0 or _too_often_outside(tally)
+
+
+def _too_often_outside(tally: Tally) -> bool:
+    return tally.usual >= ENOUGH and tally.usual_share > SHARE
+
+
+def _line(tally: Tally) -> str:
+    error = f"{tally.inside_pool[0].value:.3g}" if tally.inside_pool else "-"
+    ratio = f"{tally.outside_pool[0].value:.3g}" if tally.outside_pool else "-"
+    jump = f"{tally.jump.value:.1e}" if tally.jump is not None else "-"
+    outside = tally.outside / tally.matrices
+    return (
+        f"{tally.operator:<16}{tally.precision:<9}{tally.matrices:>9}{outside:>9.2%}"
+        f"{tally.usual_share:>8.2%}{error:>10}{ratio:>10}{jump:>10}{tally.not_finite:>9}"
+        f"{tally.unproven:>9}{tally.sampled:>8}{tally.broken:>8}"
+    )
+
+
+def _worst(tally: Tally) -> Iterator[str]:
+    if tally.inside_pool:
+        yield _described(tally, tally.inside_pool[0], f"error {tally.inside_pool[0].value:.3g}")
+    if tally.outside_pool:
+        yield _described(tally, tally.outside_pool[0], f"|u| {tally.outside_pool[0].value:.3g}")
+
+
+def _described(tally: Tally, specimen: Specimen, what: str) -> str:
+    views, elements = specimen.rows.shape
+    return (
+        f"{tally.operator}, {tally.precision}: {what} (K = {views}, P = {elements}, "
+        f"{specimen.family}, round {specimen.turn})\n  --rows '{specimen.text()}'"
+    )
+
+
+def _failures(tallies: Sequence[Tally]) -> str:
+    lines = [
+        _described(tally, specimen, reason)
+        for tally in tallies
+        for specimen, reason in tally.failures
+    ]
+    lines += [
+        f"{tally.operator}, {tally.precision}: {tally.usual_share:.2%} of usual gradients outside"
+        for tally in tallies
+        if _too_often_outside(tally)
+    ]
+    if not lines:
+        return "nothing outside what is stated"
+    return "\n".join(["broken promises:", *lines])

@@ -1,0 +1,58 @@
+"""The whole suite: every operator on every case, and every law."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, cast
+
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.registry.entries import build, entries
+from crossgrad_operators.stress.case import Case
+from crossgrad_operators.stress.exact import DIGITS, require_mpmath
+from crossgrad_operators.stress.invariances import LAWS, run_law
+from crossgrad_operators.stress.promises import promise_of
+from crossgrad_operators.stress.reference import OPTIONS, ORACLES, chained
+from crossgrad_operators.stress.runner import Cell, Reference, run_case
+from crossgrad_operators.stress.verdict import ExactCase, one_sign
+
+
+def installed() -> list[str]:
+    """Names of all operators, third parties' too."""
+    return list(entries("operators"))
+
+
+def made(name: str) -> Operator:
+    """An operator with the options under which the suite runs it."""
+    return cast("Operator", build("operators", name, OPTIONS.get(name, {})))
+
+
+def run_suite(
+    names: Sequence[str], cases: Sequence[Case], progress: Callable[[str], None] = lambda _: None
+) -> Iterator[Cell]:
+    """Cells of all operators for one case after the other, then the laws.
+
+    Raises:
+        UserError: mpmath is not installed, or an operator cannot be made.
+    """
+    mpmath = require_mpmath()
+    operators = {name: made(name) for name in names}
+    with mpmath.mp.workdps(DIGITS):
+        for case in cases:
+            progress(case.name)
+            exact = ExactCase(case)
+            for name, operator in operators.items():
+                yield run_case(name, operator, exact, reference_of(name, operator))
+        for law in LAWS:
+            progress(law.__name__)
+            yield from (run_law(name, operator, law) for name, operator in operators.items())
+
+
+def reference_of(name: str, operator: Operator) -> Reference:
+    """What a built-in operator is held against; a third party's of the same name has nothing."""
+    options: dict[str, Any] = {
+        field: getattr(operator, field) for field in type(operator).model_fields
+    }
+    if not type(operator).__module__.startswith("crossgrad_operators."):
+        return Reference(None, options)
+    if name == "graddrop":
+        return Reference(None, options, one_sign, promise_of(name))
+    oracle = chained if name == "chain" else ORACLES.get(name)
+    return Reference(oracle, options, promise=promise_of(name))

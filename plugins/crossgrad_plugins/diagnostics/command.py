@@ -1,0 +1,172 @@
+"""What `crossgrad diagnose` does: a model, its probes, the report."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.contexts import Model
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble, read_scene
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.training.budget import steps_for
+from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+from crossgrad_core.training.loop import train
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state, warm_up
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.training.views import model_of
+from crossgrad_plugins.diagnostics.plan import (
+    DEFAULT_GROUPING,
+    OF_THE_RUN,
+    ProbePlan,
+    labelled,
+    plan_probe,
+)
+from crossgrad_plugins.diagnostics.probe import ModelProbe
+from crossgrad_plugins.diagnostics.report import Report
+from crossgrad_plugins.diagnostics.watch import Watch
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a scene is diagnosed.
+
+    Attributes:
+        grouping: Name of the grouping; by default that of the run, or else the paper's.
+        per_group: Probed views per group.
+        probes: Probes during the vanilla run, evenly spaced; the last one at its end.
+        seconds: Training seconds of the vanilla run.
+        seed: Seed of the vanilla run and of the probes.
+        signature: File for the labels of grouping `conflict-signature`, or None.
+    """
+
+    grouping: str | None = None
+    per_group: int = 12
+    probes: int = 4
+    seconds: float = 60.0
+    seed: int = 0
+    signature: Path | None = None
+
+
+def diagnose_scene(config: RunConfig, options: Options) -> Report:
+    """Trains a short vanilla run (one view per step, epoch order, plain sum) and probes it.
+
+    Args:
+        config: Scene, reading options, device and threads; components are replaced.
+        options: How to probe.
+
+    Returns:
+        The report. Where training failed after the first probe it holds the probes so far, and
+        `failure` says what happened.
+
+    Raises:
+        UserError: The scene cannot be read, or the grouping cannot group it.
+        TrainingFailedError: Training failed before the first probe.
+    """
+    configure_threads(config.threads)
+    vanilla = config.model_copy(
+        update={
+            "backbone": ComponentChoice(name="vanilla"),
+            "sampler": ComponentChoice(name="epoch"),
+            "operator": ComponentChoice(name="sum"),
+            "views": 1,
+            "seed": options.seed,
+        }
+    )
+    scene, reader = read_scene(vanilla, cast("Path", vanilla.scene))
+    plan = _plan(scene, options)
+    setup = assemble(vanilla, scene, reader)
+    steps = _affordable_steps(setup, options.seconds)
+    setup = replace(setup, schedule=Schedule.for_run(steps, vanilla.schedule))
+    watch = Watch(plan, max(1, steps // options.probes), steps, options.seed)
+    setup.manager.register(watch, name="diagnostics")
+    state = first_state(setup)
+    model = f"a vanilla run of {steps} steps, one view each, in epoch order"
+    try:
+        train(setup, state, _NoSink(), Stopper())
+    except TrainingFailedError as error:
+        if watch.last is None:
+            raise
+        model = f"{model}, which failed; probed before that"
+        return replace(_report(model, watch, model_of(setup, state), options), failure=str(error))
+    return _report(model, watch, model_of(setup, state), options)
+
+
+def _affordable_steps(setup: Setup, seconds: float) -> int:
+    """How many steps fit into `seconds`; compiles the kernels first.
+
+    Raises:
+        TrainingFailedError: Not even the steps that are tried out can be taken.
+    """
+    try:
+        warm_up(setup)
+        return steps_for(setup, seconds)[0]
+    except NonFiniteError as error:
+        raise TrainingFailedError(str(error)) from error
+
+
+def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:
+    """Probes a run where it is.
+
+    Raises:
+        UserError: The grouping cannot group its scene.
+    """
+    plan = _plan(setup.scene, options, setup.groups)
+    watch = Watch(plan, 1, state.step, options.seed)
+    model = model_of(setup, state)
+    watch.crossgrad_model(model)
+    names = setup.selection.names
+    which = (
+        f"run {folder} ({names['backbone']}, {names['sampler']}, {names['operator']}) "
+        f"at step {state.step}"
+    )
+    return _report(which, watch, model, options)
+
+
+class _NoSink:
+    """The vanilla run leaves no results."""
+
+    def evaluate(self, setup: Setup, state: TrainState) -> None:
+        pass
+
+    def save(self, setup: Setup, state: TrainState) -> None:
+        pass
+
+    def rewind(self, setup: Setup, step: int) -> None:
+        pass
+
+
+def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
+    """The views to probe; `groups` are the labels that the probed run was trained with."""
+    if options.grouping is None and groups is not None:
+        return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
+    name = options.grouping or DEFAULT_GROUPING
+    labels, notes = labelled(scene, name, options.seed)
+    return replace(plan_probe(scene, name, labels, options.per_group, options.seed), notes=notes)
+
+
+def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
+    report = watch.report(model.scene, which)
+    if options.signature is None:
+        return report
+    note = _write_signature(model, options.signature, options.seed)
+    return replace(report, notes=(*report.notes, note))
+
+
+def _write_signature(model: Model, path: Path, seed: int) -> str:
+    """Writes the labels of `conflict-signature` for grouping `lists`."""
+    scene = model.scene
+    grouping = cast("Grouping", build("groupings", "conflict-signature", {}))
+    rng = np.random.default_rng(seed)
+    found = grouping.label(scene, scene.views, rng, ModelProbe(model, rng))
+    lines = [f"{view.name},{label}" for view, label in zip(scene.views, found.labels, strict=True)]
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    return f"labels of conflict-signature in {path} (--grouping lists --set grouping.file={path})"

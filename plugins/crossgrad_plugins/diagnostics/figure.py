@@ -1,0 +1,133 @@
+"""The picture of a report: six panels."""
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.diagnostics.table import ALL, AMPLITUDES, Row, rows_of, touched
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Okabe and Ito's colours, distinguishable with any colour vision.
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_METRICS = {"plain": ("o", "#0072B2"), "adam": ("s", "#D55E00")}
+
+
+def draw(title: str, probes: Sequence[Row], cameras: Sequence[Row]) -> bytes:
+    """The picture as PNG.
+
+    Args:
+        title: Its title.
+        probes: Rows of all probes; the last one fills the panels without a time axis.
+        cameras: Rows on the cameras.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 8.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 3)
+    figure.suptitle(title)
+    last = max(int(row["step"]) for row in probes)
+    shown = touched(probes)
+    now = [row for row in shown if row["step"] == last]
+    _trajectory(axes[0, 0], shown, "conflict_rate", "conflict rate (near, far)")
+    axes[0, 0].set_ylim(-0.02, 1.02)
+    _trajectory(axes[0, 1], shown, "ratio_of_means", "gradient length, near / far")
+    axes[0, 1].set_yscale("log")
+    axes[0, 1].axhline(1.0, color="0.6", linewidth=0.8)
+    _intervals(axes[0, 2], now, "rho", f"sigma_b^2 / sigma_w^2, step {last}, 95 %")
+    _intervals(axes[1, 0], now, "exponent_radial", f"distance exponent, step {last}, 95 %")
+    axes[1, 0].axhline(0.0, color="0.6", linewidth=0.8)
+    _by_distance(axes[1, 1], now)
+    _bimodality(axes[1, 2], cameras)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
+
+def _legend(axes: "Axes") -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
+
+
+def _blocks(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(str(row["block"]) for row in rows))
+
+
+def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) -> None:
+    """One line per block over the steps, in the plain metric."""
+    rows = rows_of(probes, "plain")
+    singles = [b for b in _blocks(rows) if b not in {ALL, "+".join(AMPLITUDES)}]
+    for number, block in enumerate(singles):
+        own = [row for row in rows if row["block"] == block]
+        steps = [float(row["step"]) for row in own]
+        values = [float(row[column]) for row in own]
+        color = _COLORS[number % len(_COLORS)]
+        axes.plot(steps, values, marker="o", markersize=4, color=color, label=block)
+    axes.set_xlabel("step")
+    axes.set_ylabel(label)
+    _legend(axes)
+
+
+def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> None:
+    """A point with its interval per block, side by side for the metrics."""
+    blocks = _blocks(rows)
+    for shift, (metric, (marker, color)) in zip((-0.12, 0.12), _METRICS.items(), strict=True):
+        own = {str(row["block"]): row for row in rows_of(rows, metric)}
+        if not own:
+            continue
+        places = np.arange(len(blocks)) + shift
+        values, low, high = (
+            np.array([float(own[block][column + end]) for block in blocks])
+            for end in ("", "_low", "_high")
+        )
+        axes.vlines(places, low, _drawable(high, low), color=color, linewidth=1.5)
+        axes.plot(places, values, marker, color=color, label=f"{metric} metric")
+    axes.set_xticks(range(len(blocks)), blocks, rotation=30, ha="right", fontsize=8)
+    axes.set_ylabel(label)
+    _legend(axes)
+
+
+def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Upper ends with the infinite ones cut off a little above the largest finite one."""
+    finite = high[np.isfinite(high)]
+    top = 1.2 * float(finite.max()) if len(finite) else float(np.nanmax(np.append(low, 1.0)))
+    return np.where(np.isinf(high), top, high)
+
+
+def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
+    """Conflict of all pairs of views by how much their distances differ, one line per block."""
+    plain = rows_of(rows, "plain")
+    singles = [row for row in plain if row["block"] not in {ALL, "+".join(AMPLITUDES)}]
+    for number, row in enumerate(singles):
+        bins = [name for name in row if name.startswith("conflict_radial_bin")]
+        rates = [float(row[name]) for name in bins]
+        color = _COLORS[number % len(_COLORS)]
+        axes.plot(range(1, len(bins) + 1), rates, marker="o", color=color, label=str(row["block"]))
+        axes.set_xticks(range(1, len(bins) + 1))
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel("quarter of pairs by |log r_i - log r_j|, small to large")
+    axes.set_ylabel("conflict rate (all pairs of views)")
+    _legend(axes)
+
+
+def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
+    """Sarle's coefficient in both forms."""
+    names = [str(row["quantity"]).split(" (")[0] for row in cameras]
+    places = np.arange(len(names))
+    for shift, column, color in ((-0.2, "sample", _COLORS[0]), (0.2, "population", _COLORS[1])):
+        values = [float(row[f"bimodality_{column}"]) for row in cameras]
+        axes.bar(places + shift, values, 0.38, color=color, label=f"{column} form")
+    for value, label in ((5.0 / 9.0, "uniform"), (1.0 / 3.0, "normal")):
+        axes.axhline(value, color="0.4", linewidth=0.8, linestyle=":")
+        axes.annotate(label, (-0.45, value), fontsize=7, va="bottom")
+    count = int(cameras[0]["views"]) if cameras else 0
+    axes.set_ylim(0.0, 1.05)
+    axes.set_xticks(places, names, fontsize=8)
+    axes.set_ylabel(f"Sarle's bimodality, n = {count}")
+    _legend(axes)

@@ -1,0 +1,137 @@
+"""Resampled figures of a grouped Gramian: cameras drawn anew, no camera paired with itself."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
+
+#: Resamples with fewer different cameras in a group are drawn again: they have no variance.
+_FEWEST_CAMERAS = 3
+
+_Array = NDArray[np.float64]
+
+
+def multiplicities(size: int, resamples: int, rng: np.random.Generator) -> _Array:
+    """[R + 1, size] how often each camera is drawn; the first row is the sample itself."""
+    share = np.full(size, 1.0 / size)
+    drawn = rng.multinomial(size, share, size=resamples)
+    fewest = min(_FEWEST_CAMERAS, size)
+    while (poor := np.count_nonzero(drawn, axis=1) < fewest).any():
+        drawn[poor] = rng.multinomial(size, share, size=int(poor.sum()))
+    return np.concatenate([np.ones((1, size)), drawn.astype(np.float64)])
+
+
+@dataclass(frozen=True, eq=False)
+class GroupResamples:
+    """What one group contributes, for each of R + 1 resamples.
+
+    Attributes:
+        counts: [R + 1, n] multiplicities.
+        spread: [R + 1] mean over pairs of different cameras of half their squared distance.
+        self_share: [R + 1] sum of squared multiplicities over n^2 (1/n in the sample itself).
+        along: [R + 1] mean deviation along (near mean - far mean).
+        own: [R + 1] squared length of the mean deviation.
+        linear: [R + 1] variance of the mean deviation along the gap.
+        quadratic: [R + 1] variance of `spread`.
+        mixed: [R + 1] covariance of `spread` with the mean deviation along the gap.
+    """
+
+    counts: _Array
+    spread: _Array
+    self_share: _Array
+    along: _Array
+    own: _Array
+    linear: _Array
+    quadratic: _Array
+    mixed: _Array
+
+    @classmethod
+    def of(cls, deviations: _Array, along: _Array, counts: _Array) -> Self:
+        """From dot products of deviations [n, n], their products with the gap [n], and counts."""
+        n = len(along)
+        squared = np.diag(deviations)
+        halves = (squared[:, None] + squared[None, :] - 2.0 * deviations) / 2.0
+        to_others = counts @ halves
+        self_share = (counts * counts).sum(axis=1) / n**2
+        # Conditional means of the pair kernel, one per camera, without the camera's own copies.
+        conditional = 2.0 * to_others / (n - counts)
+        mean_along = counts @ along / n
+        about_along = along[None, :] - mean_along[:, None]
+        about = conditional - ((counts * conditional).sum(axis=1) / n)[:, None]
+        weights = counts / (n * (n - 1.0))
+        return cls(
+            counts=counts,
+            spread=(counts * to_others).sum(axis=1) / (n**2 * (1.0 - self_share)),
+            self_share=self_share,
+            along=mean_along,
+            own=(counts * (counts @ deviations)).sum(axis=1) / n**2,
+            linear=(weights * about_along**2).sum(axis=1),
+            quadratic=(weights * about**2).sum(axis=1),
+            mixed=(weights * about_along * about).sum(axis=1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Resamples:
+    """Everything that the intervals need; row 0 is the sample itself, in units of the scale.
+
+    If theta is the true ||near mean - far mean||^2, a resample's estimate of it is theta +
+    2 sqrt(theta) `shift` + `noise`, less the mean of the noise.
+
+    Attributes:
+        within: [R + 1] sigma_w^2.
+        within_variance: [R + 1] its variance.
+        shift: [R + 1] mean deviation along the unit vector of the gap, each view's own part in the
+            gap left out.
+        noise: [R + 1] squared mean deviation, less what single cameras' deviations make of it.
+        shift_variance: [R + 1] variance of `shift`.
+        covariance: [R + 1] covariance of `within` with `shift`.
+        spread: [R + 1] variance of the difference of the means, summed over dimensions.
+    """
+
+    within: _Array
+    within_variance: _Array
+    shift: _Array
+    noise: _Array
+    shift_variance: _Array
+    covariance: _Array
+    spread: _Array
+
+    def along_gap(self, factor: float) -> "Resamples":
+        """The same with the variance of the shift times a factor."""
+        return replace(
+            self,
+            shift=self.shift * factor**0.5,
+            shift_variance=self.shift_variance * factor,
+            covariance=self.covariance * factor**0.5,
+        )
+
+    @classmethod
+    def of(
+        cls, parts: GroupedGramian, groups: Groups, resamples: int, rng: np.random.Generator
+    ) -> Self:
+        """Draws the resamples."""
+        n, m = groups.sizes
+        near = GroupResamples.of(parts.near, parts.near_along, multiplicities(n, resamples, rng))
+        far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
+        (f, g), (p, q) = groups.unseen, groups.shares
+        p, q = p * groups.divisors[0], q * groups.divisors[1]
+        # Probing part of a finite population leaves only the unseen share of the noise's variance.
+        root_f, root_g = f**0.5, g**0.5
+        near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
+        far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])
+        meeting = (near.counts @ parts.cross * far.counts).sum(axis=1) / (n * m)
+        unit = parts.gap**0.5 if parts.gap > 0.0 else 1.0
+        own_noise = f * near.spread * near.self_share + g * far.spread * far.self_share
+        return cls(
+            within=p * near_spread + q * far_spread,
+            within_variance=p**2 * f * near.quadratic + q**2 * g * far.quadratic,
+            shift=(root_f * near.along - root_g * far.along) / unit,
+            noise=f * near.own + g * far.own - 2.0 * root_f * root_g * meeting - own_noise,
+            shift_variance=(f * near.linear + g * far.linear) / unit**2,
+            covariance=(p * f * near.mixed - q * g * far.mixed) / unit,
+            spread=f * near.spread / n + g * far.spread / m,
+        )

@@ -1,0 +1,94 @@
+"""Probes during a run: conflict, gradient ratios, variance within and between groups."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field, PrivateAttr
+
+from crossgrad_core.contract.contexts import Model, RunInfo
+from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.observer import Observer
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.diagnostics.watch import Watch
+
+#: Probes of a run whose interval the user does not set.
+_PROBES = 8
+
+
+class Diagnostics(Observer):
+    """Measures the gradients of chosen views at an interval, parameters frozen.
+
+    Writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's folder. The
+    views are drawn by the observer's own generator; training is not changed by a bit. A probe
+    costs a forward and a backward pass of each probed view, off the training clock; the column
+    `probe_seconds` tells how long it took.
+    """
+
+    every: int | None = Field(
+        None, ge=1, description="steps between probes; default: an eighth of the run"
+    )
+    views: int = Field(12, ge=2, description="probed training views of each group, at most")
+    grouping: str | None = Field(
+        None, description="which views are near and far; default: the run's grouping, else radial"
+    )
+    seed: int = Field(0, ge=0, description="seed of the choice of views and of the bootstrap")
+
+    # What was found so far; no part of the run's state.
+    _run: RunInfo | None = PrivateAttr(default=None)
+    _watch: "Watch | None" = PrivateAttr(default=None)
+
+    @hookimpl
+    def crossgrad_run_start(self, run: RunInfo) -> None:
+        """Remembers where results go."""
+        self._run, self._watch = run, None
+
+    @hookimpl
+    def crossgrad_model(self, model: Model) -> None:
+        """Probes where it is time, and writes the table."""
+        if self._watch is None:
+            self._watch = self._start(model)
+        watch = self._watch
+        found = len(watch.rows)
+        watch.crossgrad_model(model)
+        folder = self._folder()
+        if folder is not None and len(watch.rows) > found:
+            from crossgrad_plugins.diagnostics.report import PROBES, write_csv
+
+            write_csv(folder / PROBES, watch.rows)
+
+    @hookimpl
+    def crossgrad_run_end(self, status: str) -> None:
+        """Writes the picture and what does not change over the run."""
+        folder, watch, run = self._folder(), self._watch, self._run
+        if folder is None or watch is None or run is None or watch.last is None:
+            return
+        watch.report(run.scene, f"{folder.name}, {status}").write(folder)
+
+    def _folder(self) -> Path | None:
+        return None if self._run is None else self._run.folder
+
+    def _start(self, model: Model) -> "Watch":
+        """The views to look at, and the rows of a run that is being continued."""
+        from crossgrad_plugins.diagnostics.plan import (
+            DEFAULT_GROUPING,
+            OF_THE_RUN,
+            labelled,
+            plan_probe,
+        )
+        from crossgrad_plugins.diagnostics.report import PROBES, read_probes
+        from crossgrad_plugins.diagnostics.watch import Watch
+
+        if self.grouping is None and model.groups is not None:
+            name, labels = OF_THE_RUN, model.groups
+        else:
+            name = self.grouping or DEFAULT_GROUPING
+            labels, _ = labelled(model.scene, name, self.seed)
+        plan = plan_probe(model.scene, name, labels, self.views, self.seed)
+        total = model.phase.schedule.total
+        watch = Watch(plan, self.every or max(1, total // _PROBES), total, self.seed)
+        folder = self._folder()
+        if folder is not None:
+            rows = read_probes(folder / PROBES)
+            watch.rows += [row for row in rows if int(row["step"]) < model.phase.step]
+        return watch

@@ -1,0 +1,121 @@
+"""Which views a probe looks at: as many near as far ones, the same in every probe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build
+from crossgrad_core.scene.poses import footprint_of, radial_distances
+from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
+
+#: The grouping of a probe where the run has none: the paper's.
+DEFAULT_GROUPING = "radial"
+#: What the groups that a run was trained with are called.
+OF_THE_RUN = "of the run"
+
+
+@dataclass(frozen=True, eq=False)
+class ProbePlan:
+    """The views of a probe.
+
+    Attributes:
+        grouping: Name of the grouping, or how the labels came about.
+        near_label: Label of the near group.
+        far_label: Label of the far group.
+        labels: Label of every training view.
+        views: Positions in `scene.train_views`, in ascending order.
+        notes: What the grouping had to say.
+    """
+
+    grouping: str
+    near_label: str
+    far_label: str
+    labels: tuple[str, ...]
+    views: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+    def near(self, views: Sequence[int]) -> NDArray[np.bool_]:
+        """Which of these views [V] are near."""
+        return np.array([self.labels[view] == self.near_label for view in views])
+
+    @property
+    def cameras(self) -> tuple[int, int]:
+        """Numbers of (near, far) training views."""
+        return self.labels.count(self.near_label), self.labels.count(self.far_label)
+
+
+def labelled(scene: Scene, grouping: str, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Labels of the training views by the grouping of that name, and its notes.
+
+    Raises:
+        UserError: There is no such grouping, or it cannot group this scene.
+    """
+    component = cast("Grouping", build("groupings", grouping, {}))
+    found = component.label(scene, scene.train_views, np.random.default_rng(seed))
+    return found.labels, found.notes
+
+
+def plan_probe(
+    scene: Scene, grouping: str, labels: tuple[str, ...], per_group: int, seed: int
+) -> ProbePlan:
+    """Draws up to `per_group` views of the nearest and of the farthest group.
+
+    Args:
+        scene: The scene.
+        grouping: Name of the grouping.
+        labels: Its label of every training view; with three or more, the middle is left out.
+        per_group: Views per group.
+        seed: Seed of the probe's own generator.
+
+    Raises:
+        UserError: There is one group only, or one with a single view.
+    """
+    near_label, far_label = _outermost(scene, labels)
+    rng = np.random.default_rng(seed)
+    views: list[int] = []
+    for label in (near_label, far_label):
+        members = [i for i, own in enumerate(labels) if own == label]
+        if len(members) < SMALLEST_GROUP:
+            raise UserError(
+                "a probe needs two training views of each group",
+                where=f"grouping {grouping}",
+                found=f"{len(members)} of group {label}",
+                todo="choose another grouping",
+            )
+        count = min(per_group, len(members))
+        views += [members[i] for i in rng.choice(len(members), size=count, replace=False)]
+    return ProbePlan(grouping, near_label, far_label, labels, tuple(sorted(views)))
+
+
+def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
+    """The labels of the nearest and of the farthest group."""
+    names = sorted(set(labels))
+    if len(names) == 1:
+        raise UserError(
+            "a probe compares two groups of views",
+            where="grouping",
+            found=f"one group, {names[0]}",
+            todo="choose another grouping",
+        )
+    if {"near", "far"} <= set(names):
+        return "near", "far"
+    closeness = _closeness(scene)
+    mean = {
+        name: float(np.median([c for c, own in zip(closeness, labels, strict=True) if own == name]))
+        for name in names
+    }
+    return max(names, key=lambda name: mean[name]), min(names, key=lambda name: mean[name])
+
+
+def _closeness(scene: Scene) -> NDArray[np.float64]:
+    """[N] a number that is larger for nearer training views."""
+    footprints = np.array([footprint_of(scene, view) for view in scene.train_views])
+    if np.isnan(footprints).any():
+        return -radial_distances(scene, scene.train_views)
+    return footprints

@@ -1,0 +1,190 @@
+"""The results of diagnostics: CSV files, a picture, and a few lines for the terminal."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isnan
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of, touched
+
+PROBES = "diagnostics.csv"
+CAMERAS = "cameras.csv"
+GROUPINGS = "groupings.csv"
+PICTURE = "diagnostics.png"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that was found out.
+
+    Attributes:
+        scene: Name of the scene.
+        title: Scene and model.
+        probes: Rows of `table`, all probes one after the other.
+        cameras: Rows of `camera_rows`.
+        groupings: Rows of `grouping_rows`, for the last probe.
+        notes: What the reader should know.
+        failure: Why training ended before its time; None where it did not.
+    """
+
+    scene: str
+    title: str
+    probes: Sequence[Row]
+    cameras: Sequence[Row]
+    groupings: Sequence[Row]
+    notes: Sequence[str] = ()
+    failure: str | None = None
+
+    def write(self, folder: Path) -> None:
+        """Writes the CSV files and the picture.
+
+        Raises:
+            UserError: The disk is full, or the folder is read-only.
+        """
+        from crossgrad_plugins.diagnostics.figure import draw
+
+        write_csv(folder / PROBES, self.probes)
+        write_csv(folder / CAMERAS, self.cameras)
+        write_csv(folder / GROUPINGS, self.groupings)
+        write_atomically(folder / PICTURE, draw(self.title, self.probes, self.cameras))
+
+    def lines(self) -> list[str]:
+        """The report for a terminal."""
+        parts = (
+            [f"scene: {self.scene}", *self.notes],
+            _camera_lines(self.cameras),
+            self._blocks(),
+            _grouping_lines(self.groupings),
+        )
+        return [line for part in parts for line in ("", *part)][1:]
+
+    def _blocks(self) -> list[str]:
+        last = max(int(row["step"]) for row in self.probes)
+        now = [row for row in self.probes if row["step"] == last]
+        first = now[0]
+        lines = [
+            f"step {last}, {first['near_views']} near and {first['far_views']} far views by "
+            f"grouping {first['grouping']}; intervals 95 %"
+        ]
+        for metric in dict.fromkeys(str(row["metric"]) for row in now):
+            lines += ["", f"{metric} metric", _HEADER]
+            lines += [_block_line(row) for row in touched(rows_of(now, metric))]
+        return lines
+
+
+_HEADER = (
+    f"{'block':<16}{'conflict':>9}{'near/far':>9}{'sigma_b2/sigma_w2':>26}"
+    f"{'noise scale':>13}{'exponent':>22}"
+)
+
+
+def _block_line(row: Row) -> str:
+    conflict = _figure(100.0 * float(row["conflict_rate"]), ".0f") + " %"
+    rho = _with_interval(row, "rho", ".2g")
+    exponent = _with_interval(row, "exponent_radial", ".1f")
+    name = str(row["block"])
+    return (
+        f"{name if name != ALL else '(all)':<16}{conflict:>9}"
+        f"{_figure(float(row['ratio_of_means']), '.2f'):>9}{rho:>26}"
+        f"{_figure(float(row['noise_scale']), '.3g'):>13}{exponent:>22}"
+    )
+
+
+def _with_interval(row: Row, name: str, form: str) -> str:
+    low, high = float(row[f"{name}_low"]), float(row[f"{name}_high"])
+    ends = "" if isnan(low) else f" [{_figure(low, form)}, {_figure(high, form)}]"
+    return _figure(float(row[name]), form) + ends
+
+
+def _camera_lines(rows: Sequence[Row]) -> list[str]:
+    lines = ["Sarle's bimodality (finite-sample, population form; uniform 0.56, normal 0.33)"]
+    for row in rows:
+        figures = (
+            f"{_figure(float(row['bimodality_sample']), '.3f')}, "
+            f"{_figure(float(row['bimodality_population']), '.3f')}, n = {row['views']}"
+        )
+        variance = float(row["relative_variance"])
+        spread = "" if isnan(variance) else f"; Var(r)/mean(r)^2 = {variance:.3g}"
+        note = f" ({row['note']})" if row["note"] else ""
+        lines.append(f"  {row['quantity']}: {figures}{spread}{note}")
+    return lines
+
+
+def _grouping_lines(rows: Sequence[Row]) -> list[str]:
+    """The first block as other groupings see it: the choice of near and far matters."""
+    lines = ["the same probe by grouping, plain metric"]
+    for name in dict.fromkeys(str(row["grouping"]) for row in rows):
+        first = next(row for row in rows if row["grouping"] == name)
+        if first["note"]:
+            lines.append(f"  {name}: {first['note']}")
+            continue
+        lines.append(
+            f"  {name} ({first['near_cameras']} near, {first['far_cameras']} far): "
+            f"{first['block']} near/far {_figure(float(first['ratio_of_means']), '.2f')}, "
+            f"sigma_b2/sigma_w2 {_figure(float(first['rho']), '.2g')}, blocks in conflict per pair "
+            f"{_figure(100.0 * float(first['per_pair_conflict']), '.0f')} %"
+        )
+    return lines
+
+
+def _figure(value: float, form: str) -> str:
+    # Adding zero after rounding turns -0.00 into 0.00.
+    return "-" if isnan(value) else format(float(format(value, form)) + 0.0, form)
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Writes rows with the union of their columns; a figure that is NaN is left empty.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
+    """
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: _cell(value) for name, value in row.items()})
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_probes(path: Path) -> list[Row]:
+    """Rows that `write_csv` wrote of probes, empty cells as NaN; none where there is no file.
+
+    Raises:
+        UserError: The file cannot be read, or a row lacks cells or a step.
+    """
+    if not path.is_file():
+        return []
+    todo = "remove the file; the rows of earlier steps are then missing from it"
+    header, *lines = read_rows(path, "the table of probes", todo) or [[]]
+    rows: list[Row] = [dict(zip(header, map(_value, line), strict=False)) for line in lines]
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != len(line) or len(row) != len(header) or not isinstance(row.get("step"), int):
+            raise UserError(
+                "the table of probes cannot be read",
+                where=path,
+                expected=f"{len(header)} cells, one of them a step",
+                found=",".join(line),
+                todo=todo,
+            )
+    return rows
+
+
+def _cell(value: float | str) -> str:
+    if isinstance(value, float):
+        return "" if isnan(value) else f"{value:.9g}"
+    return str(value)
+
+
+def _value(cell: str) -> str | int | float:
+    if cell == "":
+        return float("nan")
+    try:
+        return parse_number(cell)
+    except ValueError:
+        return cell
