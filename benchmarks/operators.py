@@ -24,10 +24,10 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.contract.aggregation import operator_context
 from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.gramian_operator import MatrixOperator, operator_context
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
@@ -183,7 +183,7 @@ def _context(gradients: ViewGradients) -> AggregateContext:
 
 def _arithmetic(operator: Operator, views: int) -> float | None:
     """Microseconds of `transform` for six blocks; None for operators that work on elements."""
-    if operator.elementwise:
+    if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))
     gramians = context.gradients.gramians("tensor")

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate, Parameters
-from crossgrad_core.contract.component import Component, Selection, ViewCounts
+from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -17,6 +17,7 @@ from crossgrad_core.contract.contexts import (
     Draw,
     EvaluationReport,
     Model,
+    OperatorContext,
     RegularizeContext,
     Regularized,
     RunInfo,
@@ -28,17 +29,19 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.gradients import Granularity, ViewGradients
+from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.operator import Granularity, Operator, OperatorContext
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -63,11 +66,14 @@ __all__ = [
     "Field",
     "Gaussians",
     "GradientProbe",
+    "GramianOperator",
     "Granularity",
     "Grouping",
+    "HasIdleOptions",
     "IncompatibleSelectionError",
     "Labelling",
     "LearningRate",
+    "MatrixOperator",
     "Model",
     "NoEdit",
     "Observer",
@@ -102,5 +108,6 @@ __all__ = [
     "ViewCounts",
     "ViewGradients",
     "ViewRecord",
+    "Weighting",
     "hookimpl",
 ]

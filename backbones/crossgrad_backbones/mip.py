@@ -17,7 +17,7 @@ from crossgrad_backbones.visibility import NEAR
 from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
 from crossgrad_core.contract.contexts import AfterStepContext, Densified
 from crossgrad_core.contract.gaussians import Gaussians, Response
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.scene import Camera, Scene
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.topology import Edit, Rows

@@ -12,10 +12,10 @@ from typing_extensions import override
 
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
-from crossgrad_core.contract.component import Selection
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Camera, Scene
 from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.spherical import COEFFICIENTS, SH_C0
 from crossgrad_core.splats import nearest_neighbour_scales
@@ -42,8 +42,8 @@ class Vanilla(Backbone):
     lr_f_dc: float = Field(2.5e-3, ge=0, description="learning rate of SH band 0")
     lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         if self.sh_degree > 0:
             return {}
         return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave it out"}

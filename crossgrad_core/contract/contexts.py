@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, Parameters
+from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
@@ -312,3 +312,36 @@ class EvaluationReport:
 
     step: int
     row: Mapping[str, float | int | str | None]
+
+
+@dataclass(frozen=True, eq=False)
+class OperatorContext:
+    """What a Gramian operator may know besides the Gramians.
+
+    Attributes:
+        step: 1-based number of the step.
+        blocks: [B] name of each Gramian's block (`geometry`, `appearance` under granularity
+            `group`, `all` under `global`; under `gaussian` one name for all rows of a block).
+        kinds: [B] kind of each.
+        losses: [K] float64.
+        labels: K group labels, or None.
+        distances: [K] float64 camera distances from the mean training camera, local units.
+        reference_distance: Their median over all training cameras.
+        present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
+            columns of the others are zero in the Gramian; an operator must give them weight 0.
+        unit: Unit roundoff of the gradients' type: no result needs to be closer.
+        remainders: Works out [B, K, K], what rounding to float64 took from the Gramians; both
+            together have twice the digits. It takes another, slower pass over the gradients: for
+            Gramians so close to singular that their own rounding shows. None where nobody knows.
+    """
+
+    step: int
+    blocks: tuple[str, ...]
+    kinds: tuple[BlockKind, ...]
+    losses: NDArray[np.float64]
+    labels: tuple[str, ...] | None
+    distances: NDArray[np.float64]
+    reference_distance: float
+    present: NDArray[np.bool_]
+    unit: float = 2.0**-24
+    remainders: Callable[[], NDArray[np.float64]] | None = None

@@ -4,9 +4,9 @@ from abc import abstractmethod
 from typing import ClassVar
 
 from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.component import Component, Selection
+from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import Densified, DensifyContext
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit, NoEdit
@@ -57,29 +57,3 @@ class Densifier(Component):
         """Answers the seam with this densifier's edit."""
         edit, state = self.densify(context, context.state(STATE))
         return Densified(edit, states={STATE: state})
-
-    @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
-        """Refuses backbones and rasterizers that lack what this densifier needs."""
-        return [*self._missing_blocks(selection), *self._missing_statistics(selection)]
-
-    def _missing_blocks(self, selection: Selection) -> list[str]:
-        have = {tensor for block in selection.backbone.blocks() for tensor in block.tensors}
-        missing = sorted(self.blocks - have)
-        if not missing:
-            return []
-        names = selection.names
-        return [
-            f"densifier {names['densifier']} edits the tensors {', '.join(missing)}, "
-            f"which backbone {names['backbone']} does not have"
-        ]
-
-    def _missing_statistics(self, selection: Selection) -> list[str]:
-        missing = sorted(self.needs - selection.rasterizer.provides)
-        if not missing:
-            return []
-        names = selection.names
-        return [
-            f"densifier {names['densifier']} needs the screen statistics {', '.join(missing)}, "
-            f"which rasterizer {names['rasterizer']} does not provide"
-        ]

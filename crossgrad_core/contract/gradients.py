@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.operator import Granularity
-
+#: What one Gramian covers: each block, all blocks of a kind, everything, each Gaussian of a block.
+Granularity = Literal["tensor", "group", "global", "gaussian"]
 #: K tensors (None where a view does not touch the tensor) -> one tensor or None.
 Elementwise = Callable[[str, Sequence[Tensor | None]], Tensor | None]
 

@@ -8,10 +8,9 @@ with a value; None is an error.
 
 from typing import TYPE_CHECKING
 
-import pluggy
+from crossgrad_core.contract.marks import hookspec
 
 if TYPE_CHECKING:
-    from crossgrad_core.contract.component import Selection
     from crossgrad_core.contract.contexts import (
         AfterStepContext,
         AggregateContext,
@@ -27,10 +26,7 @@ if TYPE_CHECKING:
         Sampled,
         StepRecord,
     )
-
-PROJECT = "crossgrad"
-hookspec = pluggy.HookspecMarker(PROJECT)
-hookimpl = pluggy.HookimplMarker(PROJECT)
+    from crossgrad_core.contract.selection import Selection
 
 
 class HookSpecs:

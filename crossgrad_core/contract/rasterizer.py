@@ -1,14 +1,12 @@
 """The rasterizer slot: Gaussians x Camera -> Render, differentiable."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
-from typing_extensions import override
 
-from crossgrad_core.contract.component import Component, Selection
+from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response
 from crossgrad_core.contract.scene import Camera
 
@@ -40,13 +38,6 @@ class Rasterizer(Component):
     max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
     near: float = Field(1e-3, gt=0.0, description="near plane, local units")
     dilation: float = Field(0.3, ge=0.0, description="dilation of the 2-D covariance, px^2")
-
-    @override
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        if not selection.backbone.own_dilation:
-            return {}
-        name = selection.names["backbone"]
-        return {"dilation": f"backbone {name} has a dilation of its own; leave it out"}
 
     @abstractmethod
     def render(

@@ -3,9 +3,9 @@
 from abc import abstractmethod
 from typing import ClassVar
 
-from crossgrad_core.contract.component import Component, Selection, ViewCounts
+from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.contexts import Draw, SampleContext, Sampled
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.state import PluginState
 
 STATE = "sampler"
@@ -51,21 +51,3 @@ class Sampler(Component):
         """Answers the seam with this sampler's draw."""
         draw, state = self.sample(context, context.state(STATE))
         return Sampled(draw, states={STATE: state})
-
-    @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
-        """Refuses numbers of views, and of groups, for which the sampler means nothing."""
-        name, views, labels = (
-            selection.names["sampler"],
-            selection.views_per_step,
-            selection.labels,
-        )
-        reasons = []
-        if not self.view_counts.admits(views):
-            reasons.append(f"sampler {name} needs {self.view_counts}; K = {views} was asked for")
-        if self.groups is not None and labels is not None and len(labels) != self.groups:
-            reasons.append(
-                f"sampler {name} draws from {self.groups} groups; grouping "
-                f"{selection.names['grouping']} gives {len(labels)}: {', '.join(labels)}"
-            )
-        return reasons

@@ -12,8 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
-from crossgrad_core.contract.gradients import Elementwise, ViewGradients
-from crossgrad_core.contract.operator import Granularity
+from crossgrad_core.contract.gradients import Elementwise, Granularity, ViewGradients
 from crossgrad_core.gradients import exact, generic, native
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
 from crossgrad_core.gradients.squares import column_gramians, column_remainders

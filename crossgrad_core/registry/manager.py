@@ -11,7 +11,8 @@ from typing import TypeVar
 import pluggy
 
 from crossgrad_core.contract.contexts import Answer, Densified, Sampled, StepContext
-from crossgrad_core.contract.hooks import PROJECT, HookSpecs
+from crossgrad_core.contract.hooks import HookSpecs
+from crossgrad_core.contract.marks import PROJECT
 from crossgrad_core.contract.topology import Edit, NoEdit
 from crossgrad_core.errors import UserError
 from crossgrad_core.wording import did_you_mean, listed, sentences

@@ -10,15 +10,17 @@ import torch
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.component import Component, Selection
+from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
@@ -130,23 +132,20 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     """
     config = _with_first_degree(config)
     selection, notes = select(config, scene, reader)
-    components = selection.components
     observers = {choice.name: _built("observers", choice) for choice in config.observers}
-    plugins = _plugins(components, observers)
+    plugins = _plugins(selection.components, observers)
     manager = make_manager(plugins)
     answers = manager.hook.crossgrad_objections(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
-    densifier = cast("Densifier", components["densifier"])
     setup = Setup(
         config=config,
         scene=scene,
         selection=selection,
-        densifier=densifier,
         manager=manager,
         plugins=plugins,
         groups=groups,
-        schedule=schedule_of(config, densifier, config.steps or DEFAULT_STEPS),
+        schedule=schedule_of(config, selection.densifier, config.steps or DEFAULT_STEPS),
         device=choose_device(config.device),
         notes=tuple(notes),
     )
@@ -190,13 +189,6 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     )
     views = config.views or sampler.usual_views
     grouping_choice = _grouping_choice(config, sampler, notes)
-    components: dict[str, Component] = {
-        "backbone": backbone,
-        "sampler": sampler,
-        "operator": operator,
-        "densifier": densifier,
-        "rasterizer": rasterizer,
-    }
     names = {
         "backbone": config.backbone.name,
         "sampler": config.sampler.name,
@@ -205,10 +197,22 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "rasterizer": rasterizer_name,
         "reader": reader,
     }
+    grouping = None
     if grouping_choice is not None:
-        components["grouping"] = _built("groupings", grouping_choice)
+        grouping = cast("Grouping", _built("groupings", grouping_choice))
         names["grouping"] = grouping_choice.name
-    return Selection(components, names, views, device.type), notes
+    selection = Selection(
+        backbone=backbone,
+        sampler=sampler,
+        operator=operator,
+        densifier=densifier,
+        rasterizer=rasterizer,
+        names=names,
+        views_per_step=views,
+        device=device.type,
+        grouping=grouping,
+    )
+    return selection, notes
 
 
 def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
@@ -295,9 +299,9 @@ def _grouping_choice(
 def _groups(
     config: RunConfig, scene: Scene, selection: Selection, notes: list[str]
 ) -> tuple[str, ...] | None:
-    if "grouping" not in selection.components:
+    grouping = selection.grouping
+    if grouping is None:
         return None
-    grouping = cast("Grouping", selection.components["grouping"])
     rng = make_streams(config.seed)["grouping"]
     labelling = grouping.label(scene, scene.train_views, rng)
     notes += labelling.notes
@@ -321,17 +325,7 @@ def reasons_against(
     config: RunConfig, selection: Selection, answers: Iterable[list[str]]
 ) -> tuple[str, ...]:
     """Why the selection cannot work: what its components object, and what the core does."""
-    reasons = [reason for answer in answers for reason in answer]
-    device, rasterizer = selection.device, selection.rasterizer
-    if device not in rasterizer.devices:
-        reasons.append(
-            f"rasterizer {selection.names['rasterizer']} does not run on device {device}"
-        )
-    if selection.backbone.response not in rasterizer.responses:
-        reasons.append(
-            f"rasterizer {selection.names['rasterizer']} does not draw the pixel response "
-            f"{selection.backbone.response} of backbone {selection.names['backbone']}"
-        )
+    reasons = objections_to(selection) + [reason for answer in answers for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
         reasons.append(
             f"--backward joint makes one gradient of all views, but operator "

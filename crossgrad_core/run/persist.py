@@ -6,7 +6,7 @@ from typing import Any, cast
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import Json
-from crossgrad_core.run.checkpoint.checkpoint import Checkpoint
+from crossgrad_core.run.checkpoint.contents import Checkpoint
 from crossgrad_core.training.rngs import restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Clock, Counters, TrainState

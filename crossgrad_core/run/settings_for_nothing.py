@@ -9,6 +9,7 @@ from pathlib import Path
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
@@ -78,7 +79,7 @@ def _of_choice(
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
     # As the user set it: fitted to the scene, it may have lost what the scene does not need.
     component = build(f"{slot}s", name, choice.options)
-    for option, why in component.set_for_nothing(setup.selection).items():
+    for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{place}.{option}", why
 
 

@@ -27,7 +27,7 @@ from crossgrad_core.contract.contexts import (
     StepRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule

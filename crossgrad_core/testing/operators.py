@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.blocks import BlockKind
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.testing.aggregation import AGGREGATION_CHECKS
 from crossgrad_core.testing.components import COMPONENT_CHECKS
@@ -89,28 +91,28 @@ def _families(draw: Array) -> Iterator[tuple[str, Array]]:
 
 
 def transformed(
-    operator: Operator, case: OperatorCase, state: PluginState = EMPTY_STATE, seed: int = 0
+    operator: MatrixOperator, case: OperatorCase, state: PluginState = EMPTY_STATE, seed: int = 0
 ) -> tuple[Array, PluginState]:
     """What the operator answers to a case."""
     rng = np.random.default_rng(seed)
     return operator.transform(case.gramians, case.context, state, rng)
 
 
-def _gramian_operator(make: Make[Operator]) -> Operator:
-    """The operator, where it works on Gramians.
+def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
+    """The operator, where it has a matrix.
 
     Raises:
-        SkipTest: It works on the elements of the gradients: it has its own `aggregate`.
+        SkipTest: It needs the gradients themselves.
     """
     operator = make()
-    if type(operator).aggregate is not Operator.aggregate:
-        raise cannot_tell("it has its own aggregate and does not work on Gramians")
+    if not isinstance(operator, MatrixOperator):
+        raise cannot_tell("it needs the gradients themselves and has no matrix")
     return operator
 
 
 def matrices_have_the_shape(make: Make[Operator]) -> None:
     """`transform` answers [B, R, K] float64 for every number of views that it admits."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
         matrices, _ = transformed(operator, case)
@@ -124,7 +126,7 @@ def matrices_have_the_shape(make: Make[Operator]) -> None:
 
 def matrices_are_finite(make: Make[Operator]) -> None:
     """No finite gradients give a NaN or an infinity."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
         matrices, _ = transformed(operator, case)
@@ -137,7 +139,7 @@ def matrices_are_finite(make: Make[Operator]) -> None:
 
 def one_block_is_enough(make: Make[Operator]) -> None:
     """Each block is treated by itself: alone it gets the matrix that it gets among others."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
         matrices, _ = transformed(operator, case)
@@ -166,7 +168,7 @@ def _only(case: OperatorCase, block: int) -> OperatorCase:
 
 def inputs_stay_untouched(make: Make[Operator]) -> None:
     """`transform` changes neither the Gramians nor what the context holds nor the old state."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         _, state = transformed(operator, operator_case(views))
         before, kept = operator_case(views, 2), revived(state)
@@ -181,7 +183,7 @@ def inputs_stay_untouched(make: Make[Operator]) -> None:
 
 def same_seed_same_answer(make: Make[Operator]) -> None:
     """The answer depends on the arguments alone, and randomness comes from `rng`."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         with global_randomness_untouched():
             one, one_state = transformed(operator, operator_case(views))
@@ -192,7 +194,7 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
 
 def state_survives_a_checkpoint(make: Make[Operator]) -> None:
     """After each step the state can be written, read and continued from, bit for bit."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         state, copy = EMPTY_STATE, EMPTY_STATE
         for step in range(1, _STEPS + 1):
@@ -208,7 +210,7 @@ def state_survives_a_checkpoint(make: Make[Operator]) -> None:
 
 def one_view_keeps_its_direction(make: Make[Operator]) -> None:
     """With one view the answer is a positive multiple of its gradient."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     if not operator.views.admits(1):
         raise cannot_tell(f"it needs {operator.views}")
     case = operator_case(1)
@@ -222,7 +224,7 @@ def one_view_keeps_its_direction(make: Make[Operator]) -> None:
 
 def scales_with_the_gradients(make: Make[Operator]) -> None:
     """Gradients times c > 0 give the answer times c, so no threshold hides an absolute length."""
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case, scaled = operator_case(views), operator_case(views, scale=_SCALE)
         weights = transformed(operator, case)[0].sum(axis=1)
@@ -245,7 +247,7 @@ def what_it_reads_is_declared(make: Make[Operator]) -> None:
 
     A run refuses a grouping that nobody reads, and a granularity of Gramians that nobody reads.
     """
-    operator = _gramian_operator(make)
+    operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
         matrices, _ = transformed(operator, case)
@@ -256,7 +258,7 @@ def what_it_reads_is_declared(make: Make[Operator]) -> None:
                 np.array_equal(transformed(operator, other)[0], matrices),
                 f"K = {views}: other labels change the matrices, and reads_labels() is False",
             )
-        if not operator.reads_gramians():
+        if isinstance(operator, GramianOperator) and not operator.reads_gramians():
             turned = OperatorCase(case.families, case.gramians[:, ::-1, ::-1], case.context)
             require(
                 np.array_equal(transformed(operator, turned)[0], matrices),

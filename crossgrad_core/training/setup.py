@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block
-from crossgrad_core.contract.component import Selection
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.training.operator_scale import OperatorScale
 
 
@@ -30,7 +30,6 @@ class Setup:
         config: The configuration with every decision filled in.
         scene: The scene.
         selection: The chosen components.
-        densifier: The chosen densifier (also in the selection).
         manager: This run's plugin manager.
         plugins: Every registered plugin by name.
         groups: Label of each training view, or None.
@@ -42,7 +41,6 @@ class Setup:
     config: RunConfig
     scene: Scene
     selection: Selection
-    densifier: Densifier
     manager: pluggy.PluginManager
     plugins: Mapping[str, object]
     groups: tuple[str, ...] | None
@@ -64,6 +62,11 @@ class Setup:
     def operator(self) -> Operator:
         """The operator."""
         return self.selection.operator
+
+    @property
+    def densifier(self) -> Densifier:
+        """The densifier."""
+        return self.selection.densifier
 
     @property
     def rasterizer(self) -> Rasterizer:

@@ -58,7 +58,7 @@ def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
 
 def unwatched(setup: Setup) -> Setup:
     """The same run without observers and wrappers, which must not see steps that do not count."""
-    components = dict(setup.selection.components)
+    components = setup.selection.components
     return replace(setup, manager=make_manager(components), plugins=components)
 
 

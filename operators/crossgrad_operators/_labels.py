@@ -2,11 +2,9 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import cast
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.operator import OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.errors import UserError
 
 
@@ -31,7 +29,7 @@ def label_objections(
 ) -> list[str]:
     """Reasons why views will not carry labels, or not those that options of the operator name."""
     name, sampler = selection.names["operator"], selection.names["sampler"]
-    grouping = cast("Grouping | None", selection.components.get("grouping"))
+    grouping = selection.grouping
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:

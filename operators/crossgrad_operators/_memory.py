@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.operator import OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
 from crossgrad_core.contract.state import PluginState
 
 #: More Gramians than this are those of primitives.

@@ -6,15 +6,17 @@ from typing import Annotated, Any, TypeAlias, cast
 
 from pydantic import BeforeValidator, PlainSerializer
 
-from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
+from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.registry.entries import build, entries
 
 STATE_SEPARATOR = "/"
 
 
-def operator_of(value: object) -> Operator:
+def operator_of(value: object) -> MatrixOperator:
     """An operator from itself, from its name, or from `{name: ..., option: ...}`."""
     if isinstance(value, Operator):
         return _checked(value)
@@ -26,12 +28,12 @@ def operator_of(value: object) -> Operator:
     return _checked(cast("Operator", build("operators", str(value["name"]), options)))
 
 
-def _checked(operator: Operator) -> Operator:
-    if operator.elementwise:
-        raise ValueError(
-            f"{name_of(operator)} works on elements, not on Gramians, and can only stand alone"
+def _checked(operator: Operator) -> MatrixOperator:
+    if not isinstance(operator, MatrixOperator):
+        raise ValueError(  # noqa: TRY004 - pydantic turns it into an error of validation
+            f"{name_of(operator)} needs the gradients themselves, and can only stand alone"
         )
-    if operator.granularity != "tensor":
+    if isinstance(operator, GramianOperator) and operator.granularity != "tensor":
         raise ValueError(
             f"{name_of(operator)} cannot have a granularity of its own here; set it on the whole"
         )
@@ -52,7 +54,14 @@ def plain(operator: Operator) -> dict[str, Any]:
 
 
 #: A field that holds an operator and is written as its name with its options.
-OperatorField: TypeAlias = Annotated[Operator, BeforeValidator(operator_of), PlainSerializer(plain)]
+OperatorField: TypeAlias = Annotated[
+    MatrixOperator, BeforeValidator(operator_of), PlainSerializer(plain)
+]
+
+
+def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
+    """Whether the Gramians make a difference to any of these operators."""
+    return any(isinstance(each, GramianOperator) and each.reads_gramians() for each in operators)
 
 
 def inner_state(state: PluginState, key: str) -> PluginState:
@@ -77,12 +86,9 @@ def outer_state(states: Mapping[str, PluginState]) -> PluginState:
 def inner_objections(selection: Selection, operator: Operator) -> list[str]:
     """What an inner operator objects to in a selection."""
     name = name_of(operator)
-    seen = replace(
-        selection,
-        components={**selection.components, "operator": operator},
-        names={**selection.names, "operator": name},
-    )
-    return list(operator.crossgrad_objections(seen) or ())
+    seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
+    own = getattr(operator, "crossgrad_objections", None)
+    return objections_to_views(operator, seen) + list(own(seen) or () if own else ())
 
 
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
@@ -90,7 +96,7 @@ def inner_idle(selection: Selection, option: str, operators: Iterable[Operator])
     found = [
         f"{name_of(operator)}.{name}: {why}"
         for operator in operators
-        for name, why in operator.set_for_nothing(selection).items()
+        for name, why in set_for_nothing(operator, selection).items()
     ]
     return {option: "; ".join(found)} if found else {}
 

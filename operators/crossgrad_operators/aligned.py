@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 
-class Aligned(Operator):
+class Aligned(GramianOperator):
     """All singular values of the gradient matrix are brought down to its smallest one.
 
     G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above

@@ -7,15 +7,17 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection, ViewCounts
-from crossgrad_core.contract.hooks import hookimpl
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.component import ViewCounts
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._pairs import project, slot_order
 
 
-class Anchors(Operator):
+class Anchors(GramianOperator):
     """`symmetric` between a nearest and a farthest view, `sum` between any others.
 
     Meant for the sampler `anchors-30`: the nearest and the farthest 30 % of the cameras are
@@ -44,8 +46,6 @@ class Anchors(Operator):
         return project(gramians, context, slot_order(gramians.shape[1]), gates=gates), state
 
     @hookimpl
-    @override
     def crossgrad_objections(self, selection: Selection) -> list[str]:
-        """Refuses other than two views, and samplers whose views carry no labels."""
-        counts = Operator.crossgrad_objections(self, selection)
-        return counts + label_objections(selection, {"near": self.near, "far": self.far})
+        """Refuses samplers whose views carry no labels."""
+        return label_objections(selection, {"near": self.near, "far": self.far})

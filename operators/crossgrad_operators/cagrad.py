@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 
-class CAGrad(Operator):
+class CAGrad(GramianOperator):
     """The direction near the mean that serves the worst-off view best.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
@@ -32,12 +33,11 @@ class CAGrad(Operator):
     def reads_gramians(self) -> bool:
         return self.c > 0
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        idle = super().idle_options(selection)
+        """See `HasIdleOptions`."""
         if self.c > 0:
-            return idle
-        return {**idle, "rescale": "it divides by 1 where c = 0; leave it out"}
+            return {}
+        return {"rescale": "it divides by 1 where c = 0; leave it out"}
 
     @override
     def transform(

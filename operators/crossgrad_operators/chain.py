@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.hooks import hookimpl
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_operators._nested import (
@@ -20,13 +21,14 @@ from crossgrad_operators._nested import (
     inner_state,
     name_of,
     outer_state,
+    reads_gramians,
 )
 
 #: Rows of a product that are shorter than this share of their terms are rounding noise.
 _NOISE = 1e-14
 
 
-class Chain(Operator):
+class Chain(GramianOperator):
     """Each link works on what the one before made of the gradients; the last rows are added.
 
     The chain's matrix is the product of its links' matrices; each link sees M Gram M^T, so that no
@@ -41,15 +43,15 @@ class Chain(Operator):
 
     @override
     def reads_gramians(self) -> bool:
-        return any(link.reads_gramians() for link in self.links)
+        return reads_gramians(self.links)
 
     @override
     def reads_labels(self) -> bool:
         return any(link.reads_labels() for link in self.links)
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        return {**super().idle_options(selection), **inner_idle(selection, "links", self.links)}
+        """See `HasIdleOptions`."""
+        return inner_idle(selection, "links", self.links)
 
     @override
     def transform(
@@ -78,7 +80,6 @@ class Chain(Operator):
         return product, outer_state(states)
 
     @hookimpl
-    @override
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """What any link objects to."""
         return [reason for link in self.links for reason in inner_objections(selection, link)]
@@ -94,7 +95,7 @@ def _noise(
     return empty
 
 
-def _reshaped(link: Operator, rows: int, views: int) -> UserError:
+def _reshaped(link: MatrixOperator, rows: int, views: int) -> UserError:
     return UserError(
         f"operator {name_of(link)} cannot be followed by another one",
         expected=f"as many directions as views, {views}",

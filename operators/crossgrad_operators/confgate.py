@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._pairs import project, slot_order
@@ -18,7 +19,7 @@ from crossgrad_operators._pairs import project, slot_order
 _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
-class ConfGate(Operator):
+class ConfGate(GramianOperator):
     """Projects a pair only where it conflicts now and has probably been conflicting for a while.
 
     Mean mu and variance v of the block's cosine are exponential averages (bias-corrected) with
@@ -36,8 +37,8 @@ class ConfGate(Operator):
     beta: float = Field(0.99, ge=0, lt=1, description="decay of the averages per step")
     warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         return {} if self.tau is None else {"preset": "tau wins over it; leave one of the two out"}
 
     @override

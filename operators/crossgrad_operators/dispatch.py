@@ -10,9 +10,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import BlockKind
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.hooks import hookimpl
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._nested import (
     OperatorField,
@@ -21,6 +22,7 @@ from crossgrad_operators._nested import (
     inner_state,
     outer_state,
     plain,
+    reads_gramians,
 )
 from crossgrad_operators.confgate import ConfGate
 from crossgrad_operators.sum import Sum
@@ -49,7 +51,7 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
     return {rule.block: plain(rule.operator) for rule in rules}
 
 
-class Dispatch(Operator):
+class Dispatch(GramianOperator):
     """Each block goes to the operator of its own rule, else of its kind's, else of the preset.
 
     Presets (the paper's two variants): `geometry-confgate` gates the geometry and adds the
@@ -75,18 +77,18 @@ class Dispatch(Operator):
 
     @override
     def reads_gramians(self) -> bool:
-        return any(operator.reads_gramians() for operator in self._operators().values())
+        return reads_gramians(self._operators().values())
 
     @override
     def reads_labels(self) -> bool:
         return any(operator.reads_labels() for operator in self._operators().values())
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         given = self._given(selection)
         ruled = {rule.block for rule in self.rules}
         keys = {self._key(name, kind, ruled) for name, kind in given}
-        idle = dict(super().idle_options(selection))
+        idle: dict[str, str] = {}
         if not keys - ruled:
             idle["preset"] = "the rules serve every block; leave it out"
         if not any(name in _OPACITY and name not in ruled for name, _ in given):
@@ -133,7 +135,6 @@ class Dispatch(Operator):
         return matrices, outer_state(states)
 
     @hookimpl
-    @override
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """What any of the operators objects to, and rules for blocks that do not exist."""
         reasons = [
@@ -152,9 +153,9 @@ class Dispatch(Operator):
                 reasons.append(f"dispatch has a rule for {rule.block!r}; there are {known}")
         return reasons
 
-    def _operators(self) -> dict[str, Operator]:
+    def _operators(self) -> dict[str, MatrixOperator]:
         """Key of a rule -> operator."""
-        presets: dict[str, dict[str, Operator]] = {
+        presets: dict[str, dict[str, MatrixOperator]] = {
             "geometry-confgate": {"geometry": ConfGate(), "appearance": Sum()},
             "geometry-projection": {"geometry": Symmetric(), "appearance": ConfGate()},
         }

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 
-class DualProj(Operator):
+class DualProj(GramianOperator):
     """The mean gradient, projected on the cone that conflicts with no gradient.
 
     v = argmin v^T G v subject to v >= 1/K; u = v G. All active sets for up to four views, Lawson

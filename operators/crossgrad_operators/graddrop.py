@@ -3,50 +3,24 @@
 from collections.abc import Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.errors import UserError
 
 
 class GradDrop(Operator):
-    """In every element either the positive or the negative gradients are kept, by chance.
+    """In every element either the positive or the negative gradients are kept, at random.
 
     With p the sum of the positive and n that of the negative magnitudes, the positive ones are kept
     with probability p / (p + n), else the negative ones; one uniform number per element serves all
-    views. The expectation is `sum`. Works on elements, so that granularity means nothing here.
+    views. The expectation is `sum`.
     """
 
     idle_at_one: ClassVar[bool] = True
-    elementwise: ClassVar[bool] = True
-
-    @override
-    def reads_gramians(self) -> bool:
-        return False
-
-    @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
-        """Refused: signs of elements cannot be told from a Gramian.
-
-        Raises:
-            UserError: Always.
-        """
-        raise UserError(
-            "operator graddrop works on elements, not on Gramians",
-            todo="use it alone, not in a chain or for single blocks",
-        )
 
     @override
     def aggregate(

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.hooks import hookimpl
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
@@ -19,7 +20,7 @@ from crossgrad_operators._weights import weighting
 _Losses = dict[str, dict[str, float]]
 
 
-class GradNorm(Operator):
+class GradNorm(GramianOperator):
     """Weights that let gradient norms follow the relative losses: u = sum w_s g_s over groups s.
 
     G_s = w_s |g_s| should meet mean(G) (l_s / mean l)^alpha, where l_s is the group's average loss
@@ -38,8 +39,8 @@ class GradNorm(Operator):
     def reads_labels(self) -> bool:
         return True
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         if self.alpha > 0:
             return {}
         return dict.fromkeys(("baseline", "decay"), "alpha = 0 looks at no losses; leave it out")
@@ -65,11 +66,9 @@ class GradNorm(Operator):
         return weighting(weights), remember(kept, context, "log_weight", logs)
 
     @hookimpl
-    @override
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """Refuses samplers whose views carry no labels."""
-        counts = Operator.crossgrad_objections(self, selection)
-        return counts + label_objections(selection)
+        return label_objections(selection)
 
     def _followed(
         self,

@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._pairs import random_order
 
 
-class GradVac(Operator):
+class GradVac(GramianOperator):
     """Each gradient is turned towards its partners until their usual cosine is met; u is the sum.
 
     For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of

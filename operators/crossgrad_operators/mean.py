@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
+from crossgrad_core.contract.gramian_operator import MatrixOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators.sum import divided_sum
 
 
-class Mean(Operator):
+class Mean(MatrixOperator):
     """u = (1/K) sum of g_k; K counts all views of the step, also those without a gradient.
 
     Under Adam the same as `sum` up to the optimizer's eps. Needs no separate gradients.
@@ -20,10 +20,6 @@ class Mean(Operator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
-
-    @override
-    def reads_gramians(self) -> bool:
-        return False
 
     @override
     def transform(

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 
-class MGDA(Operator):
+class MGDA(GramianOperator):
     """The shortest convex combination of the gradients: min |sum w_k g_k|, w on the simplex.
 
     Closed form on every face: all supports for up to four views, Wolfe's method above. |u| is at

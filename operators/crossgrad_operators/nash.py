@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
 
-class Nash(Operator):
+class Nash(GramianOperator):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
     Closed form for two views, damped Newton above (decrement 1e-13). |u| would always be sqrt(K);

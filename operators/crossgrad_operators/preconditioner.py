@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import MatrixOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._weights import weighting
 
@@ -13,7 +14,7 @@ from crossgrad_operators._weights import weighting
 _BOUNDS = (1e-2, 1e2)
 
 
-class Preconditioner(Operator):
+class Preconditioner(MatrixOperator):
     """g_k is multiplied by (r_k / r_ref)^d; then the gradients are added.
 
     r_k is the distance of the camera from the mean training camera, r_ref the median of these, and
@@ -24,10 +25,6 @@ class Preconditioner(Operator):
     geometry: float = Field(2.0, description="exponent d for means, scales and rotations")
     appearance: float = Field(1.0, description="exponent d for opacity and colour")
     neutral: float = Field(1.0, description="exponent d for blocks of neither kind")
-
-    @override
-    def reads_gramians(self) -> bool:
-        return False
 
     @override
     def transform(

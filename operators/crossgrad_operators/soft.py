@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._pairs import project, slot_order
 
 
-class Soft(Operator):
+class Soft(GramianOperator):
     """Where cos(g_i, g_j) < -threshold, `strength` times the component along g_j is taken away.
 
     v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 are `symmetric`, strength 0 is
@@ -29,12 +30,11 @@ class Soft(Operator):
     def reads_gramians(self) -> bool:
         return self.strength > 0
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        idle = super().idle_options(selection)
+        """See `HasIdleOptions`."""
         if self.strength > 0:
-            return idle
-        return {**idle, "threshold": "nothing is taken away where strength = 0; leave it out"}
+            return {}
+        return {"threshold": "nothing is taken away where strength = 0; leave it out"}
 
     @override
     def transform(

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
+from crossgrad_core.contract.gramian_operator import MatrixOperator
 from crossgrad_core.contract.state import PluginState
 
 
-class Sum(Operator):
+class Sum(MatrixOperator):
     """u = sum of g_k: what one backward pass through the summed losses gives.
 
     Needs no Gramian and no separate gradients; both ways lead to the same bits.
@@ -19,10 +19,6 @@ class Sum(Operator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
-
-    @override
-    def reads_gramians(self) -> bool:
-        return False
 
     @override
     def transform(

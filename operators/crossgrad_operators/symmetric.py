@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._pairs import project, slot_order
 
 
-class Symmetric(Operator):
+class Symmetric(GramianOperator):
     """Where two gradients conflict, each loses its component along the other; then they are added.
 
     g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1 for m = g_1.g_2 < 0 (paper,

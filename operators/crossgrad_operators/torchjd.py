@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_operators._weights import weighting
@@ -24,7 +25,7 @@ def _pairs(value: object) -> object:
     return tuple(value.items()) if isinstance(value, Mapping) else value
 
 
-class TorchJD(Operator):
+class TorchJD(GramianOperator):
     """w = Weighting(G / trace G), for the weighting classes of torchjd.aggregation.
 
     G is divided by its trace because TorchJD compares it with absolute thresholds; views without a

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.operator import Operator, OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.state import PluginState
 
 
-class UPGrad(Operator):
+class UPGrad(GramianOperator):
     """The mean of the gradients, each projected on the cone that conflicts with no gradient.
 
     For each k: v_k = argmin v^T G v subject to v >= e_k / K; u = sum of the v_k G. Two views: half

@@ -14,9 +14,9 @@ from crossgrad_core.registry.slots import GROUPS
 OPERATOR = """
 import numpy as np
 from pydantic import Field
-from crossgrad_core.plugin import Operator, ViewCounts
+from crossgrad_core.plugin import GramianOperator, ViewCounts
 
-class Halving(Operator):
+class Halving(GramianOperator):
     '''Adds half of every gradient.'''
 
     views = ViewCounts(2, 4)
@@ -197,16 +197,16 @@ def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatc
 
 BROKEN = {
     "raises in a check": (
-        "from crossgrad_core.plugin import Operator\n"
-        "class Halving(Operator):\n"
+        "from crossgrad_core.plugin import GramianOperator\n"
+        "class Halving(GramianOperator):\n"
         "    def transform(self, gramians, context, state, rng):\n"
         "        return gramians.no_such_thing, state\n",
         4,
     ),
     "raises at import": ("import numpy\nnumpy.no_such_thing\n", 2),
     "raises at construction": (
-        "from crossgrad_core.plugin import Field, Operator\n"
-        "class Halving(Operator):\n"
+        "from crossgrad_core.plugin import Field, GramianOperator\n"
+        "class Halving(GramianOperator):\n"
         "    share: float\n"
         "    def transform(self, gramians, context, state, rng):\n"
         "        return gramians, state\n",

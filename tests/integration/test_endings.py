@@ -11,7 +11,7 @@ import pytest
 import torch
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load

@@ -10,7 +10,7 @@ import yaml
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.ply.file import read_ply
 from crossgrad_core.run import app

@@ -20,7 +20,7 @@ from crossgrad_backbones.anchors.volume import mean_volume
 from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.contexts import RegularizeContext, Regularized
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.contract.scene import Camera, Scene
 from crossgrad_core.contract.schedule import Phase

@@ -10,7 +10,7 @@ from crossgrad_backbones.anchors import appearance
 from crossgrad_backbones.anchors.heads import Heads
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
-from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.selection import Selection
 
 _FROZEN = LearningRate(0.0)
 
@@ -45,8 +45,8 @@ class AnchorOptions(Backbone):
     lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
     lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         bank = "there is no feature bank (feature_bank = false); leave it out"
         codes = "photos have no codes (appearance = 0); leave it out"
         return {

@@ -12,7 +12,7 @@ from torch import Tensor
 from crossgrad_core.system.files import sync_file
 
 if TYPE_CHECKING:
-    from crossgrad_core.run.checkpoint.checkpoint import Checkpoint
+    from crossgrad_core.run.checkpoint.contents import Checkpoint
 
 _PLUGIN = "plugin"
 _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")

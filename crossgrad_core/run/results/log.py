@@ -5,7 +5,7 @@ from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
 
 FILE = "log.txt"

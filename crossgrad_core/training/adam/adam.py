@@ -2,47 +2,19 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from crossgrad_core.contract.adam_state import AdamState
-
-#: Added to the root of the second moment (3DGS).
-EPS = 1e-15
-# Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
-# less than 1e-14 of its learning rate, but as they decay they would become subnormal.
-TINY = 1e-30
-# Second moments below float32's smallest normal number count as 0: their root, 1e-19, is nothing
-# against eps = 1e-15, and subnormal numbers are slow on most processors.
-SMALLEST_NORMAL = 2.0**-126
-# Gradients are clamped to this size, because the square of a larger one overflows float32 and an
-# infinite second moment would stop its parameter for good.
-LARGEST = 1e18
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """The numbers of one tensor's step; bias correction is folded in.
-
-    Attributes:
-        beta1: Decay of the first moment.
-        beta2: Decay of the second moment.
-        step_size: Learning rate / (1 - beta1^t).
-        root_scale: 1 / sqrt(1 - beta2^t).
-        eps: Added to the root of the corrected second moment.
-        square_floor: Gradients below it would give a subnormal contribution to the second moment.
-        scale: What the gradient is multiplied by.
-    """
-
-    beta1: float
-    beta2: float
-    step_size: float
-    root_scale: float
-    eps: float
-    square_floor: float
-    scale: float = 1.0
+from crossgrad_core.training.adam.coefficients import (
+    EPS,
+    LARGEST,
+    SMALLEST_NORMAL,
+    TINY,
+    Coefficients,
+)
 
 
 @torch.no_grad()

@@ -4,25 +4,20 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import Operator, OperatorContext, PluginState
+from crossgrad_core.plugin import OperatorContext, Weighting
 
 
-class EqualLength(Operator):
+class EqualLength(Weighting):
     """Brings the K gradients of a block to their mean length, then adds them.
 
     u = sum of (mean length / |g_k|) g_k over the views that have a gradient.
     """
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         present = context.present
         lengths = np.sqrt(np.einsum("bkk->bk", gramians))  # [B, K]
         mean = lengths.sum(axis=1) / np.maximum(present.sum(axis=1), 1)  # [B]
-        weights = np.divide(mean[:, None], lengths, out=np.zeros_like(lengths), where=present)
-        return weights[:, None, :], state
+        return np.divide(mean[:, None], lengths, out=np.zeros_like(lengths), where=present)

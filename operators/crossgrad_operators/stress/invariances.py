@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.gramian_operator import MatrixOperator
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_operators.stress.case import Case, short
@@ -79,7 +80,7 @@ def one_view(operator: Operator) -> float | None:
 
 def size(operator: Operator) -> float | None:
     """A gradient repeated 3,001 times, in whatever chunks, gives the same result repeated."""
-    if operator.elementwise:
+    if not isinstance(operator, MatrixOperator):
         return None
     worst = 0.0
     for views in _counts(operator):
@@ -94,7 +95,7 @@ def size(operator: Operator) -> float | None:
 
 def company(operator: Operator) -> float | None:
     """Other blocks in the same step change no bit of a block's result."""
-    if operator.elementwise:
+    if not isinstance(operator, MatrixOperator):
         return None
     for views in _counts(operator):
         case, circumstances = _rows(views), usual_views(views)

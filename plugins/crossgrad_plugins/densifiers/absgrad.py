@@ -8,7 +8,6 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.screen_statistics import (
     add,
@@ -18,6 +17,7 @@ from crossgrad_core.contract.screen_statistics import (
     sums,
     visible,
 )
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
 
@@ -48,8 +48,8 @@ class AbsGradDensityControl(CloneSplit):
     abs_threshold: float = Field(4e-4, gt=0, description="of ga: abs (splits)")
     gsplat_threshold: float = Field(8e-4, gt=0, description="of ga: gsplat (clones and splits)")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         used = _THRESHOLDS[self.criterion]
         why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave it out"
         return dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)

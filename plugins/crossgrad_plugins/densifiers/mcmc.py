@@ -19,7 +19,7 @@ from crossgrad_core.contract.contexts import (
     Regularized,
 )
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows

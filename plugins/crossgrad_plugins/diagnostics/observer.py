@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field, PrivateAttr
 
 from crossgrad_core.contract.contexts import Model, RunInfo
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 
 if TYPE_CHECKING:

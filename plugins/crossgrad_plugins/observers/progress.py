@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, PrivateAttr
 
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.run.results.lines import (
     Pace,

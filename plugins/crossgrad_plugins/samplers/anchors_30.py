@@ -5,10 +5,11 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.samplers.draws import training_views
@@ -31,16 +32,14 @@ class Anchors30(Sampler):
     default_grouping: ClassVar[str | None] = "anchors"
 
     @hookimpl
-    @override
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """Refuses groups without near and far ones."""
-        reasons = Sampler.crossgrad_objections(self, selection)
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
-            reasons.append(
+            return [
                 "sampler anchors-30 needs groups labelled near and far; grouping "
                 f"{selection.names['grouping']} gives {', '.join(selection.labels)}"
-            )
-        return reasons
+            ]
+        return []
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:

@@ -6,9 +6,10 @@ from typing import ClassVar, cast
 from pydantic import Field, PositiveInt
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import Draw, SampleContext
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_plugins.samplers.draws import Deck, draw
 from crossgrad_plugins.samplers.groups import drawn, groups_of
@@ -38,8 +39,8 @@ class Horizon(Sampler):
         0.6, ge=0.0, le=1.0, description="share of the run that the first stage takes"
     )
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         if 0.0 < self.coarse_share < 1.0:
             return {}
         name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")

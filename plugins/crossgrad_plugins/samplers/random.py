@@ -6,9 +6,10 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import Draw, SampleContext
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.samplers.draws import Deck, Order, draw, training_views
 from crossgrad_plugins.samplers.groups import drawn
@@ -26,8 +27,8 @@ class Random(Sampler):
 
     distinct: bool = Field(False, description="draw K different views, not K independent ones")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         if selection.views_per_step > 1:
             return {}
         return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}

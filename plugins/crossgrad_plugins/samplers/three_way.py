@@ -6,9 +6,10 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import Draw, SampleContext
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
@@ -34,8 +35,8 @@ class ThreeWay(Sampler):
         "epoch: every view once before any comes again",
     )
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         return idle_order(self.order, selection.views_per_step, 3)
 
     @override

@@ -5,13 +5,8 @@ import pytest
 import torch
 
 from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.training.adam.adam import (
-    LARGEST,
-    Coefficients,
-    adam_step,
-    update_reference,
-    update_tensor,
-)
+from crossgrad_core.training.adam.adam import adam_step, update_reference, update_tensor
+from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients
 
 SHAPES = {"means": (50, 3), "f_rest": (50, 15, 3), "opacities": (50,), "empty": (0, 3)}
 RATES = {"means": 1e-2, "f_rest": 1e-3, "opacities": 5e-2, "empty": 1.0}

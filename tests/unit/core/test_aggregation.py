@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from crossgrad_core.contract.aggregation import aggregate_by_gramians
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.gradients.separate import DenseViewGradients
 from crossgrad_core.testing.fixtures import step_fields
@@ -38,7 +38,7 @@ def test_views_without_a_common_element_are_counted_and_added():
         reference_distance=1.0,
         blocks=BLOCKS,
     )
-    aggregated, _ = aggregate_by_gramians(PCGrad(), context, PluginState())
+    aggregated, _ = aggregate_by_gramians(PCGrad(), "tensor", context, PluginState())
     assert dict(aggregated.counts) == {"zero": 0, "disjoint": 1, "dropped": 0, "conflict": 1}
     for name, wanted in sums.items():
         assert torch.equal(aggregated.gradients[name], wanted)

@@ -15,14 +15,8 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint import checkpoint
 from crossgrad_core.run.checkpoint import tensors as checkpoint_tensors
-from crossgrad_core.run.checkpoint.checkpoint import (
-    Checkpoint,
-    drop_later,
-    latest,
-    load,
-    load_latest,
-    save,
-)
+from crossgrad_core.run.checkpoint.checkpoint import drop_later, latest, load, load_latest, save
+from crossgrad_core.run.checkpoint.contents import Checkpoint
 from crossgrad_core.run.checkpoint.folders import Keep
 
 

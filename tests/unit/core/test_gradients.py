@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.aggregation import aggregate_by_gramians
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
+from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
@@ -405,5 +405,5 @@ def test_aggregation_is_what_operators_do_by_default():
         reference_distance=1.0,
         blocks=BLOCKS,
     )
-    direct, _ = aggregate_by_gramians(Symmetric(), context, EMPTY_STATE)
+    direct, _ = aggregate_by_gramians(Symmetric(), "tensor", context, EMPTY_STATE)
     assert all(torch.equal(found.gradients[n], direct.gradients[n]) for n in SHAPES)

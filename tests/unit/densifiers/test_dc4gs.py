@@ -279,8 +279,7 @@ def test_a_run_splits_and_asks_for_directions_only_while_it_needs_them(rasterize
             asked.append("directions" in outputs)
             return super().render(gaussians, camera, background, outputs)
 
-    components = {**setup.selection.components, "rasterizer": Watched()}
-    setup = replace(setup, selection=replace(setup.selection, components=components))
+    setup = replace(setup, selection=replace(setup.selection, rasterizer=Watched()))
     state = first_state(setup)
     records = [timed_step(setup, state) for _ in range(8)]
     assert [record.counts.get("split", 0) > 0 for record in records] == [False, True] * 3 + [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from crossgrad_core.contract.operator import OperatorContext
+from crossgrad_core.contract.contexts import OperatorContext
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.registry.entries import build
 

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from crossgrad_core.contract.state import EMPTY_STATE
-from crossgrad_core.errors import UserError
 from crossgrad_operators.graddrop import GradDrop
 from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import BLOCK, context_of
@@ -47,8 +46,3 @@ def test_views_that_are_not_finite_are_left_out():
     bad = torch.tensor([1.0, float("nan")])
     assert drop(bad, torch.tensor([2.0, -3.0])).tolist() == [2.0, -3.0]
     assert drop(bad, bad) is None
-
-
-def test_it_is_no_gramian_operator():
-    with pytest.raises(UserError, match="elements"):
-        GradDrop().transform(np.eye(2)[None], None, EMPTY_STATE, np.random.default_rng(0))

@@ -1,8 +1,9 @@
 """Operators that need labelled views refuse selections that give none."""
 
 import pytest
+from support.selections import selection_of
 
-from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.objections import objections_to_views
 from crossgrad_core.registry.entries import build
 
 LABELLED = "operator {} needs labelled views; sampler random draws from no groups"
@@ -10,12 +11,15 @@ LABELLED = "operator {} needs labelled views; sampler random draws from no group
 
 def objections(name, sampler, grouping=None, views=2):
     operator = build("operators", name, {})
-    components = {"operator": operator, "sampler": build("samplers", sampler, {})}
-    names = {"operator": name, "sampler": sampler}
-    if grouping is not None:
-        components["grouping"] = build("groupings", grouping, {})
-        names["grouping"] = grouping
-    return operator.crossgrad_objections(Selection(components, names, views, "cpu"))
+    selection = selection_of(
+        operator=operator,
+        sampler=build("samplers", sampler, {}),
+        grouping=None if grouping is None else build("groupings", grouping, {}),
+        names={"operator": name, "sampler": sampler, "grouping": grouping},
+        views_per_step=views,
+    )
+    own = getattr(operator, "crossgrad_objections", lambda _: [])
+    return objections_to_views(operator, selection) + own(selection)
 
 
 @pytest.mark.parametrize("name", ["anchors", "gradnorm"])

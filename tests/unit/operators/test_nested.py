@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from support.selections import selection_of
 
-from crossgrad_core.contract.component import Selection, ViewCounts
+from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
@@ -118,10 +119,9 @@ def selection(operator, views, blocks=()):
         def trained_blocks():
             return blocks
 
-    sampler = build("samplers", "random", {})
-    components = {"operator": operator, "backbone": Backbone(), "sampler": sampler}
-    names = {"operator": "it", "sampler": "random"}
-    return Selection(components, names, views, "cpu")
+    return selection_of(
+        operator=operator, backbone=Backbone(), names={"operator": "it"}, views_per_step=views
+    )
 
 
 def test_objections_of_links_are_passed_on():

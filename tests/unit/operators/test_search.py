@@ -8,7 +8,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.errors import UserError
 from crossgrad_operators.stress.case import short
 from crossgrad_operators.stress.exact import exact_gramian
@@ -67,7 +67,7 @@ class Jumps(Symmetric):
         return matrices * (gramians[:, :1, :1] * 2.0**52 % 2 < 1), state
 
 
-class Absolute(Operator):
+class Absolute(GramianOperator):
     """Compares lengths with a constant."""
 
     def transform(self, gramians, context, state, rng):

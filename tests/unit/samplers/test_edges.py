@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from support.selections import selection_of
 
-from crossgrad_core.contract.component import Selection
+from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
@@ -31,8 +32,8 @@ def scene(cameras):
 
 
 def objections(sampler, name, views):
-    selection = Selection({"sampler": sampler}, {"sampler": name}, views, "cpu")
-    return sampler.crossgrad_objections(selection)
+    selection = selection_of(sampler=sampler, names={"sampler": name}, views_per_step=views)
+    return [reason for reason in objections_to(selection) if f"sampler {name}" in reason]
 
 
 @pytest.mark.parametrize("name", ADMITTED)

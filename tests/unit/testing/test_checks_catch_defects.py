@@ -32,7 +32,7 @@ Radial = load("groupings", "radial")
 NoDensification = load("densifiers", "none")
 
 
-class Adding(api.Operator):
+class Adding(api.GramianOperator):
     """The plain sum, by way of Gramians: every defect is a small change of it."""
 
     def weights(self, gramians, context, rng):

@@ -9,7 +9,7 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import Densified
-from crossgrad_core.contract.hooks import hookimpl
+from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.manager import make_manager

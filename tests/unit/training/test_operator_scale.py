@@ -9,6 +9,7 @@ import torch
 
 from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import Aggregated
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
@@ -41,7 +42,7 @@ def scale_of(operator, views):
     return OperatorScale(operator).of(aggregate_context(sample_gradients(views)))
 
 
-class Fivefold(Operator):
+class Fivefold(GramianOperator):
     """A third party's: the sum times five, in one row."""
 
     asked: ClassVar[list] = []
@@ -54,9 +55,6 @@ class Fivefold(Operator):
 class Halves(Operator):
     """A third party's that works on elements and freezes the network."""
 
-    def transform(self, gramians, context, state, rng):
-        raise AssertionError
-
     def aggregate(self, context, state):
         def half(name, views):
             if name.startswith("net"):
@@ -66,12 +64,12 @@ class Halves(Operator):
         return Aggregated(context.gradients.elementwise(half)), state
 
 
-class Broken(Operator):
+class Broken(GramianOperator):
     def transform(self, gramians, context, state, rng):
         return np.full(gramians.shape, nan if gramians[0, 0, -1] > 0.999 else 1.0), state
 
 
-class Labelled(Operator):
+class Labelled(GramianOperator):
     """Needs one view of each label."""
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -166,9 +164,6 @@ def test_weights_that_are_not_finite_are_refused_by_name():
 
 
 class Overflowing(Operator):
-    def transform(self, gramians, context, state, rng):
-        raise AssertionError
-
     def aggregate(self, context, state):
         return Aggregated({name: torch.tensor([torch.inf]) for name in TENSORS}), state
 

@@ -16,10 +16,6 @@ from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 
 IDLE = [
-    ({"operator": {"name": "sum", "granularity": "gaussian"}}, "operator.granularity"),
-    ({"operator": {"name": "mean", "granularity": "global"}}, "operator.granularity"),
-    ({"operator": {"name": "graddrop", "granularity": "group"}}, "operator.granularity"),
-    ({"operator": {"name": "preconditioner", "granularity": "global"}}, "operator.granularity"),
     (
         {"operator": {"name": "chain", "links": ["mean"], "granularity": "group"}},
         "operator.granularity",
@@ -226,3 +222,9 @@ def test_a_run_that_goes_on_is_not_asked(folders):
         {"scene": str(folders), "steps": 10, "operator": {"name": "sum", "granularity": "global"}}
     )
     set_up(config, -1)
+
+
+@pytest.mark.parametrize("name", ["sum", "mean", "graddrop", "preconditioner"])
+def test_operators_that_look_at_no_gramians_have_no_granularity(name):
+    with pytest.raises(UserError, match="has no option 'granularity'"):
+        build("operators", name, {"granularity": "gaussian"})

@@ -11,9 +11,9 @@ from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
 from crossgrad_backbones.anchors.growth.anchor_growing import Level, grown
 from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
 from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.component import Selection
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.selection import Selection
 
 
 class AnchorControl(AnchorDensifier):
@@ -26,8 +26,8 @@ class AnchorControl(AnchorDensifier):
     coarsest: int = Field(16, ge=1, description="edge of the coarsest cell, voxels")
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
 
-    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
         if self.levels > 1:
             return {}
         why = "there is one size of cells (levels = 1); leave it out"

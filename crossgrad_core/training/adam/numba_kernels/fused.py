@@ -7,7 +7,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel, parallel_kernel
-from crossgrad_core.training.adam.adam import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
+from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
 

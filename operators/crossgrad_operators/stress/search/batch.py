@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_operators.stress.reference import Views
@@ -62,7 +63,7 @@ def search_views(count: int, seed: int = 0) -> Views:
 
 def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
     """[B, P] what an operator makes of each case; NaN where it raises an error."""
-    if not operator.elementwise:
+    if isinstance(operator, GramianOperator):
         operator = operator.model_copy(update={"granularity": "gaussian"})
     return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))
 

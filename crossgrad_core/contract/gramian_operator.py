@@ -1,21 +1,107 @@
-"""From the gradients of K views to one, by way of Gramians: what all Gramian operators share."""
+"""Operators that see the gradients of K views through their dot products only."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block, BlockKind
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.gradients import ViewGradients
-from crossgrad_core.contract.operator import Granularity, Operator, OperatorContext
+from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
+from crossgrad_core.contract.gradients import Granularity, ViewGradients
+from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 
 
+class MatrixOperator(Operator):
+    """Replaces the K gradients G of each block by M G and adds the rows of M G.
+
+    It can be a link of a chain and serve single blocks.
+    """
+
+    @abstractmethod
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        """The matrices M.
+
+        Args:
+            gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.
+            context: See `OperatorContext`.
+            state: What this operator returned last.
+            rng: The only source of random numbers.
+
+        Returns:
+            [B, R, K] float64 matrices M (R is the operator's choice) and the new state. A chain of
+            operators multiplies them: the next link sees M Gram M^T.
+        """
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[Aggregated, PluginState]:
+        return aggregate_by_gramians(self, "tensor", context, state)
+
+
+class GramianOperator(MatrixOperator):
+    """An operator whose matrices depend on the Gramians.
+
+    Attributes:
+        granularity: What one Gramian covers: each block's tensors, all geometry / all appearance
+            blocks, everything, or each Gaussian's row of a block.
+    """
+
+    granularity: Granularity = Field("tensor", description="what one Gramian covers")
+
+    def reads_gramians(self) -> bool:
+        """Whether the Gramians make a difference with these options; else granularity does not."""
+        return True
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[Aggregated, PluginState]:
+        return aggregate_by_gramians(self, self.granularity, context, state)
+
+
+class Weighting(GramianOperator):
+    """A Gramian operator that gives each view one weight per block, from this step alone."""
+
+    @abstractmethod
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
+        """[B, K] float64 weights of the K gradients; their weighted sum is the result.
+
+        Args:
+            gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.
+            context: See `OperatorContext`.
+        """
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        return self.weights(gramians, context)[:, None, :], state
+
+
 def aggregate_by_gramians(
-    operator: Operator, context: AggregateContext, state: PluginState
+    operator: MatrixOperator,
+    granularity: Granularity,
+    context: AggregateContext,
+    state: PluginState,
 ) -> tuple[Aggregated, PluginState]:
     """One pass for the Gramians of all blocks, one small solve, one pass for the weighted sums.
 
@@ -27,7 +113,7 @@ def aggregate_by_gramians(
     Raises:
         UserError: The operator answered with weights that are not finite.
     """
-    gradients, granularity = context.gradients, operator.granularity
+    gradients = context.gradients
     gramians = gradients.gramians(granularity)
     present = gradients.present(granularity)
     given = operator_context(context, granularity, present)

@@ -1,0 +1,90 @@
+"""What holds for all components of a slot: what cannot work together, options that do nothing."""
+
+from collections.abc import Iterator, Mapping
+
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.gramian_operator import GramianOperator
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.selection import HasIdleOptions, Selection
+
+
+def objections_to(selection: Selection) -> list[str]:
+    """Why the selection cannot work, whoever wrote its components."""
+    return [
+        *_of_the_sampler(selection),
+        *objections_to_views(selection.operator, selection),
+        *_of_the_densifier(selection),
+        *_of_the_rasterizer(selection),
+    ]
+
+
+def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
+    """Numbers of views for which the operator, named as the selection's, means nothing."""
+    if operator.views.admits(selection.views_per_step):
+        return []
+    name = selection.names["operator"]
+    return [f"operator {name} needs {operator.views}; K = {selection.views_per_step} was asked for"]
+
+
+def _of_the_sampler(selection: Selection) -> Iterator[str]:
+    sampler, views, labels = selection.sampler, selection.views_per_step, selection.labels
+    name = selection.names["sampler"]
+    if not sampler.view_counts.admits(views):
+        yield f"sampler {name} needs {sampler.view_counts}; K = {views} was asked for"
+    if sampler.groups is not None and labels is not None and len(labels) != sampler.groups:
+        yield (
+            f"sampler {name} draws from {sampler.groups} groups; grouping "
+            f"{selection.names['grouping']} gives {len(labels)}: {', '.join(labels)}"
+        )
+
+
+def _of_the_densifier(selection: Selection) -> Iterator[str]:
+    densifier, names = selection.densifier, selection.names
+    have = {tensor for block in selection.backbone.blocks() for tensor in block.tensors}
+    if missing := sorted(densifier.blocks - have):
+        yield (
+            f"densifier {names['densifier']} edits the tensors {', '.join(missing)}, "
+            f"which backbone {names['backbone']} does not have"
+        )
+    if missing := sorted(densifier.needs - selection.rasterizer.provides):
+        yield (
+            f"densifier {names['densifier']} needs the screen statistics {', '.join(missing)}, "
+            f"which rasterizer {names['rasterizer']} does not provide"
+        )
+
+
+def _of_the_rasterizer(selection: Selection) -> Iterator[str]:
+    rasterizer, backbone, names = selection.rasterizer, selection.backbone, selection.names
+    if selection.device not in rasterizer.devices:
+        yield f"rasterizer {names['rasterizer']} does not run on device {selection.device}"
+    if backbone.response not in rasterizer.responses:
+        yield (
+            f"rasterizer {names['rasterizer']} does not draw the pixel response "
+            f"{backbone.response} of backbone {names['backbone']}"
+        )
+
+
+def idle_options(component: Component, selection: Selection) -> Mapping[str, str]:
+    """Options of a component that would change nothing: name -> why, and the way out."""
+    idle: dict[str, str] = {}
+    if isinstance(component, GramianOperator) and not component.reads_gramians():
+        idle["granularity"] = "this operator looks at no Gramians; leave it out"
+    if isinstance(component, Rasterizer) and selection.backbone.own_dilation:
+        name = selection.names["backbone"]
+        idle["dilation"] = f"backbone {name} has a dilation of its own; leave it out"
+    if isinstance(component, HasIdleOptions):
+        idle |= component.idle_options(selection)
+    return idle
+
+
+def set_for_nothing(component: Component, selection: Selection) -> dict[str, str]:
+    """The idle options that were set to something else than their default."""
+    fields = type(component).model_fields
+    return {
+        name: why
+        for name, why in idle_options(component, selection).items()
+        if name in component.model_fields_set
+        and name in fields
+        and getattr(component, name) != fields[name].default
+    }

@@ -1,0 +1,68 @@
+"""The chosen components of a run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.sampler import Sampler
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen components of a run, for objections.
+
+    Attributes:
+        backbone: The backbone.
+        sampler: The sampler.
+        operator: The operator.
+        densifier: The densifier.
+        rasterizer: The rasterizer.
+        names: Slot (singular word, `reader` included) -> name under which the component was chosen.
+        views_per_step: K.
+        device: Torch device type.
+        grouping: The grouping; None where the views have no groups.
+        labels: Labels that training views have by the grouping; None where it is not known yet, or
+            where there is no grouping.
+    """
+
+    backbone: Backbone
+    sampler: Sampler
+    operator: Operator
+    densifier: Densifier
+    rasterizer: Rasterizer
+    names: Mapping[str, str]
+    views_per_step: int
+    device: str
+    grouping: Grouping | None = None
+    labels: tuple[str, ...] | None = None
+
+    @property
+    def components(self) -> dict[str, Component]:
+        """Slot (singular word) -> component, of the slots that are filled."""
+        filled: dict[str, Component | None] = {
+            "backbone": self.backbone,
+            "sampler": self.sampler,
+            "operator": self.operator,
+            "densifier": self.densifier,
+            "rasterizer": self.rasterizer,
+            "grouping": self.grouping,
+        }
+        return {slot: each for slot, each in filled.items() if each is not None}
+
+
+@runtime_checkable
+class HasIdleOptions(Protocol):
+    """A component that knows which of its options would change nothing."""
+
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """Options that would change nothing in this selection: name -> why, and the way out.
+
+        A new run is refused where the user has set one of them to something else than its default.
+        """
+        ...
