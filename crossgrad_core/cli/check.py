@@ -5,7 +5,7 @@ from textwrap import fill
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.slots import GROUPS, OFFERED
 from crossgrad_core.testing.checking import Result, check_entry
 from crossgrad_core.wording import did_you_mean, sentences, singular
 
@@ -46,7 +46,7 @@ def _entries_of(package: str) -> list[registry.Entry]:
     Raises:
         UserError: See `check_package`.
     """
-    offered = [entry for slot in GROUPS for entry in registry.offers(slot)]
+    offered = [entry for slot in OFFERED for entry in registry.offers(slot)]
     found = [entry for entry in offered if package in _names_of(entry)]
     found = found or [
         entry for entry in offered if _normalized(package) == _normalized(entry.distribution)

@@ -10,6 +10,8 @@ from pydantic.fields import FieldInfo
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.commands import load_command, summary
+from crossgrad_core.registry.slots import COMMANDS
 from crossgrad_core.wording import listed, singular
 
 _WIDTH = 80
@@ -37,15 +39,28 @@ def describe(entry: registry.Entry) -> str:
     Raises:
         UserError: The plugin cannot be loaded.
     """
+    if entry.slot == COMMANDS:
+        return _described_command(entry)
     component = registry.load_entry(entry)
     parts = [
-        f"{singular(entry.slot)} {entry.name}, from {entry.distribution} {entry.version}\n"
-        f"{_MARGIN}{entry.value}",
+        _heading(entry),
         indent(_prose(inspect.getdoc(component) or "No description."), _MARGIN),
         "\n".join(f"{_MARGIN}{label}: {text}" for label, text in _traits(component)),
         _options(entry, component),
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def _heading(entry: registry.Entry) -> str:
+    word = singular(entry.slot)
+    return f"{word} {entry.name}, from {entry.distribution} {entry.version}\n{_MARGIN}{entry.value}"
+
+
+def _described_command(entry: registry.Entry) -> str:
+    """A command in words; its options are its own help's."""
+    load_command(entry)
+    hint = f"`crossgrad {entry.name} --help` explains its options"
+    return "\n\n".join([_heading(entry), indent(_prose(f"{summary(entry)}\n\n{hint}"), _MARGIN)])
 
 
 def _prose(docstring: str) -> str:

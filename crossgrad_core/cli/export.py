@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.startup import announce
+from crossgrad_core.system.startup import announce
 
 
 class Format(StrEnum):

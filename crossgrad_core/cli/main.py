@@ -9,18 +9,18 @@ from typer.main import get_command
 
 from crossgrad_core import __version__
 from crossgrad_core.cli import evaluate, export, plugins, render, run
-from crossgrad_core.cli.grouped import GroupedCommand
-from crossgrad_core.cli.startup import finish
+from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.errors import UserError
-from crossgrad_operators.stress import cli as stress
-from crossgrad_plugins.diagnostics import cli as diagnose
+from crossgrad_core.system.grouped import GroupedCommand
+from crossgrad_core.system.startup import finish
 
 #: Exit status after bad input.
 BAD_INPUT = 2
 
 app = typer.Typer(
     name="crossgrad",
+    cls=WithPlugins,
     help="Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts.",
     epilog="Example: crossgrad run SCENE --sampler near-far --operator symmetric",
     rich_markup_mode=None,
@@ -55,16 +55,6 @@ app.command("run", cls=GroupedCommand)(run.run)
 app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
 app.command("render", cls=GroupedCommand)(render.render)
 app.command("export", cls=GroupedCommand)(export.export)
-app.command(
-    "diagnose",
-    cls=GroupedCommand,
-    short_help="Measure a scene: camera regimes, gradient conflict, variance.",
-)(diagnose.diagnose)
-app.command(
-    "stress",
-    cls=GroupedCommand,
-    short_help="Hold operators against exact arithmetic on extreme gradients.",
-)(stress.stress)
 app.add_typer(plugins.app, name="plugins")
 
 

@@ -4,10 +4,10 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.grouped import GroupedCommand
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.slots import COMMANDS, OFFERED, OWN_COMMANDS
+from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.wording import did_you_mean, listed, sentences
 
 app = typer.Typer(
@@ -18,7 +18,7 @@ app = typer.Typer(
 
 SlotOption = Annotated[
     str | None,
-    typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(GROUPS)}."),
+    typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(OFFERED)}."),
 ]
 
 
@@ -31,7 +31,7 @@ def plugins(context: typer.Context) -> None:
 
 @app.command("list", cls=GroupedCommand)
 def list_plugins(slot: SlotOption = None) -> None:
-    """Show the installed plugins by slot."""
+    """Show the installed plugins by slot, and the commands that they add."""
     for each in _slots(slot):
         typer.echo(each)
         typer.echo("\n".join(_rows(registry.offers(each))) or "  none installed")
@@ -83,13 +83,13 @@ def check(
 
 def _slots(slot: str | None) -> tuple[str, ...]:
     if slot is None:
-        return tuple(GROUPS)
-    plural = slot if slot in GROUPS else f"{slot}s"
-    if plural not in GROUPS:
+        return tuple(OFFERED)
+    plural = slot if slot in OFFERED else f"{slot}s"
+    if plural not in OFFERED:
         raise UserError(
             f"there is no slot named {slot!r}",
-            expected=f"one of {listed(GROUPS)}",
-            todo=sentences(did_you_mean(slot, GROUPS), "leave --slot out to see all of them"),
+            expected=f"one of {listed(OFFERED)}",
+            todo=sentences(did_you_mean(slot, OFFERED), "leave --slot out to see all of them"),
         )
     return (plural,)
 
@@ -99,7 +99,10 @@ def _rows(offers: tuple[registry.Entry, ...]) -> list[str]:
     width = max((len(name) for name in names), default=0)
     rows = []
     for entry in offers:
-        twice = "  offered twice: runs that ask for it are refused"
-        note = twice if names.count(entry.name) > 1 else ""
+        note = ""
+        if names.count(entry.name) > 1:
+            note = "  offered twice: it is refused where it is asked for"
+        if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
+            note = "  never called: the core has a command of that name"
         rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
     return rows

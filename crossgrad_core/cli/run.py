@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from crossgrad_core.cli.resuming import refuse_beside_resume
-from crossgrad_core.cli.startup import announce
+from crossgrad_core.system.startup import announce
 
 _PARTS = "Components (`crossgrad plugins list` shows the names)"
 _TRAINING = "Training"

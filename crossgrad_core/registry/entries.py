@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.places import raised_at
-from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, OFFERED
 from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Entry:
 
     Attributes:
         name: Name that users type.
-        slot: Slot that it fills, a key of `GROUPS`.
+        slot: Slot that it fills, or `commands`: a key of `OFFERED`.
         value: Where its class is: `module:Class`.
         distribution: Name of the distribution that offers it.
         version: Version of that distribution.
@@ -114,19 +114,28 @@ def load(slot: str, name: str) -> "type[Component]":
 
 def load_entry(entry: Entry) -> "type[Component]":
     """The class that an entry points at; see `load`."""
+    return _checked(entry, resolve_entry(entry))
+
+
+def resolve_entry(entry: Entry) -> object:
+    """Whatever an entry points at; imports its module.
+
+    Raises:
+        UserError: It cannot be imported.
+    """
     try:
-        found = _resolve(entry.value)
+        return _resolve(entry.value)
     except UserError:
         raise
     except Exception as error:
         place = raised_at(error, entry.package)
+        others = COMMANDS if entry.slot == COMMANDS else "runs"
         raise UserError(
             f"{singular(entry.slot)} {entry.name} cannot be imported",
             where=sentences(entry.origin, place),
             found=in_one_line(error),
-            todo=f"repair or uninstall {entry.distribution}; other runs are not affected",
+            todo=f"repair or uninstall {entry.distribution}; other {others} are not affected",
         ) from error
-    return _checked(entry, found)
 
 
 def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
@@ -161,7 +170,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     # One unfiltered call: each one scans every installed distribution.
     points = entry_points()
     found: dict[str, tuple[Entry, ...]] = {}
-    for slot, group in GROUPS.items():
+    for slot, group in OFFERED.items():
         described = (
             Entry(point.name, slot, point.value, *_identity(point.dist))
             for point in points.select(group=group)

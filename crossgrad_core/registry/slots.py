@@ -16,3 +16,9 @@ GROUPS: Final[dict[str, str]] = {
         "observers",
     )
 }
+#: What packages offer as commands of `crossgrad`; no slot of a run.
+COMMANDS: Final = "commands"
+#: Everything that packages can offer -> entry-point group.
+OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
+#: The core's own commands, which no plugin replaces.
+OWN_COMMANDS: Final = ("run", "eval", "render", "export", "plugins")

@@ -9,7 +9,9 @@ from unittest import SkipTest
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.commands import load_command
 from crossgrad_core.registry.places import defined_at, raised_at
+from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
 from crossgrad_core.wording import in_one_line, singular
 
 #: `check(make)`, see `crossgrad_core.testing.contract`; of any slot.
@@ -43,15 +45,22 @@ def checks_of(slot: str) -> tuple[AnyCheck, ...]:
 def check_entry(entry: registry.Entry) -> list[Result]:
     """Loads a plugin and runs every check of its slot; stops early where it cannot be loaded."""
     try:
-        component = registry.load_entry(entry)
+        loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
         where = raised_at(error, entry.package) or _announced_at(entry)
         return [Result("it can be loaded", failure=f"{error.found or error.what}", where=where)]
-    try:
-        component()
-    except Exception as error:
-        return [_failed("it can be made with default options", error, component)]
-    return [_result(check, component) for check in checks_of(entry.slot)]
+    if entry.slot == COMMANDS:
+        where, package = _announced_at(entry), entry.package
+        if entry.name in OWN_COMMANDS:
+            taken = f"the core has a command {entry.name}, which is called instead"
+            return [Result("its name is free", failure=taken, where=entry.origin)]
+    else:
+        where, package = defined_at(loaded), loaded.__module__.partition(".")[0]
+        try:
+            loaded()
+        except Exception as error:
+            return [_failed("it can be made with default options", error, package, where)]
+    return [_result(check, loaded, package, where) for check in checks_of(entry.slot)]
 
 
 def _announced_at(entry: registry.Entry) -> str:
@@ -64,19 +73,20 @@ def _announced_at(entry: registry.Entry) -> str:
     return own or getattr(loaded, "__file__", None) or entry.origin
 
 
-def _failed(check: str, error: Exception, component: type) -> Result:
-    where = raised_at(error, component.__module__.partition(".")[0]) or defined_at(component)
+def _failed(check: str, error: Exception, package: str, where: str) -> Result:
+    """A failure at the innermost line of the package, or else at `where`."""
+    where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
         return Result(check, str(error) or "an assertion without a text failed", where=where)
     return Result(check, in_one_line(error), where=where)
 
 
-def _result(check: AnyCheck, component: type) -> Result:
+def _result(check: AnyCheck, subject: object, package: str, where: str) -> Result:
     name = check.__name__.replace("_", " ")
     try:
-        check(component)
+        check(subject)
     except SkipTest as reason:
         return Result(name, skipped=str(reason))
     except Exception as error:
-        return _failed(name, error, component)
+        return _failed(name, error, package, where)
     return Result(name)

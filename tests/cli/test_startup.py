@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from crossgrad_core.cli import startup
+from crossgrad_core.system import startup
 
 #: Notes the processor seconds and the heavy modules at the first line, and ends.
 FIRST_LINE = """

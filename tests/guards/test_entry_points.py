@@ -9,12 +9,15 @@ import pytest
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.commands import load_command
+from crossgrad_core.registry.slots import COMMANDS, GROUPS
+from crossgrad_core.testing.checking import checks_of
 
 SHELVES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
 OURS = [
     entry for slot in GROUPS for entry in registry.offers(slot) if entry.distribution == "crossgrad"
 ]
+COMMANDS_OF_OURS = [each for each in registry.offers(COMMANDS) if each.distribution == "crossgrad"]
 
 
 @pytest.mark.parametrize("entry", OURS, ids=lambda entry: f"{entry.slot}-{entry.name}")
@@ -28,6 +31,13 @@ def test_each_entry_point_loads(entry):
 def test_each_name_is_easy_to_type(entry):
     assert entry.name.replace("-", "").isalnum()
     assert entry.name == entry.name.lower()
+
+
+@pytest.mark.parametrize("entry", COMMANDS_OF_OURS, ids=lambda entry: entry.name)
+def test_each_command_loads_from_a_shelf(entry):
+    assert load_command(entry).__module__.partition(".")[0] in SHELVES
+    for check in checks_of(COMMANDS):
+        check(load_command(entry))
 
 
 @pytest.mark.parametrize("shelf", SHELVES)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
-from crossgrad_core.cli.startup import announce
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.startup import announce
 
 if TYPE_CHECKING:
     import torch
@@ -100,7 +100,10 @@ def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         typer.Option(min=0, metavar="N", help="Seed of --search and --matrices. Default: 0."),
     ] = None,
 ) -> None:
-    """Hold operators against 50-digit arithmetic; exit status 1 if one breaks its promise."""
+    """Hold operators against exact arithmetic on extreme gradients.
+
+    Results are compared with 50 digits; exit status 1 if an operator breaks its promise.
+    """
     announce()
     modes = {"--search": search, "--matrices": matrices, "--rows": rows}
     given = {"--case": case, "--elements": elements, "--type": precision, "--seed": seed}

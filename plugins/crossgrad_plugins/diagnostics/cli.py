@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.startup import announce
+from crossgrad_core.system.startup import announce
 
 _PROBE = "Probe"
 _MODEL = "Model"
@@ -113,10 +113,11 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
     ] = None,
 ) -> None:
-    """Measure a scene: camera regimes, gradient conflict, variance within and between groups.
+    """Measure a scene: camera regimes, gradient conflict, variance.
 
     Trains a short vanilla run (or takes --run), probes the gradients of single views at frozen
-    parameters, and writes CSV files and a picture.
+    parameters, and writes CSV files and a picture. The variance is split into the part within
+    groups of views and the part between them.
     """
     announce()
     from crossgrad_plugins.diagnostics import app

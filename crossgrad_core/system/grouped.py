@@ -2,15 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-import typer
 from typer.core import TyperCommand
 from typing_extensions import override
 
 if TYPE_CHECKING:
     from typer._click import Context, HelpFormatter
-
-#: Exit status after an interrupt from the keyboard: 128 + SIGINT.
-INTERRUPTED = 130
 
 
 class GroupedCommand(TyperCommand):
@@ -31,12 +27,3 @@ class GroupedCommand(TyperCommand):
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
-
-    @override
-    def invoke(self, ctx: "Context") -> object:
-        """Runs the command; an interrupt ends it with the status that shells expect."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            typer.echo("interrupted", err=True)
-            raise typer.Exit(INTERRUPTED) from None

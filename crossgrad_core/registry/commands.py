@@ -1,0 +1,86 @@
+"""Commands by name: described without importing them, imported when they are called."""
+
+import ast
+import inspect
+from collections.abc import Callable
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import typer
+from typer.main import get_command
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import Entry, resolve_entry
+from crossgrad_core.system.grouped import GroupedCommand
+
+if TYPE_CHECKING:
+    from typer import _click as click
+
+#: What an entry point in the group `crossgrad.commands` names.
+Command: TypeAlias = "typer.Typer | Callable[..., Any]"
+
+
+def load_command(entry: Entry) -> Command:
+    """The typer app or function that an entry point names; imports its module.
+
+    Raises:
+        UserError: It cannot be imported, or is something else.
+    """
+    found = resolve_entry(entry)
+    if isinstance(found, typer.Typer) or inspect.isfunction(found):
+        return found
+    raise UserError(
+        f"command {entry.name} cannot be used",
+        where=entry.origin,
+        expected="a typer.Typer, or a function with typer's annotations",
+        found=repr(found),
+        todo=f"repair or uninstall {entry.distribution}",
+    )
+
+
+def as_group_member(command: Command, name: str) -> "click.Command":
+    """The command as `crossgrad` calls it.
+
+    Args:
+        command: A typer app, or a function; of a function, the help groups its options.
+        name: Name that users type.
+    """
+    if not isinstance(command, typer.Typer):
+        app = typer.Typer(rich_markup_mode=None, add_completion=False)
+        app.command(name, cls=GroupedCommand)(command)
+        return get_command(app)
+    return get_command(command)
+
+
+def summary(entry: Entry) -> str:
+    """What a command does, in the first line of its docstring, or of its module's.
+
+    The source is read, not run; where there is none, the line says who offers the command.
+    """
+    module, _, name = entry.value.partition(":")
+    try:
+        tree = ast.parse(_source(module.strip()))
+    except (OSError, ValueError, SyntaxError):
+        return f"from {entry.distribution} {entry.version}"
+    functions = [each for each in tree.body if isinstance(each, ast.FunctionDef)]
+    own = [ast.get_docstring(each) for each in functions if each.name == name.strip()]
+    text = (own and own[0]) or ast.get_docstring(tree)
+    return text.splitlines()[0] if text else f"from {entry.distribution} {entry.version}"
+
+
+def _source(module: str) -> bytes:
+    """The source of a module; unlike `importlib.util.find_spec` this imports no parent package.
+
+    Raises:
+        FileNotFoundError: There is none.
+    """
+    parts = module.split(".")
+    path: list[str] | None = None
+    spec = None
+    for count in range(1, len(parts) + 1):
+        spec = PathFinder.find_spec(".".join(parts[:count]), path)
+        if spec is None:
+            raise FileNotFoundError(module)
+        path = list(spec.submodule_search_locations or ())
+    return Path((spec and spec.origin) or module).read_bytes()
