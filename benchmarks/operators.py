@@ -26,11 +26,12 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
-from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.gradients import SeparateGradients
 from crossgrad_core.contract.gramian_operator import MatrixOperator, operator_context
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE
-from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build, entries
 
@@ -153,18 +154,18 @@ def _least(
     return least
 
 
-def _apart(gradients: list[dict[str, Tensor]]) -> ViewGradients:
-    return DenseViewGradients(gradients, BLOCKS, overwrite=True)
+def _apart(gradients: list[dict[str, Tensor]]) -> SeparateGradients:
+    return DenseGradients(gradients, BLOCKS, overwrite=True)
 
 
-def _accumulated(gradients: list[dict[str, Tensor]]) -> ViewGradients:
-    total = AccumulatedGradients.empty(BLOCKS, len(gradients))
+def _accumulated(gradients: list[dict[str, Tensor]]) -> SeparateGradients:
+    total = SummedGradients.empty(BLOCKS, len(gradients))
     for view in gradients:
         total.add(view)
     return total
 
 
-def _context(gradients: ViewGradients) -> AggregateContext:
+def _context(gradients: SeparateGradients) -> AggregateContext:
     views = gradients.views
     return AggregateContext(
         step=1,
@@ -186,8 +187,8 @@ def _arithmetic(operator: Operator, views: int) -> float | None:
     if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))
-    gramians = context.gradients.gramians("tensor")
-    given = operator_context(context, "tensor", context.gradients.present("tensor"))
+    gramians = context.gradients.gramians("block")
+    given = operator_context(context, "block", context.gradients.present("block"))
     rng = np.random.default_rng(0)
     state = EMPTY_STATE
 

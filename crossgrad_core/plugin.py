@@ -29,7 +29,7 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.contract.gradients import Granularity, ViewGradients
+from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
 from crossgrad_core.contract.marks import hookimpl
@@ -100,13 +100,13 @@ __all__ = [
     "Schedule",
     "Screen",
     "Selection",
+    "SeparateGradients",
     "Similarity",
     "StepContext",
     "StepRecord",
     "UserError",
     "View",
     "ViewCounts",
-    "ViewGradients",
     "ViewRecord",
     "Weighting",
     "hookimpl",

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
 from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.gradients import Gradients, SeparateGradients
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
@@ -19,7 +20,6 @@ from crossgrad_core.contract.topology import Edit, NoEdit
 if TYPE_CHECKING:
     from crossgrad_core.contract.adam_state import AdamState
     from crossgrad_core.contract.backbone import Backbone
-    from crossgrad_core.contract.gradients import ViewGradients
     from crossgrad_core.contract.rasterizer import Rasterizer
 
 
@@ -142,7 +142,7 @@ class AggregateContext(StepContext):
     """For `crossgrad_aggregate_gradients`.
 
     Attributes:
-        gradients: The gradients of the K views, opaque.
+        gradients: The gradients of the K views: apart where the operator or a plugin asks for it.
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
         distances: [K] float64 distance of each camera from the mean training camera, local units.
@@ -150,12 +150,26 @@ class AggregateContext(StepContext):
         blocks: The blocks, in the order of every Gramian's first dimension.
     """
 
-    gradients: "ViewGradients"
+    gradients: Gradients
     losses: NDArray[np.float64]
     labels: tuple[str, ...] | None
     distances: NDArray[np.float64]
     reference_distance: float
     blocks: tuple[Block, ...]
+
+    @property
+    def separate(self) -> SeparateGradients:
+        """The gradients, of each view by itself.
+
+        Raises:
+            TypeError: They were accumulated, because nobody said that single views matter.
+        """
+        if isinstance(self.gradients, SeparateGradients):
+            return self.gradients
+        raise TypeError(
+            "the views' gradients were accumulated and only their sum is known; an operator or "
+            "plugin that looks at single views must say so with `separate = True`"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,17 +7,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import override
 
 #: What one Gramian covers: each block, all blocks of a kind, everything, each Gaussian of a block.
-Granularity = Literal["tensor", "group", "global", "gaussian"]
+Granularity = Literal["block", "kind", "global", "gaussian"]
 #: K tensors (None where a view does not touch the tensor) -> one tensor or None.
 Elementwise = Callable[[str, Sequence[Tensor | None]], Tensor | None]
 
 
-class ViewGradients(ABC):
-    """The gradients of the K views of one step, block by block.
+class Gradients(ABC):
+    """The gradients of one step, block by block, whether views are kept apart or not.
 
-    Dense tensors today; the interface leaves room for sparse ones.
+    A view that is not finite for a block is left out of it.
     """
 
     @property
@@ -26,8 +27,34 @@ class ViewGradients(ABC):
         """K."""
 
     @abstractmethod
+    def present(self) -> NDArray[np.bool_]:
+        """[B, K], views whose gradient of the block is finite and not exactly zero."""
+
+    @abstractmethod
+    def finite(self) -> NDArray[np.bool_]:
+        """[B, K], views whose gradient of the block is finite."""
+
+    @abstractmethod
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        """Tensor name -> plain sum in the order of the views (the bits of accumulation).
+
+        Args:
+            divisor: What the sums are then divided by; K gives the mean without a further pass.
+
+        Returns:
+            None for tensors that no view touches, or whose views are all non-finite.
+        """
+
+
+class SeparateGradients(Gradients):
+    """The gradients of the K views of one step, each of them known: opaque to operators.
+
+    Dense tensors today; the interface leaves room for sparse ones.
+    """
+
+    @abstractmethod
     def names(self, granularity: Granularity) -> tuple[str, ...]:
-        """[B] name of the block (or group) that each Gramian belongs to."""
+        """[B] name of the block (or kind) that each Gramian belongs to."""
 
     @property
     @abstractmethod
@@ -45,12 +72,14 @@ class ViewGradients(ABC):
         Takes ten times as long as the Gramians.
         """
 
+    @override
     @abstractmethod
-    def present(self, granularity: Granularity) -> NDArray[np.bool_]:
+    def present(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
         """[B, K], views whose gradient is finite and not exactly zero."""
 
+    @override
     @abstractmethod
-    def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
+    def finite(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
         """[B, K], views whose gradient is finite."""
 
     @abstractmethod
@@ -69,14 +98,6 @@ class ViewGradients(ABC):
 
         Returns:
             None for tensors that no view touches, or whose views are all non-finite.
-        """
-
-    @abstractmethod
-    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        """Tensor name -> plain sum in the order of the views (the bits of accumulation).
-
-        Args:
-            divisor: What the sums are then divided by; K gives the mean without a further pass.
         """
 
     @abstractmethod

@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block, BlockKind
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
-from crossgrad_core.contract.gradients import Granularity, ViewGradients
+from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
@@ -48,7 +48,7 @@ class MatrixOperator(Operator):
     def aggregate(
         self, context: AggregateContext, state: PluginState
     ) -> tuple[Aggregated, PluginState]:
-        return aggregate_by_gramians(self, "tensor", context, state)
+        return aggregate_by_gramians(self, "block", context, state)
 
 
 class GramianOperator(MatrixOperator):
@@ -59,7 +59,7 @@ class GramianOperator(MatrixOperator):
             blocks, everything, or each Gaussian's row of a block.
     """
 
-    granularity: Granularity = Field("tensor", description="what one Gramian covers")
+    granularity: Granularity = Field("block", description="what one Gramian covers")
 
     def reads_gramians(self) -> bool:
         """Whether the Gramians make a difference with these options; else granularity does not."""
@@ -113,7 +113,7 @@ def aggregate_by_gramians(
     Raises:
         UserError: The operator answered with weights that are not finite.
     """
-    gradients = context.gradients
+    gradients = context.separate
     gramians = gradients.gramians(granularity)
     present = gradients.present(granularity)
     given = operator_context(context, granularity, present)
@@ -138,7 +138,7 @@ def operator_context(
     context: AggregateContext, granularity: Granularity, present: NDArray[np.bool_]
 ) -> OperatorContext:
     """What a Gramian operator may know, from what the seam is offered."""
-    names = context.gradients.names(granularity)
+    names = context.separate.names(granularity)
     return OperatorContext(
         step=context.step,
         blocks=names,
@@ -148,8 +148,8 @@ def operator_context(
         distances=context.distances,
         reference_distance=context.reference_distance,
         present=present,
-        unit=context.gradients.unit,
-        remainders=partial(context.gradients.remainders, granularity),
+        unit=context.separate.unit,
+        remainders=partial(context.separate.remainders, granularity),
     )
 
 
@@ -166,7 +166,7 @@ def _kinds(names: Sequence[str], blocks: Sequence[Block]) -> tuple[BlockKind, ..
 
 
 def _counts(
-    gradients: ViewGradients,
+    gradients: SeparateGradients,
     granularity: Granularity,
     gramians: NDArray[np.float64],
     present: NDArray[np.bool_],

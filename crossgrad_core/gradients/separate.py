@@ -12,13 +12,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
-from crossgrad_core.contract.gradients import Elementwise, Granularity, ViewGradients
+from crossgrad_core.contract.gradients import Elementwise, Granularity, SeparateGradients
 from crossgrad_core.gradients import exact, generic, native
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
 from crossgrad_core.gradients.squares import column_gramians, column_remainders
-from crossgrad_core.gradients.summed import AccumulatedGradients
-
-__all__ = ["AccumulatedGradients", "DenseViewGradients"]
 
 KINDS: Final = ("geometry", "appearance", "neutral")
 
@@ -36,7 +33,7 @@ class Groups:
     of_tensor: NDArray[np.int64]
 
 
-class DenseViewGradients(ViewGradients):
+class DenseGradients(SeparateGradients):
     """The gradients of K views, one dense tensor per view and parameter tensor.
 
     Gramians are accumulated in float64 (see `column_gramians` for gradients beyond its range).
@@ -106,13 +103,13 @@ class DenseViewGradients(ViewGradients):
         return self._lost[granularity]
 
     @override
-    def present(self, granularity: Granularity) -> NDArray[np.bool_]:
+    def present(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
         squares = _diagonal(self._raw(granularity))
         present: NDArray[np.bool_] = np.isfinite(squares) & (squares > 0)
         return present
 
     @override
-    def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
+    def finite(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
         return _finite(self._raw(granularity))
 
     @override
@@ -140,13 +137,13 @@ class DenseViewGradients(ViewGradients):
 
     @override
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        finite = self.finite("tensor")
-        of_tensor = self._groups("tensor").of_tensor
+        finite = self.finite("block")
+        of_tensor = self._groups("block").of_tensor
         return self._combine(finite.astype(np.float64)[of_tensor], finite[of_tensor], divisor)
 
     @override
     def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
-        finite = self.finite("tensor")[self._groups("tensor").of_tensor]
+        finite = self.finite("block")[self._groups("block").of_tensor]
         self._require_unspent()
         return {
             name: function(name, _selected(column, keep))
@@ -179,7 +176,7 @@ class DenseViewGradients(ViewGradients):
 
     def _grouping(self, granularity: Granularity) -> Groups:
         counts = [len(block.tensors) for block in self._blocks]
-        if granularity == "tensor":
+        if granularity == "block":
             places = np.arange(len(self._blocks))
             return Groups(tuple(block.name for block in self._blocks), np.repeat(places, counts))
         if granularity == "global":
@@ -198,7 +195,7 @@ class DenseViewGradients(ViewGradients):
         if granularity == "gaussian":
             return self._row_squares()
         groups = self._groups(granularity)
-        if len(groups.names) == len(self._tensors) and granularity == "tensor":
+        if len(groups.names) == len(self._tensors) and granularity == "block":
             return self._squares
         raw = np.zeros((len(groups.names), self._views, self._views))
         # Infinities of both signs may meet; the sum is then rightly not a number.

@@ -1,7 +1,7 @@
 """The running sum of the gradients of K views, for operators that do not need them apart."""
 
 from collections.abc import Mapping, Sequence
-from typing import NoReturn, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +9,12 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
-from crossgrad_core.contract.gradients import Elementwise, Granularity, ViewGradients
-from crossgrad_core.gradients.columns import unit_roundoff
+from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.gradients.plain import plain_sums
 from crossgrad_core.gradients.squares import column_gramians
 
 
-class AccumulatedGradients(ViewGradients):
+class SummedGradients(Gradients):
     """The sum of K views' gradients in the order of the views; single views are not kept.
 
     Either given as a whole (one backward pass of a joint loss) or built view by view from `empty`
@@ -76,13 +75,8 @@ class AccumulatedGradients(ViewGradients):
         return self._views
 
     @override
-    def names(self, granularity: Granularity) -> tuple[str, ...]:
-        self._require_blocks(granularity)
-        return tuple(block.name for block in self._blocks)
-
-    @override
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        """See `ViewGradients.total`.
+        """See `Gradients.total`.
 
         Raises:
             RuntimeError: The sum was already divided by something else.
@@ -98,41 +92,12 @@ class AccumulatedGradients(ViewGradients):
         return dict(zip(self._sum, plain_sums(columns, divisor, keep=True), strict=True))
 
     @override
-    def finite(self, granularity: Granularity) -> NDArray[np.bool_]:
-        self._require_blocks(granularity)
+    def finite(self) -> NDArray[np.bool_]:
         return np.stack(self._finite, axis=1)
 
     @override
-    def present(self, granularity: Granularity) -> NDArray[np.bool_]:
-        self._require_blocks(granularity)
+    def present(self) -> NDArray[np.bool_]:
         return np.stack(self._present, axis=1)
-
-    @property
-    @override
-    def unit(self) -> float:
-        return unit_roundoff([list(self._sum.values())])
-
-    @override
-    def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
-        self._refuse()
-
-    @override
-    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
-        self._refuse()
-
-    @override
-    def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
-        self._refuse()
-
-    @override
-    def combine(
-        self, weights: NDArray[np.float64], granularity: Granularity
-    ) -> Mapping[str, Tensor | None]:
-        self._refuse()
-
-    @override
-    def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
-        self._refuse()
 
     def _judged(
         self, view: Mapping[str, Tensor | None]
@@ -157,17 +122,6 @@ class AccumulatedGradients(ViewGradients):
         for block, kept in zip(self._blocks, finite, strict=True):
             if not kept:
                 self._sum |= dict.fromkeys(block.tensors)
-
-    def _require_blocks(self, granularity: Granularity) -> None:
-        if granularity != "tensor":
-            self._refuse()
-
-    @staticmethod
-    def _refuse() -> NoReturn:
-        raise RuntimeError(
-            "the views' gradients were accumulated and only their sum is known; an operator or "
-            "plugin that looks at single views must say so with `separate = True`"
-        )
 
 
 def _contiguous(gradient: Tensor | None) -> Tensor | None:

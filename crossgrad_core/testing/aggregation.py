@@ -10,7 +10,7 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.testing.contract import (
     Check,
     Make,
@@ -56,7 +56,7 @@ def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggre
     rng = np.random.default_rng(views)
     return AggregateContext(
         **step_fields(),
-        gradients=DenseViewGradients(gradients, BLOCKS),
+        gradients=DenseGradients(gradients, BLOCKS),
         losses=rng.uniform(0.05, 0.3, views),
         labels=tuple(("near", "far")[view % 2] for view in range(views)),
         distances=rng.uniform(0.2, 1.0, views),

@@ -187,7 +187,7 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
     for views in admitted(operator.views):
         with global_randomness_untouched():
             one, one_state = transformed(operator, operator_case(views))
-            other, other_state = transformed(make(), operator_case(views))
+            other, other_state = transformed(_matrix_operator(make), operator_case(views))
         require(np.array_equal(one, other), f"K = {views}: two calls with one seed differ")
         require(same_state(one_state, other_state), f"K = {views}: two calls leave two states")
 

@@ -11,7 +11,7 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def neutral(context: AggregateContext) -> AggregateContext:
         step=1,
         states={},
         rng=np.random.default_rng(0),
-        gradients=DenseViewGradients([unit] * views, context.blocks),
+        gradients=DenseGradients([unit] * views, context.blocks),
         losses=np.ones(views),
         distances=np.full(views, context.reference_distance),
     )

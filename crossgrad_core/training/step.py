@@ -30,8 +30,8 @@ from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import (
-    Gradients,
     Rendered,
+    TensorGradients,
     add_regularization,
     joined,
     photo_of,
@@ -50,7 +50,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     rendered = render_views(setup, state, draw)
     context = _aggregate_context(setup, state, draw, rendered)
     aggregated = _aggregate(setup, state, context)
-    of_step: Gradients = {}
+    of_step: TensorGradients = {}
     if setup.regularizes:
         add_regularization(setup, state, of_step)
     scale = setup.operator_scale.of(context)
@@ -104,7 +104,7 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 
 def _finish(
-    setup: Setup, state: TrainState, rendered: Rendered, gradients: Gradients, scale: Scale
+    setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> Mapping[str, int]:
     """Optimizer, density control and `after_step` in the order of the preset."""
     state.touched = True
@@ -123,7 +123,7 @@ def _finish(
     return edit.counts if isinstance(edit, Edit) else {}
 
 
-def _optimize(setup: Setup, state: TrainState, gradients: Gradients, scale: Scale) -> None:
+def _optimize(setup: Setup, state: TrainState, gradients: TensorGradients, scale: Scale) -> None:
     progress = state.step / setup.schedule.lr_steps
     blocks = setup.trained_blocks
     rates = {name: block.lr.at(progress) for block in blocks for name in block.tensors}
@@ -205,7 +205,7 @@ def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
     )
 
 
-def _check_finite(state: TrainState, rendered: Rendered, gradients: Gradients) -> None:
+def _check_finite(state: TrainState, rendered: Rendered, gradients: TensorGradients) -> None:
     for name, gradient in gradients.items():
         # A finite sum proves that all are finite up to cancelling infinities, which give NaN;
         # only an overflow of the sum itself needs the second, slower look.

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import Draw, Model, RegularizeContext, ViewRecord
 from crossgrad_core.contract.gaussians import Gaussians, Render
-from crossgrad_core.contract.gradients import ViewGradients
+from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.scene import View
-from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_core.training.operator_scale import Scale
@@ -22,7 +23,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 #: Tensor name -> gradient or None.
-Gradients = dict[str, Tensor | None]
+TensorGradients = dict[str, Tensor | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class Rendered:
     """
 
     records: tuple[ViewRecord, ...]
-    gradients: ViewGradients
-    regular: Gradients
+    gradients: Gradients
+    regular: TensorGradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +57,11 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     Raises:
         NonFiniteError: A loss is not finite.
     """
-    regular: Gradients = {}
+    regular: TensorGradients = {}
     if setup.joint:
         return _render_jointly(setup, state, draw, regular)
     records, per_view = [], []
-    total = AccumulatedGradients.empty(setup.trained_blocks, len(draw.views))
+    total = SummedGradients.empty(setup.trained_blocks, len(draw.views))
     _clear(state.parameters)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot)
@@ -75,11 +76,13 @@ def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
     if not setup.separate:
         return Rendered(tuple(records), total, regular)
     # Nobody looks at single views after they are combined, unless a plugin says so.
-    apart = DenseViewGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
+    apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(tuple(records), apart, regular)
 
 
-def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradients) -> Rendered:
+def _render_jointly(
+    setup: Setup, state: TrainState, draw: Draw, regular: TensorGradients
+) -> Rendered:
     """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
     _clear(state.parameters)
     drawn = [_draw_view(setup, state, draw, slot) for slot in range(len(draw.views))]
@@ -88,7 +91,7 @@ def _render_jointly(setup: Setup, state: TrainState, draw: Draw, regular: Gradie
     _backward(torch.stack([view.loss for view in drawn]).sum())
     state.counters.backward_passes += 1
     records = tuple(view.record for view in drawn)
-    total = AccumulatedGradients(_take(state.parameters), setup.trained_blocks, len(records))
+    total = SummedGradients(_take(state.parameters), setup.trained_blocks, len(records))
     return Rendered(records, total, regular)
 
 
@@ -161,7 +164,7 @@ def model_of(setup: Setup, state: TrainState) -> Model:
     )
 
 
-def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Gradients) -> None:
+def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: TensorGradients) -> None:
     if setup.regularizes:
         add_regularization(setup, state, into, drawn.gaussians, drawn.record.view)
 
@@ -169,7 +172,7 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Gradi
 def add_regularization(
     setup: Setup,
     state: TrainState,
-    into: Gradients,
+    into: TensorGradients,
     gaussians: Gaussians | None = None,
     view: View | None = None,
 ) -> None:
@@ -191,7 +194,7 @@ def add_regularization(
         _add(into, _gradients_of(answer.loss, state.parameters, keep=gaussians is not None))
 
 
-def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool) -> Gradients:
+def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool) -> TensorGradients:
     wanted = {name: t for name, t in parameters.items() if t.requires_grad}
     if not loss.requires_grad:
         return {}
@@ -199,7 +202,7 @@ def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool)
     return dict(zip(wanted, found, strict=True))
 
 
-def _add(into: Gradients, more: Mapping[str, Tensor | None]) -> None:
+def _add(into: TensorGradients, more: Mapping[str, Tensor | None]) -> None:
     for name, gradient in more.items():
         if gradient is not None:
             have = into.get(name)
@@ -207,8 +210,11 @@ def _add(into: Gradients, more: Mapping[str, Tensor | None]) -> None:
 
 
 def joined(
-    gradients: Mapping[str, Tensor | None], of_views: Gradients, of_step: Gradients, scale: Scale
-) -> Gradients:
+    gradients: Mapping[str, Tensor | None],
+    of_views: TensorGradients,
+    of_step: TensorGradients,
+    scale: Scale,
+) -> TensorGradients:
     """The aggregated gradients with those of the regularisation terms added.
 
     They follow the operator's scale c(K), so that the terms weigh as much against the photometric
@@ -227,7 +233,7 @@ def joined(
     return result
 
 
-def _times(gradients: Gradients, factors: Mapping[str, float]) -> Gradients:
+def _times(gradients: TensorGradients, factors: Mapping[str, float]) -> TensorGradients:
     """The gradients by their tensors' factors; none where the factor is 0."""
     return {
         name: gradient if factors[name] == 1.0 else gradient * factors[name]
@@ -247,7 +253,7 @@ def _clear(parameters: Mapping[str, Tensor]) -> None:
         tensor.grad = None
 
 
-def _take(parameters: Mapping[str, Tensor]) -> Gradients:
+def _take(parameters: Mapping[str, Tensor]) -> TensorGradients:
     taken = {name: tensor.grad for name, tensor in parameters.items() if tensor.requires_grad}
     _clear(parameters)
     return taken

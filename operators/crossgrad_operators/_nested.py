@@ -33,7 +33,7 @@ def _checked(operator: Operator) -> MatrixOperator:
         raise ValueError(  # noqa: TRY004 - pydantic turns it into an error of validation
             f"{name_of(operator)} needs the gradients themselves, and can only stand alone"
         )
-    if isinstance(operator, GramianOperator) and operator.granularity != "tensor":
+    if isinstance(operator, GramianOperator) and operator.granularity != "block":
         raise ValueError(
             f"{name_of(operator)} cannot have a granularity of its own here; set it on the whole"
         )

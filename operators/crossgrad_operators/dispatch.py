@@ -106,7 +106,7 @@ class Dispatch(GramianOperator):
     def _given(self, selection: Selection) -> list[tuple[str, BlockKind]]:
         """Name and kind of what a Gramian covers."""
         blocks = [(block.name, block.kind) for block in selection.backbone.trained_blocks()]
-        if self.granularity != "group":
+        if self.granularity != "kind":
             return blocks
         kinds = {kind for _, kind in blocks}
         return [(kind, kind) for kind in _KINDS if kind in kinds]

@@ -26,8 +26,8 @@ class GradDrop(Operator):
     def aggregate(
         self, context: AggregateContext, state: PluginState
     ) -> tuple[Aggregated, PluginState]:
-        gradients = context.gradients
-        finite, present = gradients.finite("tensor"), gradients.present("tensor")
+        gradients = context.separate
+        finite, present = gradients.finite(), gradients.present()
         seed = int(context.rng.integers(2**63))
         generators: dict[torch.device, torch.Generator] = {}
 

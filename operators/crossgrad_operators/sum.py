@@ -45,7 +45,7 @@ def divided_sum(context: AggregateContext, divisor: int) -> Aggregated:
     because it is not finite (`dropped`).
     """
     gradients = context.gradients
-    finite, present = gradients.finite("tensor"), gradients.present("tensor")
+    finite, present = gradients.finite(), gradients.present()
     counts = {
         "zero": int((finite & ~present).any(axis=1).sum()),
         "dropped": int((~finite).any(axis=1).sum()),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import BlockKind
 from crossgrad_core.contract.contexts import Model
-from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.training.loss.loss import photometric_loss
 
 #: Bytes that the gradients of all probed views may take together.
@@ -71,12 +71,12 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
     gradients = [factors.of(_gradients(model, view, names)) for view in views]
     finite = [all(bool(torch.isfinite(g).all()) for g in each.values()) for each in gradients]
     kept = [each for each, good in zip(gradients, finite, strict=True) if good]
-    dense = DenseViewGradients(kept, blocks)
-    plain, overlap = dense.gramians("tensor"), dense.overlap("tensor")
+    dense = DenseGradients(kept, blocks)
+    plain, overlap = dense.gramians("block"), dense.overlap("block")
     adam = None
     if model.adam.exp_avg_sq:
         _divide_by_adam(model, factors, kept)
-        adam = DenseViewGradients(kept, blocks).gramians("tensor")
+        adam = DenseGradients(kept, blocks).gramians("block")
     train_views = model.scene.train_views
     return Measurement(
         step=model.phase.step,

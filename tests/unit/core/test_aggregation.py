@@ -7,7 +7,7 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.testing.fixtures import step_fields
 from crossgrad_operators.pcgrad import PCGrad
 
@@ -31,14 +31,14 @@ def test_views_without_a_common_element_are_counted_and_added():
     sums = {name: one[name] + other[name] for name in ("apart", "crossed")}
     context = AggregateContext(
         **step_fields(),
-        gradients=DenseViewGradients([one, other], BLOCKS, overwrite=True),
+        gradients=DenseGradients([one, other], BLOCKS, overwrite=True),
         losses=np.ones(2),
         labels=None,
         distances=np.ones(2),
         reference_distance=1.0,
         blocks=BLOCKS,
     )
-    aggregated, _ = aggregate_by_gramians(PCGrad(), "tensor", context, PluginState())
+    aggregated, _ = aggregate_by_gramians(PCGrad(), "block", context, PluginState())
     assert dict(aggregated.counts) == {"zero": 0, "disjoint": 1, "dropped": 0, "conflict": 1}
     for name, wanted in sums.items():
         assert torch.equal(aggregated.gradients[name], wanted)

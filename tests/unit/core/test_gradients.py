@@ -10,7 +10,8 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.separate import AccumulatedGradients, DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.entries import build
 from crossgrad_operators.sum import Sum
 from crossgrad_operators.symmetric import Symmetric
@@ -23,10 +24,10 @@ BLOCKS = (
     Block("mlp", ("mlp.0", "mlp.1"), False, "neutral", RATE),
 )
 SHAPES = {"means": (50, 3), "scales": (50, 3), "opacities": (50, 1), "mlp.0": (7, 5), "mlp.1": (5,)}
-GRANULARITIES = ("tensor", "group", "global", "gaussian")
+GRANULARITIES = ("block", "kind", "global", "gaussian")
 TENSORS = {
-    "tensor": [["means"], ["scales"], ["opacities"], ["mlp.0", "mlp.1"]],
-    "group": [["means", "scales"], ["opacities"], ["mlp.0", "mlp.1"]],
+    "block": [["means"], ["scales"], ["opacities"], ["mlp.0", "mlp.1"]],
+    "kind": [["means", "scales"], ["opacities"], ["mlp.0", "mlp.1"]],
     "global": [list(SHAPES)],
 }
 
@@ -64,10 +65,10 @@ def naive_gramian(views, names):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 16])
-@pytest.mark.parametrize("granularity", ["tensor", "group", "global"])
+@pytest.mark.parametrize("granularity", ["block", "kind", "global"])
 def test_gramians_and_sums_against_the_obvious_way(granularity, count, dtype):
     views = make_views(count, dtype)
-    gradients = DenseViewGradients(views, BLOCKS)
+    gradients = DenseGradients(views, BLOCKS)
     expected = np.stack([naive_gramian(views, names) for names in TENSORS[granularity]])
     np.testing.assert_allclose(gradients.gramians(granularity), expected, rtol=1e-12, atol=1e-11)
     weights = np.random.default_rng(1).standard_normal((len(expected), count))
@@ -84,7 +85,7 @@ def test_gramians_and_sums_against_the_obvious_way(granularity, count, dtype):
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_rows_of_primitives(count, dtype):
     views = make_views(count, dtype)
-    gradients = DenseViewGradients(views, BLOCKS)
+    gradients = DenseGradients(views, BLOCKS)
     names, found = gradients.names("gaussian"), gradients.gramians("gaussian")
     assert names == ("means",) * 50 + ("scales",) * 50 + ("opacities",) * 50 + ("mlp",)
     rows = torch.stack([v["scales"].double() for v in views], dim=1)
@@ -103,7 +104,7 @@ def copied(view):
 
 
 def accumulation(views):
-    gradients = AccumulatedGradients.empty(BLOCKS, len(views))
+    gradients = SummedGradients.empty(BLOCKS, len(views))
     for view in views:
         gradients.add(copied(view))
     return gradients
@@ -119,11 +120,11 @@ def test_accumulation_and_separate_gradients_give_the_same_bits(count, dtype):
         for name, g in view.items():
             if g is not None:
                 grown[name] = g.clone() if grown[name] is None else grown[name].add_(g)
-    separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
+    separate = aggregate(Sum(), DenseGradients(views, BLOCKS))
     together = aggregate(Sum(), accumulation(views))
     assert separate.counts == together.counts
     weights = np.ones((len(BLOCKS), count))
-    weighted = DenseViewGradients(views, BLOCKS).combine(weights, "tensor")
+    weighted = DenseGradients(views, BLOCKS).combine(weights, "block")
     for name, expected in grown.items():
         for found in (separate.gradients, together.gradients, weighted):
             if expected is None:
@@ -141,7 +142,7 @@ def test_a_non_finite_view_is_dropped_alike_by_both_ways():
         "mlp.0": views[1]["mlp.0"] + views[2]["mlp.0"],
         "mlp.1": views[1]["mlp.1"] + views[2]["mlp.1"],
     }
-    separate = aggregate(Sum(), DenseViewGradients(views, BLOCKS))
+    separate = aggregate(Sum(), DenseGradients(views, BLOCKS))
     together = aggregate(Sum(), accumulation(views))
     for found in (separate, together):
         assert found.counts == {"zero": 0, "dropped": 2}
@@ -153,13 +154,13 @@ def test_blocks_without_a_finite_view_are_left_out():
     views = make_views(2)
     for view in views:
         view["means"][0, 0] = float("inf")
-    joint = AccumulatedGradients({n: views[0][n] + views[1][n] for n in SHAPES}, BLOCKS, 2)
-    for gradients in (DenseViewGradients(views, BLOCKS), joint):
+    joint = SummedGradients({n: views[0][n] + views[1][n] for n in SHAPES}, BLOCKS, 2)
+    for gradients in (DenseGradients(views, BLOCKS), joint):
         found = aggregate(Sum(), gradients)
         assert found.gradients["means"] is None
         assert found.gradients["scales"] is not None
         assert found.counts["dropped"] == 1
-    projected = aggregate(Symmetric(), DenseViewGradients(views, BLOCKS))
+    projected = aggregate(Symmetric(), DenseGradients(views, BLOCKS))
     assert projected.gradients["means"] is None
     assert projected.counts["dropped"] == 1
 
@@ -170,13 +171,13 @@ def test_what_a_view_does_not_touch_counts_as_zero(granularity):
     zero = [views[0], {**views[1], "opacities": torch.zeros(50, 1)}]
     absent = [views[0], {n: g for n, g in views[1].items() if n != "opacities"}]
     operator = Symmetric(granularity=granularity)
-    one = aggregate(operator, DenseViewGradients(zero, BLOCKS))
-    other = aggregate(operator, DenseViewGradients(absent, BLOCKS))
+    one = aggregate(operator, DenseGradients(zero, BLOCKS))
+    other = aggregate(operator, DenseGradients(absent, BLOCKS))
     assert one.counts == other.counts
     for name in SHAPES:
         assert torch.equal(one.gradients[name], other.gradients[name])
     nowhere = [{**v, "opacities": None} for v in views]
-    assert aggregate(operator, DenseViewGradients(nowhere, BLOCKS)).gradients["opacities"] is None
+    assert aggregate(operator, DenseGradients(nowhere, BLOCKS)).gradients["opacities"] is None
 
 
 def test_events_are_counted():
@@ -186,7 +187,7 @@ def test_events_are_counted():
     one["scales"][:25], two["scales"][25:] = 1.0, 1.0
     one |= {"mlp.0": torch.ones(7, 5), "mlp.1": torch.ones(5)}
     two |= {"mlp.0": torch.full((7, 5), float("nan")), "mlp.1": torch.ones(5)}
-    found = aggregate(Symmetric(), DenseViewGradients([one, two], BLOCKS))
+    found = aggregate(Symmetric(), DenseGradients([one, two], BLOCKS))
     assert found.counts == {"zero": 1, "disjoint": 1, "dropped": 1, "conflict": 1}
     assert torch.equal(found.gradients["scales"], one["scales"] + two["scales"])
 
@@ -195,10 +196,10 @@ def test_a_product_of_zero_is_no_proof_of_disjoint_support():
     one = {"means": torch.ones(50, 3)}
     two = {"means": torch.ones(50, 3)}
     two["means"][:, 0], two["means"][:, 1] = -1.0, 0.0
-    gradients = DenseViewGradients([one, two], BLOCKS)
-    assert gradients.gramians("tensor")[0, 0, 1] == 0
-    assert gradients.overlap("tensor")[0, 0, 1]
-    assert not DenseViewGradients([one, {}], BLOCKS).overlap("tensor")[0, 0, 1]
+    gradients = DenseGradients([one, two], BLOCKS)
+    assert gradients.gramians("block")[0, 0, 1] == 0
+    assert gradients.overlap("block")[0, 0, 1]
+    assert not DenseGradients([one, {}], BLOCKS).overlap("block")[0, 0, 1]
     rows = gradients.overlap("gaussian")
     assert rows[:50, 0, 1].all()
 
@@ -209,7 +210,7 @@ def test_overlap_of_rows(dtype):
     one[:, 0] = 1
     two[::2, 0], two[::2, 1], one[::2, 1] = 1, -1, 1
     two[1::2, 2] = 1
-    gradients = DenseViewGradients([{"means": one}, {"means": two}], BLOCKS)
+    gradients = DenseGradients([{"means": one}, {"means": two}], BLOCKS)
     assert not gradients.gramians("gaussian")[:50, 0, 1].any()
     assert gradients.overlap("gaussian")[:50, 0, 1].tolist() == [True, False] * 25
 
@@ -223,11 +224,11 @@ def test_threads_and_chunks_change_no_bit(views):
     try:
         for threads in (1, before):
             numba.set_num_threads(threads)
-            gradients = DenseViewGradients(big, BLOCKS[:1])
+            gradients = DenseGradients(big, BLOCKS[:1])
             weights = np.linspace(-1, 2, views)[None]
             rows = gradients.gramians("gaussian")
-            combined = gradients.combine(weights, "tensor")["means"]
-            results.append((gradients.gramians("tensor"), rows, combined))
+            combined = gradients.combine(weights, "block")["means"]
+            results.append((gradients.gramians("block"), rows, combined))
     finally:
         numba.set_num_threads(before)
     for one, other in zip(*results, strict=True):
@@ -256,8 +257,8 @@ def test_one_core_and_all_cores_give_the_same_bits():
 def test_overwriting_gives_the_same_bits_and_can_be_done_once(granularity, views):
     operator = Symmetric(granularity=granularity)
     kept = make_views(views)
-    expected = aggregate(operator, DenseViewGradients(kept, BLOCKS))
-    gradients = DenseViewGradients(make_views(views), BLOCKS, overwrite=True)
+    expected = aggregate(operator, DenseGradients(kept, BLOCKS))
+    gradients = DenseGradients(make_views(views), BLOCKS, overwrite=True)
     found = aggregate(operator, gradients)
     for name in SHAPES:
         assert torch.equal(found.gradients[name], expected.gradients[name])
@@ -271,28 +272,28 @@ def test_gradients_of_any_layout():
     views = make_views(2)
     turned = [{**v, "mlp.0": v["mlp.0"].T.contiguous().T, "means": v["means"]} for v in views]
     assert not turned[0]["mlp.0"].is_contiguous()
-    one, other = (DenseViewGradients(v, BLOCKS).gramians("tensor") for v in (views, turned))
+    one, other = (DenseGradients(v, BLOCKS).gramians("block") for v in (views, turned))
     np.testing.assert_array_equal(one, other)
 
 
 def test_float64_far_outside_the_range_of_products():
     views = [{"means": torch.full((50, 3), 1e200, dtype=torch.float64)} for _ in range(2)]
     views[1]["means"][:, 0] *= -4
-    gradients = DenseViewGradients(views, BLOCKS[:1])
-    gramian = gradients.gramians("tensor")[0]
+    gradients = DenseGradients(views, BLOCKS[:1])
+    gramian = gradients.gramians("block")[0]
     assert np.isfinite(gramian).all()
     cosine = gramian[0, 1] / np.sqrt(gramian[0, 0] * gramian[1, 1])
     assert cosine == pytest.approx(-2 / np.sqrt(3 * 18))
     found = aggregate(Symmetric(), gradients).gradients["means"]
     assert bool(torch.isfinite(found).all())
-    assert gradients.present("tensor").all()
+    assert gradients.present("block").all()
 
 
 def test_no_gaussians_at_all():
     views = [{"means": torch.zeros(0, 3)} for _ in range(2)]
     for granularity in GRANULARITIES:
         operator = Symmetric(granularity=granularity)
-        found = aggregate(operator, DenseViewGradients(views, BLOCKS[:1]))
+        found = aggregate(operator, DenseGradients(views, BLOCKS[:1]))
         assert found.gradients["means"].shape == (0, 3)
 
 
@@ -305,28 +306,17 @@ def test_elementwise_sees_the_views_that_count():
         seen[name] = [g is not None for g in gradients]
         return next(g for g in gradients if g is not None)
 
-    found = DenseViewGradients(views, BLOCKS).elementwise(first)
+    found = DenseGradients(views, BLOCKS).elementwise(first)
     assert seen["means"] == [False, True]
     assert seen["scales"] == [True, True]
     assert torch.equal(found["means"], views[1]["means"])
 
 
-@pytest.mark.parametrize(
-    "look",
-    [
-        lambda g: g.gramians("tensor"),
-        lambda g: g.overlap("tensor"),
-        lambda g: g.combine(np.ones((4, 2)), "tensor"),
-        lambda g: g.elementwise(lambda _, views: views[0]),
-        lambda g: g.present("group"),
-    ],
-)
-def test_accumulated_gradients_do_not_pretend_to_know_single_views(look):
+def test_accumulated_gradients_are_refused_where_single_views_are_looked_at():
     gradients = accumulation(make_views(2))
     assert gradients.views == 2
-    assert gradients.names("tensor") == ("means", "scales", "opacities", "mlp")
-    with pytest.raises(RuntimeError, match="separate = True"):
-        look(gradients)
+    with pytest.raises(TypeError, match="separate = True"):
+        aggregate(Symmetric(), gradients)
 
 
 def test_weights_that_are_not_finite_are_refused_with_the_operator_and_the_block():
@@ -335,14 +325,14 @@ def test_weights_that_are_not_finite_are_refused_with_the_operator_and_the_block
             return np.full(gramians.shape, np.nan), state
 
     with pytest.raises(UserError, match="Divides"):
-        aggregate(Divides(), DenseViewGradients(make_views(2), BLOCKS))
+        aggregate(Divides(), DenseGradients(make_views(2), BLOCKS))
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("name", ["symmetric", "cagrad", "gradvac", "confgate", "nash", "dispatch"])
 def test_operators_take_every_granularity(name, granularity):
     operator = build("operators", name, {"granularity": granularity})
-    found = aggregate(operator, DenseViewGradients(make_views(2), BLOCKS))
+    found = aggregate(operator, DenseGradients(make_views(2), BLOCKS))
     for gradient in found.gradients.values():
         assert bool(torch.isfinite(gradient).all())
 
@@ -355,13 +345,13 @@ def test_the_mean_is_the_sum_over_all_views_to_the_bit(count, dtype, absent):
     views = make_views(count, dtype)
     views[min(absent, count - 1)]["means"] = None
     views[0]["mlp.1"][0] = float("nan")
-    grown = aggregate(Sum(), DenseViewGradients(views, BLOCKS)).gradients
+    grown = aggregate(Sum(), DenseGradients(views, BLOCKS)).gradients
     mean = build("operators", "mean", {})
     for gradients in (
-        DenseViewGradients(views, BLOCKS),
-        DenseViewGradients(list(map(copied, views)), BLOCKS, overwrite=True),
+        DenseGradients(views, BLOCKS),
+        DenseGradients(list(map(copied, views)), BLOCKS, overwrite=True),
         accumulation(views),
-        AccumulatedGradients(copied(grown), BLOCKS, count),
+        SummedGradients(copied(grown), BLOCKS, count),
     ):
         found = aggregate(mean, gradients).gradients
         for name, total in grown.items():
@@ -390,7 +380,7 @@ def test_an_accumulated_sum_is_gone_once_it_was_divided():
 
 
 def test_aggregation_is_what_operators_do_by_default():
-    gradients = DenseViewGradients(make_views(2), BLOCKS)
+    gradients = DenseGradients(make_views(2), BLOCKS)
     found = aggregate(Symmetric(), gradients)
     context = AggregateContext(
         step=1,
@@ -405,5 +395,5 @@ def test_aggregation_is_what_operators_do_by_default():
         reference_distance=1.0,
         blocks=BLOCKS,
     )
-    direct, _ = aggregate_by_gramians(Symmetric(), "tensor", context, EMPTY_STATE)
+    direct, _ = aggregate_by_gramians(Symmetric(), "block", context, EMPTY_STATE)
     assert all(torch.equal(found.gradients[n], direct.gradients[n]) for n in SHAPES)

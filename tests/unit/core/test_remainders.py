@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.gradients.separate import DenseViewGradients
+from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.numerics import double_double
 
 RATE = LearningRate(1.0)
@@ -18,8 +18,8 @@ BLOCKS = (
 )
 SHAPES = {"means": (6, 3), "scales": (6, 2), "mlp.0": (7, 5), "mlp.1": (5,)}
 GROUPS = {
-    "tensor": [["means"], ["scales"], ["mlp.0", "mlp.1"]],
-    "group": [["means", "scales"], ["mlp.0", "mlp.1"]],
+    "block": [["means"], ["scales"], ["mlp.0", "mlp.1"]],
+    "kind": [["means", "scales"], ["mlp.0", "mlp.1"]],
     "global": [list(SHAPES)],
 }
 
@@ -60,7 +60,7 @@ def check(gradients, granularity, block, views, names, rows=slice(None)):
 @pytest.mark.parametrize("granularity", GROUPS)
 def test_gramian_and_remainder_have_twice_the_digits(granularity, dtype):
     views = views_of(3, dtype)
-    gradients = DenseViewGradients(views, BLOCKS)
+    gradients = DenseGradients(views, BLOCKS)
     for block, names in enumerate(GROUPS[granularity]):
         check(gradients, granularity, block, views, names)
 
@@ -68,7 +68,7 @@ def test_gramian_and_remainder_have_twice_the_digits(granularity, dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_so_have_those_of_single_primitives(dtype):
     views = views_of(4, dtype, seed=1)
-    gradients = DenseViewGradients(views, BLOCKS)
+    gradients = DenseGradients(views, BLOCKS)
     for row in range(6):
         check(gradients, "gaussian", row, views, ["means"], row)
         check(gradients, "gaussian", 6 + row, views, ["scales"], row)
@@ -77,7 +77,7 @@ def test_so_have_those_of_single_primitives(dtype):
 
 def test_gradients_whose_squares_leave_float64_keep_their_digits():
     views = views_of(2, torch.float64, scale=1e160)
-    gradients = DenseViewGradients(views, BLOCKS)
+    gradients = DenseGradients(views, BLOCKS)
     gramian, rest = gradients.gramians("global")[0], gradients.remainders("global")[0]
     found = [Fraction(gramian[i, 1]) + Fraction(rest[i, 1]) for i in range(2)]
     exact = [exact_product(views[i], views[1], list(SHAPES)) for i in range(2)]
@@ -88,8 +88,8 @@ def test_views_that_do_not_count_have_none():
     views = views_of(3, torch.float32)
     views[1]["means"][2, 1] = torch.inf
     views[2] = {"scales": views[2]["scales"], "mlp.0": None}
-    gradients = DenseViewGradients(views, BLOCKS)
-    rest = gradients.remainders("tensor")
+    gradients = DenseGradients(views, BLOCKS)
+    rest = gradients.remainders("block")
     assert np.isfinite(rest).all()
     assert not rest[0, 1].any() and not rest[0, :, 1].any()
     assert not rest[0, 2].any() and not rest[2, 2].any()
@@ -99,12 +99,12 @@ def test_views_that_do_not_count_have_none():
 def test_the_unit_is_that_of_the_narrowest_rounding():
     def unit(*types):
         views = [{"means": torch.ones(2, 3, dtype=kind)} for kind in types]
-        return DenseViewGradients(views, BLOCKS).unit
+        return DenseGradients(views, BLOCKS).unit
 
     assert unit(torch.float32, torch.float32) == 2.0**-24
     assert unit(torch.float64) == 2.0**-53
     assert unit(torch.bfloat16) == 2.0**-8
-    assert DenseViewGradients([{}], BLOCKS).unit == 2.0**-24
+    assert DenseGradients([{}], BLOCKS).unit == 2.0**-24
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def test_configurations_are_read_back(operator):
     assert hash(type(operator).model_validate(written)) == hash(operator)
 
 
-@pytest.mark.parametrize("links", [["graddrop"], [{"name": "pcgrad", "granularity": "group"}], [3]])
+@pytest.mark.parametrize("links", [["graddrop"], [{"name": "pcgrad", "granularity": "kind"}], [3]])
 def test_links_that_cannot_work_are_refused(links):
     with pytest.raises(ValidationError):
         Chain(links=links)

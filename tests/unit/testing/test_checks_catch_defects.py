@@ -131,7 +131,7 @@ class ForgetsATensor(Adding):
 class CountsViewsThatAreNotThere(Adding):
     def aggregate(self, context, state):
         aggregated, state = super().aggregate(context, state)
-        share = 1.0 / context.gradients.finite("tensor").sum()
+        share = 1.0 / context.gradients.finite("block").sum()
         gradients = {n: None if g is None else g * share for n, g in aggregated.gradients.items()}
         return replace(aggregated, gradients=gradients), state
 

@@ -89,7 +89,7 @@ def test_known_operators_have_the_sums_of_the_specification(name, views):
     assert scale.per_view == pytest.approx(dict.fromkeys(TENSORS, EXPECTED[name](views) / views))
 
 
-@pytest.mark.parametrize("granularity", ["group", "global", "gaussian"])
+@pytest.mark.parametrize("granularity", ["kind", "global", "gaussian"])
 def test_every_granularity_has_the_same_sum(granularity):
     operator = build("operators", "nash", {"granularity": granularity})
     assert scale_of(operator, 3).per_step == pytest.approx(dict.fromkeys(TENSORS, sqrt(3)))
@@ -154,7 +154,7 @@ def test_asking_leaves_the_step_alone():
     drawn = np.random.default_rng(0).bit_generator.state
     OperatorScale(build("operators", "graddrop", {})).of(context)
     assert context.rng.bit_generator.state == drawn
-    assert context.gradients.present("tensor").any()
+    assert context.gradients.present("block").any()
     assert neutral(context).rng is not context.rng
 
 

@@ -6,6 +6,7 @@ import pytest
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.app import run
@@ -17,10 +18,10 @@ from crossgrad_core.testing.fixtures import sample_scene
 
 IDLE = [
     (
-        {"operator": {"name": "chain", "links": ["mean"], "granularity": "group"}},
+        {"operator": {"name": "chain", "links": ["mean"], "granularity": "kind"}},
         "operator.granularity",
     ),
-    ({"operator": {"name": "cagrad", "c": 0, "granularity": "group"}}, "operator.granularity"),
+    ({"operator": {"name": "cagrad", "c": 0, "granularity": "kind"}}, "operator.granularity"),
     ({"operator": {"name": "cagrad", "c": 0, "rescale": "1+c"}}, "operator.rescale"),
     ({"operator": {"name": "soft", "strength": 0, "threshold": 0.5}}, "operator.threshold"),
     ({"operator": {"name": "confgate", "tau": 0.8, "preset": "low"}}, "operator.preset"),
@@ -32,7 +33,7 @@ IDLE = [
         "operator.decay",
     ),
     (
-        {"operator": {"name": "dispatch", "rules": {"means": "sum"}, "granularity": "group"}},
+        {"operator": {"name": "dispatch", "rules": {"means": "sum"}, "granularity": "kind"}},
         "operator.rules",
     ),
     ({"operator": {"name": "dispatch", "neutral": "geometry"}}, "operator.neutral"),
@@ -118,8 +119,8 @@ IDLE = [
 #: The same settings where they do something.
 AT_WORK = [
     {"operator": {"name": "symmetric", "granularity": "gaussian"}},
-    {"operator": {"name": "chain", "links": ["mean", "nash"], "granularity": "group"}},
-    {"operator": {"name": "dispatch", "rules": {"geometry": "nash"}, "granularity": "group"}},
+    {"operator": {"name": "chain", "links": ["mean", "nash"], "granularity": "kind"}},
+    {"operator": {"name": "dispatch", "rules": {"geometry": "nash"}, "granularity": "kind"}},
     {"sampler": {"name": "near-far", "order": "distinct"}, "views": 4},
     {"sampler": {"name": "near-far", "order": "epoch"}},
     {"grouping": {"name": "gmm"}, "sampler": {"name": "near-far"}},
@@ -128,7 +129,7 @@ AT_WORK = [
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
     # A value that is the default is never refused.
-    {"operator": {"name": "sum", "granularity": "tensor"}},
+    {"operator": {"name": "chain", "links": ["mean"], "granularity": "block"}},
     {"backbone": {"name": "scaffold", "lr_bank": 0.01}},
 ]
 
@@ -161,7 +162,7 @@ def test_settings_that_do_something_are_not(settings):
 def test_defaults_never_are(slot):
     selection = assemble(RunConfig(steps=10), sample_scene(), "none").selection
     for name in entries(slot):
-        assert not build(slot, name, {}).set_for_nothing(selection)
+        assert not set_for_nothing(build(slot, name, {}), selection)
 
 
 def test_listed_splits_leave_test_every_nothing_to_do(tmp_path):
