@@ -43,7 +43,7 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 
 __all__ = [
@@ -75,7 +75,6 @@ __all__ = [
     "LearningRate",
     "MatrixOperator",
     "Model",
-    "NoEdit",
     "Observer",
     "Operator",
     "OperatorContext",

@@ -15,7 +15,7 @@ from crossgrad_core.contract.gradients import Gradients, SeparateGradients
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.contract.topology import Edit
 
 if TYPE_CHECKING:
     from crossgrad_core.contract.adam_state import AdamState
@@ -267,9 +267,9 @@ class Regularized(Answer):
 
 @dataclass(frozen=True, eq=False)
 class Densified(Answer):
-    """Answer of `crossgrad_densify` and `crossgrad_after_step`: an edit, or an explicit NoEdit."""
+    """Answer of `crossgrad_densify` and `crossgrad_after_step`: an edit, or NO_EDIT."""
 
-    edit: Edit | NoEdit
+    edit: Edit
 
 
 @dataclass(frozen=True, eq=False)

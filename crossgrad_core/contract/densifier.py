@@ -9,7 +9,7 @@ from crossgrad_core.contract.contexts import Densified, DensifyContext
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.contract.topology import Edit
 
 STATE = "densifier"
 
@@ -44,9 +44,7 @@ class Densifier(Component):
         return parameters
 
     @abstractmethod
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         """The edit of this step and the new state.
 
         The core gathers `state.per_primitive` of *the returned state* along with the edit.

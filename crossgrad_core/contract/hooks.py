@@ -61,7 +61,7 @@ class HookSpecs:
 
     @hookspec(firstresult=True)
     def crossgrad_densify(self, context: "DensifyContext") -> "Densified | None":
-        """Seam 3: the topology edit of this step, or NoEdit. Answered by the selected densifier."""
+        """Seam 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
 
     @hookspec
     def crossgrad_after_step(self, context: "AfterStepContext") -> "Densified | None":

@@ -45,13 +45,14 @@ class Edit:
     values: Mapping[str, Rows] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether it changes nothing and counts nothing."""
+        return self.source is None and not self.values and not self.counts
 
-@dataclass(frozen=True)
-class NoEdit:
-    """The explicit answer of a densifier that changes nothing in this step."""
 
-
-NO_EDIT = NoEdit()
+#: The explicit answer of a densifier that changes nothing in this step.
+NO_EDIT = Edit()
 
 
 def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ import pluggy
 from crossgrad_core.contract.contexts import Answer, Densified, Sampled, StepContext
 from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.marks import PROJECT
-from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.wording import did_you_mean, listed, sentences
 
@@ -81,7 +81,7 @@ def _complete(answer: Answer) -> bool:
         case Sampled():
             return bool(answer.draw)
         case Densified():
-            return isinstance(answer.edit, Edit | NoEdit)
+            return isinstance(answer.edit, Edit)
         case _:
             return True
 

@@ -15,7 +15,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import Edit, NoEdit, apply_to_parameters, gather_indices
+from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
@@ -86,10 +86,10 @@ class DensifierRun:
             room=room,
         )
 
-    def take_step(self, step: int, room: int = _ROOM) -> Edit | NoEdit:
+    def take_step(self, step: int, room: int = _ROOM) -> Edit:
         """The answer of a step, applied."""
         edit, state = self.densifier.densify(self.context(step, room), self.state)
-        require(isinstance(edit, Edit | NoEdit), f"the answer is {edit!r}, not an Edit or NO_EDIT")
+        require(isinstance(edit, Edit), f"the answer is {edit!r}, not an Edit or NO_EDIT")
         require(isinstance(state, PluginState), f"the new state is {state!r}, not a PluginState")
         self._require_rows(state)
         self.state = state
@@ -202,7 +202,7 @@ def quiet_before_its_time(make: Make[Densifier]) -> None:
     run = DensifierRun.of(make())
     for step in (1, 100, 499, 500):
         edit = run.take_step(step)
-        require(isinstance(edit, NoEdit), f"step {step} of 30,000: {edit!r}, expected NO_EDIT")
+        require(edit.is_empty, f"step {step} of 30,000: {edit!r}, expected NO_EDIT")
 
 
 def edits_keep_everything_aligned(make: Make[Densifier]) -> None:

@@ -5,7 +5,6 @@ from torch import Tensor
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import (
     Edit,
-    NoEdit,
     apply_to_moment,
     apply_to_parameters,
     gather_indices,
@@ -14,13 +13,13 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 
-def apply_edit(setup: Setup, state: TrainState, edit: Edit | NoEdit) -> bool:
+def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     """Edits parameters, moments and plugin states together.
 
     Returns:
         Whether the set of primitives changed.
     """
-    if isinstance(edit, NoEdit):
+    if edit.is_empty:
         return False
     before = state.primitives(setup)
     for block in setup.blocks:

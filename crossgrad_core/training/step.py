@@ -20,7 +20,7 @@ from crossgrad_core.contract.contexts import (
     Sampled,
     StepRecord,
 )
-from crossgrad_core.contract.topology import Edit, NoEdit
+from crossgrad_core.contract.topology import Edit
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.edits import apply_edit
@@ -130,7 +130,7 @@ def _optimize(setup: Setup, state: TrainState, gradients: TensorGradients, scale
     adam_step(state.parameters, gradients, state.adam, rates, scales=scale.to_sum)
 
 
-def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit | NoEdit, bool]:
+def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit, bool]:
     context = DensifyContext(
         **_common(setup, state, "densifier"),
         parameters=state.parameters,

@@ -15,7 +15,7 @@ from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Phase
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows, apply_to_parameters
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.splats import rotation_matrices
 
@@ -113,9 +113,7 @@ class CloneSplit(Densifier):
         }
 
     @override
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
         state = self.observed(context, state)

@@ -22,7 +22,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_plugins.densifiers.position_noise import position_noise
 from crossgrad_plugins.densifiers.relocation import Pool
@@ -70,9 +70,7 @@ class MarkovChainMonteCarlo(Densifier):
         return started
 
     @override
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.densifies(context.step):
             return NO_EDIT, state
         pool = Pool.of(sigmoid(context.parameters["opacities"].detach().double()))
@@ -131,7 +129,7 @@ def drawn(weights: Tensor, number: int, rng: np.random.Generator) -> Tensor:
     return torch.from_numpy(indices).to(weights.device)
 
 
-def _edit_of(pool: Pool, log_scales: Tensor, counts: dict[str, int]) -> Edit | NoEdit:
+def _edit_of(pool: Pool, log_scales: Tensor, counts: dict[str, int]) -> Edit:
     """The pool as an edit; everything that shares a source starts with zero moments."""
     if not bool(pool.touched.any()):
         return Edit(counts=counts) if any(counts.values()) else NO_EDIT

@@ -7,7 +7,7 @@ from typing_extensions import override
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit
+from crossgrad_core.contract.topology import NO_EDIT, Edit
 
 
 class NoDensification(Densifier):
@@ -17,7 +17,5 @@ class NoDensification(Densifier):
     resets: ClassVar[bool] = False
 
     @override
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         return NO_EDIT, state

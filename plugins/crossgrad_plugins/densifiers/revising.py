@@ -11,7 +11,7 @@ from typing_extensions import override
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, NoEdit, Rows, apply_to_parameters
+from crossgrad_core.contract.topology import Edit, Rows, apply_to_parameters
 from crossgrad_core.numerics.elementwise import logsigmoid, sigmoid
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.error_share import ErrorKind, largest_shares, spread_views
@@ -68,11 +68,9 @@ class RevisingDensification(CloneSplit):
         return {**super().grown_values(context, state, plan), "opacities": Rows(shared, rows)}
 
     @override
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         edit, state = super().densify(context, state)
-        if self.opacity_decrease == 0 or isinstance(edit, NoEdit):
+        if self.opacity_decrease == 0 or edit.is_empty:
             return edit, state
         blocks = tuple(b for b in context.backbone.blocks() if "opacities" in b.tensors)
         logits = apply_to_parameters(edit, blocks, context.parameters)["opacities"].detach()

@@ -220,7 +220,11 @@ def test_labels_of_lists_can_be_named(folders, tmp_path):
 def test_a_run_that_goes_on_is_not_asked(folders):
     """Runs from before are continued as they were."""
     config = RunConfig.model_validate(
-        {"scene": str(folders), "steps": 10, "operator": {"name": "sum", "granularity": "global"}}
+        {
+            "scene": str(folders),
+            "steps": 10,
+            "operator": {"name": "cagrad", "c": 0, "rescale": "1+c"},
+        }
     )
     set_up(config, -1)
 

@@ -23,7 +23,7 @@ from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.screen_statistics import mean
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, NoEdit, Rows
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 
 
 class AnchorDensifier(Densifier):
@@ -64,9 +64,7 @@ class AnchorDensifier(Densifier):
         return {"scales": torch.cat([scales[:, :3], capped], 1)}
 
     @override
-    def densify(
-        self, context: DensifyContext, state: PluginState
-    ) -> tuple[Edit | NoEdit, PluginState]:
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
         # Published: statistics from step 500, edits from step 1500 on.
