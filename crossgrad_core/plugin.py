@@ -31,7 +31,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
@@ -71,7 +71,6 @@ __all__ = [
     "Grouping",
     "HasIdleOptions",
     "IncompatibleSelectionError",
-    "Labelling",
     "LearningRate",
     "MatrixOperator",
     "Model",
@@ -90,6 +89,7 @@ __all__ = [
     "Render",
     "Response",
     "Rows",
+    "Rule",
     "RunInfo",
     "SampleContext",
     "Sampled",

@@ -101,7 +101,7 @@ class Octree(AnchorBackbone):
 
     @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
-        centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
+        centers = scene.centers
         lattice = self._lattice(scene.points, centers)
         anchors = planted(scene.points, lattice, everywhere=self.plant_everywhere)
         shares = lattice.shares(anchors.positions, anchors.levels, torch.from_numpy(centers))

@@ -20,14 +20,14 @@ class Densifier(Component):
     Attributes:
         needs: Screen statistics beyond the radii and the mean gradient that it needs
             (`pixels`, `abs_gradient`, `directions`); given while `schedule.collects(step)`.
-        blocks: Names of the parameter tensors that it needs a backbone to have.
+        tensors: Names of the parameter tensors that it needs a backbone to have.
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.
     """
 
     slot: ClassVar[str] = "densifiers"
     needs: ClassVar[frozenset[str]] = frozenset()
-    blocks: ClassVar[frozenset[str]] = frozenset()
+    tensors: ClassVar[frozenset[str]] = frozenset()
     edits: ClassVar[bool] = True
     resets: ClassVar[bool] = True
 

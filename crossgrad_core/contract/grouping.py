@@ -1,7 +1,7 @@
 """The grouping slot: labels of views, for sampling."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -12,17 +12,21 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.scene import Scene, View
 
 
-@dataclass(frozen=True)
-class Labelling:
-    """What a grouping answers.
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """A grouping as fitted to the training cameras of a scene.
 
     Attributes:
-        labels: One label per view, in the order in which the views were given.
+        labels: One label per view, for any views of the scene, in their order.
         notes: What the user should know about the rule as fitted (its threshold, a fall-back ...).
     """
 
-    labels: tuple[str, ...]
+    labels: Callable[[Sequence[View]], tuple[str, ...]]
     notes: tuple[str, ...] = ()
+
+    def label(self, view: View) -> str:
+        """The label of one view."""
+        return self.labels((view,))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +69,13 @@ class Grouping(Component):
     needs_probe: ClassVar[bool] = False
 
     @abstractmethod
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
-        """One label per view of `views`, by the rule fitted on `scene.train_views`.
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
+        """The rule, fitted on `scene.train_views`.
 
         Args:
             scene: The scene.
-            views: The views to be labelled.
             rng: The only source of random numbers.
             probe: Gradients of the training views, for rules that need them.
 

@@ -42,7 +42,7 @@ def _of_the_sampler(selection: Selection) -> Iterator[str]:
 def _of_the_densifier(selection: Selection) -> Iterator[str]:
     densifier, names = selection.densifier, selection.names
     have = {tensor for block in selection.backbone.blocks() for tensor in block.tensors}
-    if missing := sorted(densifier.blocks - have):
+    if missing := sorted(densifier.tensors - have):
         yield (
             f"densifier {names['densifier']} edits the tensors {', '.join(missing)}, "
             f"which backbone {names['backbone']} does not have"

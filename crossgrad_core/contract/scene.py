@@ -1,5 +1,6 @@
 """The data types of a scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -42,6 +43,11 @@ class Camera:
         """[3, 3] float64, the calibration matrix K."""
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(rows, dtype=torch.float64)
+
+    def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the local frame in the camera's axes; the third number is the depth."""
+        pose = self.world_to_camera.numpy()
+        return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera for an image resampled to `width` x `height`."""
@@ -142,3 +148,20 @@ class Scene:
     def test_views(self) -> tuple[View, ...]:
         """The held-out views."""
         return tuple(self.views[i] for i in self.test)
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """[N, 3] float64 camera centres of the training views, local frame."""
+        return centers_of(self.train_views)
+
+    @cached_property
+    def distances(self) -> NDArray[np.float64]:
+        """[N] distance of each training camera from their mean, local units."""
+        return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
+
+
+def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
+    """[V, 3] float64 camera centres, local frame."""
+    if not views:
+        return np.zeros((0, 3))
+    return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)

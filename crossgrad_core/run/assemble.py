@@ -303,13 +303,14 @@ def _groups(
     if grouping is None:
         return None
     rng = make_streams(config.seed)["grouping"]
-    labelling = grouping.label(scene, scene.train_views, rng)
-    notes += labelling.notes
+    rule = grouping.fit(scene, rng)
+    labels = rule.labels(scene.train_views)
+    notes += rule.notes
     notes += mode_note(selection.names["grouping"], grouping, scene)
-    counts = {label: labelling.labels.count(label) for label in dict.fromkeys(labelling.labels)}
+    counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
     listed = ", ".join(f"{label} {count}" for label, count in counts.items())
     notes.append(f"groups of training views: {listed}")
-    return labelling.labels
+    return labels
 
 
 def _plugins(

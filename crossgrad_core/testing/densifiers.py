@@ -158,11 +158,11 @@ def _backbone_for(densifier: Densifier) -> Backbone:
     fitting = []
     for backbone in _backbones():
         have = {tensor for block in backbone.blocks() for tensor in block.tensors}
-        if densifier.blocks <= have:
+        if densifier.tensors <= have:
             usual = load("densifiers", backbone.default_densifier)
             fitting.append((type(densifier) is not usual, backbone))
     if not fitting:
-        wanted = ", ".join(sorted(densifier.blocks))
+        wanted = ", ".join(sorted(densifier.tensors))
         raise cannot_tell(f"no installed backbone has the tensors {wanted}")
     return min(fitting, key=lambda each: each[0])[1]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
+from crossgrad_core.contract.scene import Scene
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
@@ -43,30 +43,28 @@ class SampleProbe:
         return np.stack([gramian, 2.0 * gramian])
 
 
-def labelled(grouping: Grouping, views: Sequence[View], scene: Scene, seed: int = 0) -> Labelling:
-    """What a grouping answers for views of a scene."""
+def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> Rule:
+    """What a grouping answers for a scene."""
     probe: GradientProbe | None = SampleProbe(scene) if grouping.needs_probe else None
-    return grouping.label(scene, views, np.random.default_rng(seed), probe)
+    return grouping.fit(scene, np.random.default_rng(seed), probe)
 
 
 def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
     """One label per view, each of them announced in `labels` (unless the user's input names it)."""
     grouping, scene = make(), sample_scene()
+    rule = fitted(grouping, scene)
+    require(isinstance(rule, Rule), f"the answer is {rule!r}, not a Rule")
     for views in (scene.train_views, scene.views, scene.views[:1]):
-        answer = labelled(grouping, views, scene)
-        require(isinstance(answer, Labelling), f"the answer is {answer!r}, not a Labelling")
-        require(
-            len(answer.labels) == len(views),
-            f"{len(views)} views have {len(answer.labels)} labels",
-        )
-        foreign = sorted(set(answer.labels) - set(grouping.labels)) if grouping.labels else []
+        labels = rule.labels(views)
+        require(len(labels) == len(views), f"{len(views)} views have {len(labels)} labels")
+        foreign = sorted(set(labels) - set(grouping.labels)) if grouping.labels else []
         require(not foreign, f"labels that are not declared in `labels`: {listed(foreign)}")
 
 
 def every_group_has_training_views(make: Make[Grouping]) -> None:
     """No declared group is empty without an error, for samplers draw from all of them."""
     grouping, scene = make(), sample_scene()
-    found = set(labelled(grouping, scene.train_views, scene).labels)
+    found = set(fitted(grouping, scene).labels(scene.train_views))
     empty = sorted(set(grouping.labels) - found)
     require(not empty, f"groups without training views: {listed(empty)}; raise UserError instead")
 
@@ -74,9 +72,10 @@ def every_group_has_training_views(make: Make[Grouping]) -> None:
 def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
     """A view's label depends on the training views and itself, not on what else is labelled."""
     grouping, scene = make(), sample_scene()
-    together = labelled(grouping, scene.views, scene).labels
+    rule = fitted(grouping, scene)
+    together = rule.labels(scene.views)
     for view, label in zip(scene.views, together, strict=True):
-        alone = labelled(grouping, (view,), scene).labels[0]
+        alone = rule.label(view)
         require(
             alone == label,
             f"{view.name} is {alone!r} when labelled alone and {label!r} among the others",
@@ -102,8 +101,8 @@ def same_seed_same_labels(make: Make[Grouping]) -> None:
     """The labels depend on the arguments alone, and randomness comes from `rng`."""
     scene = sample_scene()
     with global_randomness_untouched():
-        one = labelled(make(), scene.views, scene)
-        other = labelled(make(), scene.views, scene)
+        one = fitted(make(), scene).labels(scene.views)
+        other = fitted(make(), scene).labels(scene.views)
     require(one == other, "two calls with one seed give different labels")
 
 

@@ -33,7 +33,7 @@ _PATIENCE = 400
 def _groups(grouping: str) -> tuple[str, ...]:
     scene = sample_scene()
     rule = cast("Grouping", build("groupings", grouping, {}))
-    return rule.label(scene, scene.train_views, np.random.default_rng(0)).labels
+    return rule.fit(scene, np.random.default_rng(0)).labels(scene.train_views)
 
 
 def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:

@@ -4,10 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import pluggy
 import torch
-from numpy.typing import NDArray
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
@@ -92,16 +90,6 @@ class Setup:
     def train_views(self) -> tuple[View, ...]:
         """The training views, in the order that samplers index."""
         return self.scene.train_views
-
-    @cached_property
-    def centers(self) -> NDArray[np.float64]:
-        """[N, 3] camera centres of the training views, local frame."""
-        return np.stack([view.camera.center.numpy() for view in self.train_views])
-
-    @cached_property
-    def distances(self) -> NDArray[np.float64]:
-        """[N] distance of each training camera from their mean, local units."""
-        return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
 
     @cached_property
     def watchers(self) -> tuple[str, ...]:

@@ -74,7 +74,7 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
         **_common(setup, state, "sampler"),
         views_per_step=setup.selection.views_per_step,
         groups=setup.groups,
-        centers=setup.centers,
+        centers=setup.scene.centers,
         last=state.last,
     )
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
@@ -90,8 +90,8 @@ def _aggregate_context(
         gradients=rendered.gradients,
         losses=np.array([record.loss for record in rendered.records]),
         labels=draw.labels,
-        distances=setup.distances[list(draw.views)],
-        reference_distance=float(np.median(setup.distances)),
+        distances=setup.scene.distances[list(draw.views)],
+        reference_distance=float(np.median(setup.scene.distances)),
         blocks=setup.trained_blocks,
     )
 

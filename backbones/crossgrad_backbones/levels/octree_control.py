@@ -39,7 +39,7 @@ class OctreeControl(AnchorDensifier):
     first edit on, not after the coarse phase.
     """
 
-    blocks: ClassVar[frozenset[str]] = AnchorDensifier.blocks | {
+    tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {
         "levels",
         "extra_levels",
         "lattice",
@@ -68,8 +68,8 @@ class OctreeControl(AnchorDensifier):
 
     @override
     def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:
-        centers = [view.camera.center for view in context.scene.train_views]
-        return grown(parameters, urge, self._thresholds(parameters), torch.stack(centers))
+        centers = torch.from_numpy(context.scene.centers)
+        return grown(parameters, urge, self._thresholds(parameters), centers)
 
     @override
     def changed(self, parameters: Parameters, urge: Urge) -> Mapping[str, Tensor]:

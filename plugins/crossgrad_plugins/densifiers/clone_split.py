@@ -81,7 +81,7 @@ class CloneSplit(Densifier):
     The published rule by screen radius never fires in the original code and is left out.
     """
 
-    blocks = frozenset({"means", "scales", "quats", "opacities"})
+    tensors = frozenset({"means", "scales", "quats", "opacities"})
 
     split_scale: float = Field(0.01, gt=0, description="split above, clone below; scene extents")
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="prune below")

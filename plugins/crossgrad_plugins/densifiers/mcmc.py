@@ -39,7 +39,7 @@ class MarkovChainMonteCarlo(Densifier):
     use. There is no clone, split, prune or opacity reset.
     """
 
-    blocks = frozenset({"means", "scales", "quats", "opacities"})
+    tensors = frozenset({"means", "scales", "quats", "opacities"})
     resets: ClassVar[bool] = False
 
     cap: int = Field(1_000_000, ge=0, description="most Gaussians")

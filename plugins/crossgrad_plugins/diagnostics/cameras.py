@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.scene.bimodality import bimodality
-from crossgrad_core.scene.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement

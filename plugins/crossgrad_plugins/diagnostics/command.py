@@ -166,7 +166,7 @@ def _write_signature(model: Model, path: Path, seed: int) -> str:
     scene = model.scene
     grouping = cast("Grouping", build("groupings", "conflict-signature", {}))
     rng = np.random.default_rng(seed)
-    found = grouping.label(scene, scene.views, rng, ModelProbe(model, rng))
-    lines = [f"{view.name},{label}" for view, label in zip(scene.views, found.labels, strict=True)]
+    rule = grouping.fit(scene, rng, ModelProbe(model, rng))
+    lines = [f"{view.name},{rule.label(view)}" for view in scene.views]
     write_atomically(path, ("\n".join(lines) + "\n").encode())
     return f"labels of conflict-signature in {path} (--grouping lists --set grouping.file={path})"

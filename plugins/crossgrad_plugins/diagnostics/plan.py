@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.poses import footprint_of, radial_distances
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
-from crossgrad_core.scene.poses import footprint_of, radial_distances
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
 #: The grouping of a probe where the run has none: the paper's.
@@ -57,8 +57,8 @@ def labelled(scene: Scene, grouping: str, seed: int) -> tuple[tuple[str, ...], t
         UserError: There is no such grouping, or it cannot group this scene.
     """
     component = cast("Grouping", build("groupings", grouping, {}))
-    found = component.label(scene, scene.train_views, np.random.default_rng(seed))
-    return found.labels, found.notes
+    rule = component.fit(scene, np.random.default_rng(seed))
+    return rule.labels(scene.train_views), rule.notes
 
 
 def plan_probe(

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.poses import altitudes, upward
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import altitudes, upward
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -37,13 +37,9 @@ class Altitude(Grouping):
     )
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "altitude")
         axis, source = upward(scene, self.up)
         train = altitudes(scene, scene.train_views, axis)
@@ -53,7 +49,7 @@ class Altitude(Grouping):
             f"grouping altitude: near up to {threshold:.4g} local units above the mean camera; "
             f"up is {np.array2string(axis, precision=3)} ({source})"
         )
-        return Labelling(halves(altitudes(scene, views, axis), threshold), (note,))
+        return Rule(lambda views: halves(altitudes(scene, views, axis), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

@@ -7,10 +7,10 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
-from crossgrad_plugins.groupings.thirds import label_by_shares
+from crossgrad_plugins.groupings.thirds import rule_by_shares
 
 
 class Anchors(Grouping):
@@ -26,14 +26,10 @@ class Anchors(Grouping):
     share: float = Field(0.3, gt=0.0, le=0.5, description="share of the cameras on either side")
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
-        return label_by_shares(scene, views, "anchors", self.share, (NEAR, FAR))
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
+        return rule_by_shares(scene, "anchors", self.share, (NEAR, FAR))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

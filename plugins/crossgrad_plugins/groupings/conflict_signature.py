@@ -9,10 +9,10 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
+from crossgrad_core.contract.poses import radial_distances
+from crossgrad_core.contract.scene import Scene, View, centers_of
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.poses import centers_of, radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -42,13 +42,9 @@ class ConflictSignature(Grouping):
     )
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "conflict-signature")
         if probe is None:
             raise UserError(
@@ -65,9 +61,14 @@ class ConflictSignature(Grouping):
         near = smaller_mean_first(sides, radial_distances(scene, chosen))
         train = [NEAR if side == near else FAR for side in sides]
         require_groups("conflict-signature", train, (NEAR, FAR), "the directions of gradients")
-        _, nearest = cKDTree(centers_of(chosen)).query(centers_of(views))
+        tree = cKDTree(centers_of(chosen))
+
+        def labels(views: Sequence[View]) -> tuple[str, ...]:
+            _, nearest = tree.query(centers_of(views))
+            return tuple(train[i] for i in nearest)
+
         note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
-        return Labelling(tuple(train[i] for i in nearest), (note,))
+        return Rule(labels, (note,))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:

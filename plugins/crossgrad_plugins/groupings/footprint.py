@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.poses import footprint_of
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.poses import footprint_of
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -30,22 +30,17 @@ class Footprint(Grouping):
     """
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "footprint")
         train = _footprints(scene, scene.train_views)
         threshold = float(np.median(train))
         # halves() calls small values near: a large footprint is a near camera.
         train_labels = halves(-train, -threshold)
         require_groups("footprint", train_labels, (NEAR, FAR), "projected footprint")
-        values = _footprints(scene, views)
         note = f"grouping footprint: near from {threshold:.4g} pixels per local unit"
-        return Labelling(halves(-values, -threshold), (note,))
+        return Rule(lambda views: halves(-_footprints(scene, views), -threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.poses import radial_distances
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import radial_distances
 from crossgrad_plugins.groupings.radial import Radial
 from crossgrad_plugins.groupings.split import FAR, NEAR, log_distances, require_training_views
 
@@ -32,24 +32,20 @@ class GaussianMixture(Grouping):
     restarts: int = Field(10, ge=1, description="starting points; the most likely fit is kept")
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "gmm")
         distances = radial_distances(scene, scene.train_views)
         floor = _DISTANCE_FLOOR * float(np.median(distances))
         mixture = _fit(distances, floor, self.restarts, rng)
         if mixture is None or len(set(mixture.labels(distances, floor))) == 1:
-            median = Radial().label(scene, views, rng)
+            median = Radial().fit(scene, rng)
             fallback = "grouping gmm: the mixture is degenerate, the median split is used instead"
-            return Labelling(median.labels, (fallback, *median.notes))
+            return Rule(median.labels, (fallback, *median.notes))
         near, far = np.exp(mixture.means)
         note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
-        return Labelling(mixture.labels(radial_distances(scene, views), floor), (note,))
+        return Rule(lambda views: mixture.labels(radial_distances(scene, views), floor), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
-from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import centers_of, radial_distances
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
+from crossgrad_core.contract.poses import radial_distances
+from crossgrad_core.contract.scene import Scene, View, centers_of
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -30,13 +30,9 @@ class KMeans(Grouping):
     restarts: int = Field(10, ge=1, description="seedings; the tightest clustering is kept")
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "kmeans")
         points = centers_of(scene.train_views)
         trials = [_lloyd(points, _seeds(points, rng)) for _ in range(self.restarts)]
@@ -45,11 +41,15 @@ class KMeans(Grouping):
         near = smaller_mean_first(clusters, radial_distances(scene, scene.train_views))
         train = [NEAR if cluster == near else FAR for cluster in clusters]
         require_groups("kmeans", train, (NEAR, FAR), "position")
-        labels = [NEAR if c == near else FAR for c in _nearest(centers_of(views), centroids)]
         note = (
             f"grouping kmeans: {train.count(NEAR)} near and {train.count(FAR)} far training views"
         )
-        return Labelling(tuple(labels), (note,))
+
+        def labels(views: Sequence[View]) -> tuple[str, ...]:
+            clusters = _nearest(centers_of(views), centroids)
+            return tuple(NEAR if cluster == near else FAR for cluster in clusters)
+
+        return Rule(labels, (note,))
 
 
 def _nearest(points: NDArray[np.float64], centroids: NDArray[np.float64]) -> NDArray[np.int64]:

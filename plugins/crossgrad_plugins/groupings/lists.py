@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.text_files import read_rows
@@ -29,23 +29,20 @@ class Lists(Grouping):
     )
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "lists")
-        if self.file is None:
-            labels = tuple(_folder(view.name) for view in views)
-            train = {_folder(view.name) for view in scene.train_views}
-        else:
-            table = read_labels(self.file)
-            labels = tuple(_listed(view.name, table, self.file) for view in views)
-            train = {_listed(view.name, table, self.file) for view in scene.train_views}
+        table = None if self.file is None else read_labels(self.file)
+
+        def labels(views: Sequence[View]) -> tuple[str, ...]:
+            if self.file is None or table is None:
+                return tuple(_folder(view.name) for view in views)
+            return tuple(_listed(view.name, table, self.file) for view in views)
+
+        train = set(labels(scene.train_views))
         _require_two(train, self.file)
-        return Labelling(labels, (f"grouping lists: {', '.join(sorted(train))}",))
+        return Rule(labels, (f"grouping lists: {', '.join(sorted(train))}",))
 
 
 def read_labels(path: Path) -> dict[str, str]:

@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.poses import radial_distances
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -31,20 +31,16 @@ class Percentile(Grouping):
     q: float = Field(30.0, gt=0.0, lt=100.0, description="percentile of the distances")
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "percentile")
         train = radial_distances(scene, scene.train_views)
         threshold = float(np.percentile(train, self.q))
         quantity = "distance from their mean"
         require_groups("percentile", halves(train, threshold), (NEAR, FAR), quantity)
         note = f"grouping percentile: near up to {threshold:.4g} local units from the mean camera"
-        return Labelling(halves(radial_distances(scene, views), threshold), (note,))
+        return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

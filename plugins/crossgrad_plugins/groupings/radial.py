@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.poses import radial_distances
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -25,19 +25,15 @@ class Radial(Grouping):
     """
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
         require_training_views(scene, "radial")
         train = radial_distances(scene, scene.train_views)
         threshold = float(np.median(train))
         require_groups("radial", halves(train, threshold), (NEAR, FAR), "distance from their mean")
         note = f"grouping radial: near up to {threshold:.4g} local units from the mean camera"
-        return Labelling(halves(radial_distances(scene, views), threshold), (note,))
+        return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

@@ -6,10 +6,10 @@ from typing import ClassVar
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Labelling, Quantity
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
-from crossgrad_plugins.groupings.thirds import label_by_shares
+from crossgrad_plugins.groupings.thirds import rule_by_shares
 
 
 class Terciles(Grouping):
@@ -21,14 +21,10 @@ class Terciles(Grouping):
     labels: ClassVar[tuple[str, ...]] = (NEAR, MIDDLE, FAR)
 
     @override
-    def label(
-        self,
-        scene: Scene,
-        views: Sequence[View],
-        rng: np.random.Generator,
-        probe: GradientProbe | None = None,
-    ) -> Labelling:
-        return label_by_shares(scene, views, "terciles", 1.0 / 3.0, self.labels)
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
+        return rule_by_shares(scene, "terciles", 1.0 / 3.0, self.labels)
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

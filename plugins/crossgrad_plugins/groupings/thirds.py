@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import Labelling
-from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.scene.poses import radial_distances
+from crossgrad_core.contract.grouping import Rule
+from crossgrad_core.contract.poses import radial_distances
+from crossgrad_core.contract.scene import Scene
 from crossgrad_plugins.groupings.split import (
     FAR,
     MIDDLE,
@@ -17,14 +17,11 @@ from crossgrad_plugins.groupings.split import (
 )
 
 
-def label_by_shares(
-    scene: Scene, views: Sequence[View], grouping: str, share: float, needed: Sequence[str]
-) -> Labelling:
+def rule_by_shares(scene: Scene, grouping: str, share: float, needed: Sequence[str]) -> Rule:
     """Near up to quantile `share` of the radial distance, far beyond quantile 1 - share.
 
     Args:
         scene: The scene.
-        views: The views to be labelled.
         grouping: Name of the grouping, for messages.
         share: Share of the training cameras on either side, at most 1/2.
         needed: Labels that need training views.
@@ -38,7 +35,7 @@ def label_by_shares(
     quantity = "distance from their mean"
     require_groups(grouping, _three(train, low, high), needed, quantity)
     note = f"grouping {grouping}: near up to {low:.4g}, far beyond {high:.4g} local units"
-    return Labelling(_three(radial_distances(scene, views), low, high), (note,))
+    return Rule(lambda views: _three(radial_distances(scene, views), low, high), (note,))
 
 
 def _three(values: NDArray[np.float64], low: float, high: float) -> tuple[str, ...]:

@@ -12,14 +12,14 @@ from crossgrad_core.registry.slots import GROUPS
 
 GOOD = """
 from pydantic import Field
-from crossgrad_core.plugin import Labelling, Grouping
+from crossgrad_core.plugin import Rule, Grouping
 
 class Good(Grouping):
     share: float = Field(0.5, gt=0, lt=1, description="share of near views")
     seed: int = Field(3, ge=0, description="seed")
 
-    def label(self, scene, views, rng, probe=None):
-        return Labelling(("near",) * len(views))
+    def fit(self, scene, rng, probe=None):
+        return Rule(lambda views: ("near",) * len(views))
 
 class Demanding(Good):
     file: str = Field(description="a file")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from crossgrad_core.contract.poses import altitudes, upward
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.poses import altitudes, upward
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.groupings.altitude import Altitude
 from crossgrad_plugins.groupings.thresholds import gap_threshold, otsu_threshold
@@ -75,7 +75,7 @@ def test_an_axis_without_direction_is_refused(axis):
 
 def test_low_cameras_are_near():
     scene = nadir()
-    labels = Altitude().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = Altitude().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near", "far", "far", "near") * 2
 
 
@@ -84,7 +84,7 @@ def test_heights_are_cut_where_it_was_asked_for(cut, near):
     heights = (0.0, 0.1, 0.2, 0.3, 1.0, 1.1, 3.5, 6.5)
     scene = posed_scene([posed_view((i, 0, h), f"{i}.png") for i, h in enumerate(heights)])
     grouping = Altitude(up=(0.0, 0.0, 1.0), cut=cut)
-    labels = grouping.label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = grouping.fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels.count("near") == near
 
 

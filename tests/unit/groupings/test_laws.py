@@ -58,7 +58,7 @@ def label(name, scene, views=None, seed=0, **options):
     probe = AgreementProbe(["street" not in view.name for view in scene.train_views])
     grouping = build("groupings", name, options)
     views = scene.train_views if views is None else views
-    return grouping.label(scene, views, np.random.default_rng(seed), probe).labels
+    return grouping.fit(scene, np.random.default_rng(seed), probe).labels(views)
 
 
 @pytest.mark.parametrize("name", entries("groupings"))
@@ -123,8 +123,8 @@ def test_no_training_views_are_a_user_error(name):
 @pytest.mark.parametrize("name", BY_POSITION)
 def test_the_fit_is_reported(name):
     scene = hybrid()
-    labelling = build("groupings", name, {}).label(scene, scene.views, np.random.default_rng(0))
-    assert any(note.startswith(f"grouping {name}:") for note in labelling.notes)
+    rule = build("groupings", name, {}).fit(scene, np.random.default_rng(0))
+    assert any(note.startswith(f"grouping {name}:") for note in rule.notes)
 
 
 @pytest.mark.parametrize("name", ["gmm", "kmeans"])
@@ -146,46 +146,46 @@ def on_a_line(*distances):
 
 def test_radial_puts_ties_at_the_median_near():
     scene = on_a_line(1.0, 2.0, 2.0, 2.0, 5.0)
-    labels = Radial().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = Radial().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near",) * 8 + ("far",) * 2
 
 
 def test_radial_refuses_ties_that_leave_far_empty():
     scene = on_a_line(1.0, 2.0, 2.0, 2.0)
     with pytest.raises(UserError, match="near: 8, far: 0"):
-        Radial().label(scene, scene.views, np.random.default_rng(0))
+        Radial().fit(scene, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("q", "near"), [(30.0, 6), (50.0, 10), (70.0, 14)])
 def test_percentile_sets_the_share_of_near_cameras(q, near):
     scene = on_a_line(*np.linspace(1.0, 2.0, 10))
-    labels = Percentile(q=q).label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = Percentile(q=q).fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels.count("near") == near
 
 
 def test_terciles_have_equal_shares():
     scene = on_a_line(*np.linspace(1.0, 2.0, 9))
-    labels = Terciles().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = Terciles().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 6, 6]
 
 
 def test_anchors_are_thirty_percent_on_either_side():
     scene = on_a_line(*np.linspace(1.0, 2.0, 10))
-    labels = Anchors().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = Anchors().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 8, 6]
 
 
 def test_anchors_need_no_middle():
     scene = posed_scene([posed_view((0, 0, 0), "a.png"), posed_view((1, 0, 0), "b.png")])
     three = posed_scene([*scene.views, posed_view((5, 0, 0), "c.png")])
-    labels = Anchors(share=0.5).label(three, three.views, np.random.default_rng(0)).labels
+    labels = Anchors(share=0.5).fit(three, np.random.default_rng(0)).labels(three.views)
     assert set(labels) == {"near", "far"}
 
 
 def test_kmeans_calls_the_inner_cluster_near():
     views = [posed_view((x, 0, 0), f"{x}.png") for x in (0.0, 0.1, 0.2, 0.3, 9.0)]
     scene = posed_scene(views)
-    labels = KMeans().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = KMeans().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near",) * 4 + ("far",)
 
 
@@ -193,7 +193,7 @@ def test_gmm_recovers_a_mixture():
     low = np.exp(norm.ppf((np.arange(30) + 0.5) / 30) * 0.2)
     high = np.exp(2.0 + norm.ppf((np.arange(15) + 0.5) / 15) * 0.1)
     scene = on_a_line(*low, *high)
-    labels = GaussianMixture().label(scene, scene.views, np.random.default_rng(0)).labels
+    labels = GaussianMixture().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near",) * 60 + ("far",) * 30
 
 
@@ -207,20 +207,20 @@ def test_gmm_recovers_a_mixture():
 )
 def test_gmm_survives_degenerate_distances(distances):
     scene = on_a_line(*distances)
-    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
-    assert set(labelling.labels) == {"near", "far"}
+    rule = GaussianMixture().fit(scene, np.random.default_rng(0))
+    assert set(rule.labels(scene.views)) == {"near", "far"}
 
 
 def test_gmm_falls_back_to_the_median_and_says_so():
     # The median is zero: no logarithm of these distances makes sense.
     scene = on_a_line(0.0, 0.0, 0.0, 1.0, 2.0)
-    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
-    radial = Radial().label(scene, scene.views, np.random.default_rng(0))
-    assert labelling.labels == radial.labels
-    assert "degenerate" in labelling.notes[0]
+    rule = GaussianMixture().fit(scene, np.random.default_rng(0))
+    radial = Radial().fit(scene, np.random.default_rng(0))
+    assert rule.labels(scene.views) == radial.labels(scene.views)
+    assert "degenerate" in rule.notes[0]
 
 
 def test_gmm_is_not_said_to_be_degenerate_where_it_is_not():
     scene = hybrid()
-    labelling = GaussianMixture().label(scene, scene.views, np.random.default_rng(0))
-    assert not any("degenerate" in note for note in labelling.notes)
+    rule = GaussianMixture().fit(scene, np.random.default_rng(0))
+    assert not any("degenerate" in note for note in rule.notes)

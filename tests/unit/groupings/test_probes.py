@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from crossgrad_core.contract.poses import footprint_of
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.poses import footprint_of
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.groupings.conflict_signature import (
     ConflictSignature,
@@ -38,20 +38,20 @@ def test_a_view_of_nothing_at_all_is_a_user_error():
     scene = posed_scene([view], [(0, -5, 0)])
     assert np.isnan(footprint_of(scene, view))
     with pytest.raises(UserError, match=r"view\.png"):
-        Footprint().label(scene, scene.views, RNG)
+        Footprint().fit(scene, RNG)
 
 
 def test_the_focal_length_decides_at_one_place():
     views = [posed_view((0, 0, 0), f"{f}.png", focal=f, seen=(0,)) for f in (4.0, 8.0, 16.0, 2.0)]
     scene = posed_scene(views, [(0, 5, 0)])
-    labels = Footprint().label(scene, scene.views, RNG).labels
+    labels = Footprint().fit(scene, RNG).labels(scene.views)
     assert labels == ("far", "near", "near", "far")
 
 
 def test_without_a_probe_the_signature_says_how_to_get_one():
     scene = names("a.png", "b.png")
     with pytest.raises(UserError, match="crossgrad diagnose"):
-        ConflictSignature().label(scene, scene.views, RNG)
+        ConflictSignature().fit(scene, RNG)
 
 
 class VectorProbe:
@@ -71,21 +71,21 @@ class VectorProbe:
 def test_the_signature_splits_where_gradients_oppose():
     probe = VectorProbe([[1, 0], [-1, 0.1], [1, 0.1], [-1, 0]])
     scene = names("a.png", "b.png", "c.png", "d.png")
-    labels = ConflictSignature().label(scene, scene.views, RNG, probe).labels
+    labels = ConflictSignature().fit(scene, RNG, probe).labels(scene.views)
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
 def test_the_signature_ignores_lengths_and_zero_gradients():
     probe = VectorProbe([[1e-9, 0], [-3e7, 0], [2, 0], [0, 0]], [[1, 0], [-1, 0], [1, 0], [-2, 0]])
     scene = names("a.png", "b.png", "c.png", "d.png")
-    labels = ConflictSignature().label(scene, scene.views, RNG, probe).labels
+    labels = ConflictSignature().fit(scene, RNG, probe).labels(scene.views)
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
 def test_views_that_were_not_probed_follow_the_nearest_one():
     probe = VectorProbe([[1.0]] * 5 + [[-1.0]] * 5)
     scene = names(*(f"{i}.png" for i in range(10)))
-    labels = ConflictSignature(cameras=4).label(scene, scene.views, RNG, probe).labels
+    labels = ConflictSignature(cameras=4).fit(scene, RNG, probe).labels(scene.views)
     assert probe.asked == [0, 3, 6, 9]
     assert labels[:5] == (labels[0],) * 5
     assert labels[5:] == (labels[9],) * 5
@@ -105,14 +105,14 @@ def test_the_cut_survives_exact_opposition():
 
 def test_folders_are_labels():
     scene = names("street/1.png", "aerial/1.png", "street/deep/2.png")
-    labelling = Lists().label(scene, scene.views, RNG)
-    assert labelling.labels == ("street", "aerial", "street")
+    rule = Lists().fit(scene, RNG)
+    assert rule.labels(scene.views) == ("street", "aerial", "street")
 
 
 def test_one_folder_is_a_user_error():
     scene = names("a/1.png", "a/2.png")
     with pytest.raises(UserError, match="CSV"):
-        Lists().label(scene, scene.views, RNG)
+        Lists().fit(scene, RNG)
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def listed(tmp_path):
         file = tmp_path / "labels.csv"
         file.write_text(text)
         scene = names(*paths)
-        return Lists(file=file).label(scene, scene.views, RNG).labels
+        return Lists(file=file).fit(scene, RNG).labels(scene.views)
 
     return write
 
@@ -152,4 +152,4 @@ def test_a_bad_file_is_a_user_error_that_names_the_row(listed, text, found):
 def test_a_missing_file_is_a_user_error(tmp_path):
     scene = names("a.png", "b.png")
     with pytest.raises(UserError, match="cannot be read"):
-        Lists(file=tmp_path / "no.csv").label(scene, scene.views, RNG)
+        Lists(file=tmp_path / "no.csv").fit(scene, RNG)

@@ -211,18 +211,18 @@ class ChangesItsState(InTurn):
 
 
 class ForeignLabel(Radial):
-    def label(self, scene, views, rng, probe=None):
-        return api.Labelling(("close",) * len(views))
+    def fit(self, scene, rng, probe=None):
+        return api.Rule(lambda views: ("close",) * len(views))
 
 
 class OneLabelForAll(Radial):
-    def label(self, scene, views, rng, probe=None):
-        return api.Labelling(("near",))
+    def fit(self, scene, rng, probe=None):
+        return api.Rule(lambda views: ("near",))
 
 
 class EmptyGroup(Radial):
-    def label(self, scene, views, rng, probe=None):
-        return api.Labelling(("near",) * len(views))
+    def fit(self, scene, rng, probe=None):
+        return api.Rule(lambda views: ("near",) * len(views))
 
 
 class MeasuresRanks(Radial):
@@ -232,15 +232,18 @@ class MeasuresRanks(Radial):
 
 
 class FittedOnWhatIsAsked(Radial):
-    def label(self, scene, views, rng, probe=None):
-        far = (len(views) + 1) // 2
-        return api.Labelling(("far",) * far + ("near",) * (len(views) - far))
+    def fit(self, scene, rng, probe=None):
+        def labels(views):
+            far = (len(views) + 1) // 2
+            return ("far",) * far + ("near",) * (len(views) - far)
+
+        return api.Rule(labels)
 
 
 class GlobalLabels(Radial):
-    def label(self, scene, views, rng, probe=None):
+    def fit(self, scene, rng, probe=None):
         torch.rand(1)
-        return super().label(scene, views, rng, probe)
+        return super().fit(scene, rng, probe)
 
 
 class FlatImage(Torch):

@@ -6,11 +6,11 @@ import torch
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.scene import centers_of
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.run.export import renderer
-from crossgrad_core.scene.poses import centers_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

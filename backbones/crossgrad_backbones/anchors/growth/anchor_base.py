@@ -34,7 +34,7 @@ class AnchorDensifier(Densifier):
     keeps gathering.
     """
 
-    blocks: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
+    tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
     resets: ClassVar[bool] = False
 
     grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to grow at")

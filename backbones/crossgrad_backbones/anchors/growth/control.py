@@ -19,7 +19,7 @@ from crossgrad_core.contract.selection import Selection
 class AnchorControl(AnchorDensifier):
     """Grows anchors into free cells of three sizes, coarse ones first."""
 
-    blocks: ClassVar[frozenset[str]] = AnchorDensifier.blocks | {"voxel_size"}
+    tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {"voxel_size"}
 
     threshold_factor: float = Field(2.0, ge=1, description="factor of the threshold per level")
     levels: int = Field(3, ge=1, description="sizes of cells, from coarse to fine")

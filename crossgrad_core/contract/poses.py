@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.scene import Camera, Scene, View, centers_of
 from crossgrad_core.errors import UserError
 
 #: An axis, or where to take it from.
@@ -14,24 +14,21 @@ Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]
 
 #: Below this length the mean of the cameras' unit up axes says nothing (they point everywhere).
 _SHORTEST_MEAN = 0.1
-
-
-def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
-    """[V, 3] camera centres, local frame."""
-    if not views:
-        return np.zeros((0, 3))
-    return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)
+#: A median over fewer observed points says little; points in the image are taken instead.
+_FEWEST_SEEN = 3
+#: Points tested against the image of a view that observed too few.
+_MOST_TESTED = 50_000
 
 
 def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
     """[V] distance of each camera from the mean training camera centre, local units."""
-    middle = centers_of(scene.train_views).mean(axis=0)
+    middle = scene.centers.mean(axis=0)
     return np.asarray(np.linalg.norm(centers_of(views) - middle, axis=1))
 
 
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V] height of each camera along the unit axis `up` [3] over the mean training camera."""
-    middle = centers_of(scene.train_views).mean(axis=0)
+    middle = scene.centers.mean(axis=0)
     # Not a matrix product: its rounding depends on the number of rows, and a median cut falls
     # exactly on one of them.
     return np.asarray(((centers_of(views) - middle) * up).sum(axis=1))
@@ -83,7 +80,7 @@ def _flattest(scene: Scene) -> NDArray[np.float64]:
 
     Its sign puts the cameras above the SfM points or, where there are none, lets them look down.
     """
-    centers = centers_of(scene.train_views)
+    centers = scene.centers
     spread = centers - centers.mean(axis=0)
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]
     if len(scene.points):
@@ -95,27 +92,36 @@ def _flattest(scene: Scene) -> NDArray[np.float64]:
 
 
 def footprint_of(scene: Scene, view: View) -> float:
-    """Median of f/z [pixels per local unit] over the SfM points that a view observed.
+    """`footprint` of a view of the scene."""
+    return footprint(view.camera, scene.points, view.seen)
 
-    Over those in its image where it observed none; NaN where there is none either.
+
+def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int64]) -> float:
+    """Median of f / z [pixels per local unit] over the SfM points that a camera observed.
+
+    Over those in its image where it observed fewer than 3 in front of it; NaN where there is none.
+
+    Args:
+        camera: The camera, in the size of the photo as trained.
+        points: [P, 3] SfM points, local frame.
+        seen: Rows of `points` that it observed.
     """
-    depths = _depths(view.camera, scene.points[view.seen])
-    if len(depths) == 0:
-        depths = _depths(view.camera, scene.points, inside=True)
-    if len(depths) == 0:
+    depths = _in_front(camera, points[seen])[:, 2]
+    if len(depths) < _FEWEST_SEEN:
+        inside = _in_image(camera, points[:: max(1, len(points) // _MOST_TESTED)])[:, 2]
+        depths = inside if len(inside) else depths
+    if not len(depths):
         return float("nan")
-    return float(np.sqrt(view.camera.fx * view.camera.fy) / np.median(depths))
+    return float(np.sqrt(camera.fx * camera.fy) / np.median(depths))
 
 
-def _depths(
-    camera: Camera, points: NDArray[np.float64], *, inside: bool = False
-) -> NDArray[np.float64]:
-    """Depths of the points [P, 3] in front of the camera; with `inside`, in its image only."""
-    pose = camera.world_to_camera.numpy()
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    local = local[local[:, 2] > 0.0]
-    if inside:
-        x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-        y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-        local = local[(x >= 0.0) & (x <= camera.width) & (y >= 0.0) & (y <= camera.height)]
-    return np.asarray(local[:, 2])
+def _in_front(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    local = camera.local(points)
+    return local[local[:, 2] > 0.0]
+
+
+def _in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    local = _in_front(camera, points)
+    x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+    y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    return local[(x >= 0.0) & (x < camera.width) & (y >= 0.0) & (y < camera.height)]
