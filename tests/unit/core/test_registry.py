@@ -168,7 +168,7 @@ def test_a_plugin_may_say_itself_what_is_missing(install):
 
 
 @pytest.mark.parametrize(
-    ("name", "found"), [("seven", "7"), ("unfinished", "Unfinished without the methods label")]
+    ("name", "found"), [("seven", "7"), ("unfinished", "Unfinished without the methods fit")]
 )
 def test_what_is_no_component_is_refused(good, name, found):
     error = refusal("groupings", name)

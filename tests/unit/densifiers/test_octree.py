@@ -264,4 +264,4 @@ def test_times_stretch_with_the_run(total):
 def test_statistics_stop_with_growth():
     backbone, tensors = fresh()
     edit, state = OctreeControl().densify(context(tensors, backbone, step=25_000), PluginState())
-    assert not isinstance(edit, Edit) and not state.per_primitive
+    assert edit.is_empty and not state.per_primitive

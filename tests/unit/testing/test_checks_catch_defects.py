@@ -350,7 +350,7 @@ class OverridesTheUser(Vanilla):
 
 class Impatient(NoDensification):
     def densify(self, context, state):
-        return api.Edit(), state
+        return api.Edit(counts={"cloned": 1}), state
 
 
 class WrongRows(NoDensification):
