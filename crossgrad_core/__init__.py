@@ -1,3 +1,42 @@
-"""Core of crossgrad: training loop, plugin contract, data types and command line."""
+"""crossgrad from Python: `import crossgrad_core as cg`, `cg.run(...)`, `cg.resume`, `cg.open`.
 
-__version__ = "0.1.0"
+Everything is imported when it is first used; docs/python.md shows it at work.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from crossgrad_core.system.version import VERSION
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.scene import Camera
+    from crossgrad_core.errors import RunFailedError, UserError
+    from crossgrad_core.run.door import resume, run
+    from crossgrad_core.run.trained import Run, open  # noqa: A004
+
+__version__ = VERSION
+
+#: Name -> module that it comes from.
+_HOMES = {
+    "Camera": "crossgrad_core.contract.scene",
+    "Run": "crossgrad_core.run.trained",
+    "RunFailedError": "crossgrad_core.errors",
+    "UserError": "crossgrad_core.errors",
+    "open": "crossgrad_core.run.trained",
+    "resume": "crossgrad_core.run.door",
+}
+
+__all__ = ["Camera", "Run", "RunFailedError", "UserError", "__version__", "open", "resume", "run"]
+
+
+def __getattr__(name: str) -> object:
+    if name == "run":  # The room of that name, which can be called.
+        return import_module("crossgrad_core.run")
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    message = f"module {__name__!r} has no attribute {name!r}"
+    raise AttributeError(message)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,7 @@
 """The one error type that users see, and how it is worded."""
 
 import re
+from pathlib import Path
 from typing import Final
 
 #: Longest part of a message, and longest place; the middle of what is longer is left out.
@@ -57,3 +58,16 @@ def _showable(text: str) -> str:
 
 class IncompatibleSelectionError(UserError):
     """The selected components cannot work together; raised before training, with the reason."""
+
+
+class RunFailedError(Exception):
+    """Training failed; raised by `crossgrad_core.run` and `resume`. What there is was kept.
+
+    Args:
+        folder: The run's folder: results so far, log.txt, and checkpoints to go on from.
+        error: What went wrong.
+    """
+
+    def __init__(self, folder: Path, error: str) -> None:
+        self.folder = folder
+        super().__init__(f"{error}\nwhat there is is kept in {folder}")

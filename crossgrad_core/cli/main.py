@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 from typer.main import get_command
 
-from crossgrad_core import __version__
 from crossgrad_core.cli import evaluate, export, plugins, render, run
 from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.startup import finish
+from crossgrad_core.system.version import VERSION
 
 #: Exit status after bad input.
 BAD_INPUT = 2
@@ -32,7 +32,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"crossgrad {__version__}")
+        typer.echo(f"crossgrad {VERSION}")
         raise typer.Exit
 
 

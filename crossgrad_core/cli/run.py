@@ -311,7 +311,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
     announce(quiet=quiet)
     if resume is not None:
         refuse_beside_resume(resume, given)
-    from crossgrad_core.cli.settings import merged
+    from crossgrad_core.run.settings import merged
 
     of_the_command = (
         "config",

@@ -28,7 +28,7 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: What is said before and after a kernel is compiled; `cli/startup.py` counts on the words.
+#: What is said before and after a kernel is compiled; `system/startup.py` counts on the words.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 

@@ -5,10 +5,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import EvaluationResult
 from crossgrad_core.evaluation.evaluation import evaluate as measured
-from crossgrad_core.run.export import described, export_ply, renderer
+from crossgrad_core.run.export import Exported, described, export_ply, renderer
 from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_names import flat_names
@@ -17,12 +19,21 @@ from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.run.session import totals
 from crossgrad_core.system.writability import check_file, check_folder
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 _LOG = logging.getLogger(__name__)
+
+
+class Opens(Protocol):
+    """What opens a run."""
+
+    def open(self, folder: Path) -> tuple[Setup, TrainState]:
+        """The run's setup and its newest state."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -50,8 +61,17 @@ class How:
 AS_IT_IS = How()
 
 
-def evaluate(folder: Path, how: How = AS_IT_IS) -> None:
-    """Evaluates the held-out views of a run again; prints the table and renews per_view.csv.
+def evaluate(folder: Path, how: Opens = AS_IT_IS) -> None:
+    """Evaluates the held-out views of a run again; prints the table.
+
+    Raises:
+        UserError: See `evaluated`.
+    """
+    print(final_table(*evaluated(folder, how)))  # noqa: T201
+
+
+def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
+    """Evaluates the held-out views of a run again and renews per_view.csv.
 
     The folder of a run that is training, and one that may not be written to, is only read.
 
@@ -64,10 +84,10 @@ def evaluate(folder: Path, how: How = AS_IT_IS) -> None:
         result = measured(setup.scene.test_views, renderer(setup, state))
         if writes:
             write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
-        print(final_table(result, totals(setup, state)))  # noqa: T201
+        return result, totals(setup, state)
 
 
-def render(folder: Path, *, split: str, out: Path | None, how: How = AS_IT_IS) -> None:
+def render(folder: Path, *, split: str, out: Path | None, how: Opens = AS_IT_IS) -> None:
     """Draws photo | render | error of the views of a run.
 
     Raises:
@@ -98,8 +118,34 @@ def export(
     file_format: str,
     out: Path | None,
     camera: str | None = None,
-    how: How = AS_IT_IS,
+    how: Opens = AS_IT_IS,
 ) -> None:
+    """Writes the trained scene to a file that viewers open, and prints what is in it.
+
+    Args:
+        folder: The run's folder.
+        file_format: See `exported`.
+        out: See `exported`.
+        camera: See `exported`.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `exported`.
+    """
+    path, content = exported(folder, file_format=file_format, out=out, camera=camera, how=how)
+    for line in described(content, path):
+        print(line)  # noqa: T201
+    print(f"{content.gaussians:,} Gaussians in {path}")  # noqa: T201
+
+
+def exported(
+    folder: Path,
+    *,
+    file_format: str,
+    out: Path | None,
+    camera: str | None = None,
+    how: Opens = AS_IT_IS,
+) -> tuple[Path, Exported]:
     """Writes the trained scene to a file that viewers open.
 
     Args:
@@ -109,6 +155,9 @@ def export(
             something else.
         camera: Name of the view to bake for; by default the average over the training views.
         how: How the run is opened.
+
+    Returns:
+        The file and what is in it.
 
     Raises:
         UserError: It is no run, it has no checkpoint, the file exists, there is no such view or
@@ -125,10 +174,7 @@ def export(
             _check_new(path)
         else:
             path = out or folder / _own_name(folder, f"point_cloud.{file_format}", state.step)
-        exported = export_ply(setup, state, path, camera)
-        for line in described(exported, path):
-            print(line)  # noqa: T201
-        print(f"{exported.gaussians:,} Gaussians in {path}")  # noqa: T201
+        return path, export_ply(setup, state, path, camera)
 
 
 @contextmanager

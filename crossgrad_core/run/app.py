@@ -1,12 +1,11 @@
-"""What `crossgrad run` does: a new run, or one that goes on."""
+"""A run from its settings to its results: a new one, or one that goes on."""
 
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
@@ -19,7 +18,7 @@ from crossgrad_core.run.assemble import (
     schedule_of,
 )
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
-from crossgrad_core.run.ending import Course, last_words, resume_line
+from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
 from crossgrad_core.run.opening import continued, parsed, set_up
 from crossgrad_core.run.resolve import resolved
@@ -59,6 +58,32 @@ _LOG = logging.getLogger(__name__)
 FAILED = 1
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What has become of a run.
+
+    Attributes:
+        folder: Where its results are.
+        ending: How it ended.
+        signal: Number of the signal that stopped it; None where none did.
+    """
+
+    folder: Path
+    ending: Ending
+    signal: int | None
+
+    @property
+    def exit_code(self) -> int:
+        """0, 1 where training failed, 128 and the signal's number where one stopped the run."""
+        if self.ending.status == "failed":
+            return FAILED
+        return 0 if self.signal is None else exit_code(self.signal)
+
+
+#: Is told the results while signals are still only noted: table, folder and last words.
+Tell = Callable[[str, Path, Sequence[str]], None]
+
+
 def run(
     settings: Mapping[str, Any],
     *,
@@ -67,7 +92,7 @@ def run(
     verbosity: int = 0,
     accept_scene: bool = False,
 ) -> int:
-    """Trains, evaluates and exports.
+    """Trains, evaluates, exports, and prints the results: what `crossgrad run` does.
 
     Args:
         settings: What the user set, in the shape of `RunConfig`.
@@ -84,24 +109,41 @@ def run(
         UserError: The input is bad; nothing was written.
     """
     if resume is not None:
-        take = partial(continued, resume, settings, verbosity, accept_scene=accept_scene)
-        return _resume(resume, take)
+        way = Way(verbosity, _print_results)
+        return resumed(resume, settings, way, accept_scene=accept_scene).exit_code
     if accept_scene:
         raise UserError(
             "only a run that is continued has a scene to compare with",
             where="--accept-scene",
             todo="leave it out, or name the run with --resume",
         )
-    config = with_defaults(parsed(settings))
-    check_out(config.out)
-    check_folder(config.out or RUNS, SMALLEST_NEED)
-    setup, load_seconds = set_up(config, verbosity)
-    refuse_labels_for_nothing(setup)
-    refuse_settings_for_nothing(config, setup)
-    load_seconds += _held_out_decoded(setup)
     if dry_run:
-        _print_dry_run(setup)
+        _print_dry_run(_checked(settings, verbosity)[0])
         return 0
+    return new(settings, Way(verbosity, _print_results)).exit_code
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a run speaks.
+
+    Attributes:
+        verbosity: -1 quiet, 0 normal, 1 verbose.
+        tell: Is told the results.
+    """
+
+    verbosity: int
+    tell: Tell
+
+
+def new(settings: Mapping[str, Any], way: Way) -> Outcome:
+    """Trains a new run, evaluates and exports it.
+
+    Raises:
+        UserError: The input is bad; nothing was written.
+    """
+    setup, load_seconds = _checked(settings, way.verbosity)
+    config = setup.config
     check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
     compile_seconds = warm_up(setup)
     length: Length = Forecast(Planned(config.revisions))
@@ -116,7 +158,18 @@ def run(
         write_config(folder, setup.config)
         _write_scene(folder, setup)
         with way_on(resume_line(folder)):
-            return _train(setup, state, Session.fresh(folder, setup), length)
+            return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
+
+
+def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]:
+    """The setup of a new run, all that can be refused refused, and the seconds of loading."""
+    config = with_defaults(parsed(settings))
+    check_out(config.out)
+    check_folder(config.out or RUNS, SMALLEST_NEED)
+    setup, load_seconds = set_up(config, verbosity)
+    refuse_labels_for_nothing(setup)
+    refuse_settings_for_nothing(config, setup)
+    return setup, load_seconds + _held_out_decoded(setup)
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -179,7 +232,9 @@ def _held(folder: Path) -> Iterator[None]:
         yield
 
 
-def _train(setup: Setup, state: TrainState, session: Session, length: Length) -> int:
+def _train(
+    setup: Setup, state: TrainState, session: Session, length: Length, tell: Tell
+) -> Outcome:
     """Trains from `state` on and finishes the run's folder whatever happens."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
@@ -188,27 +243,38 @@ def _train(setup: Setup, state: TrainState, session: Session, length: Length) ->
         course = Course(setup, state, session, log, stopper)
         ending = course.to_the_end(length)
         table = final_table(session.result(state.step), totals(course.setup, state))
-        log.write(table)
-        print(table)  # noqa: T201 - the result of the command
-        print(f"results in {session.folder}")  # noqa: T201
-        for line in last_words(course):
-            log.write(line)
-            print(line, file=sys.stderr)  # noqa: T201
-    if ending.status == "failed":
-        return FAILED
-    return 0 if stopper.signal is None else exit_code(stopper.signal)
+        words = last_words(course)
+        for text in (table, *words):
+            log.write(text)
+        tell(table, session.folder, words)
+    return Outcome(session.folder, ending, stopper.signal)
 
 
-def _resume(folder: Path, take: Callable[[], tuple[Setup, TrainState]]) -> int:
+def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
+    print(table)  # noqa: T201 - the result of the command
+    print(f"results in {folder}")  # noqa: T201
+    for line in words:
+        print(line, file=sys.stderr)  # noqa: T201
+
+
+def resumed(
+    folder: Path, settings: Mapping[str, Any], way: Way, *, accept_scene: bool = False
+) -> Outcome:
     """Continues a run.
 
     Args:
         folder: The run's folder.
-        take: Answers what it is made of and the state that it goes on from.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
+        way: How it speaks.
+        accept_scene: Continue although photos, masks or points of the scene have changed.
+
+    Raises:
+        UserError: It is no run, it is finished or in use, a setting would change the training, or
+            the scene is another one.
     """
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
     with way_on(resume_line(folder)), _held(folder):
-        setup, state = take()
+        setup, state = continued(folder, settings, way.verbosity, accept_scene=accept_scene)
         if state.step >= setup.schedule.total and _is_described(folder, state.step):
             raise UserError(
                 "the run is finished",
@@ -221,7 +287,8 @@ def _resume(folder: Path, take: Callable[[], tuple[Setup, TrainState]]) -> int:
             state.clock.compile += warm_up(setup, state)
         _write_scene(folder, setup)
         session = Session.resumed(folder, setup, state.step)
-        return _train(setup, state, session, Forecast(Planned(setup.config.revisions)))
+        length = Forecast(Planned(setup.config.revisions))
+        return _train(setup, state, session, length, way.tell)
 
 
 def _held_out_decoded(setup: Setup) -> float:

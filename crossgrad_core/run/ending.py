@@ -30,11 +30,13 @@ class Ending:
         status: `finished`, `stopped` (resumable) or `failed`.
         error: What went wrong and what there is not therefore; None where nothing did.
         traced: Whether log.txt holds a traceback.
+        cause: The exception that ended training; None where none did.
     """
 
     status: Status
     error: str | None = None
     traced: bool = False
+    cause: BaseException | None = None
 
 
 @dataclass
@@ -147,7 +149,8 @@ class Course:
         if known is None or reason not in known:
             parts = [known, ": ".join(part for part in (missing, *steps_of(error), reason) if part)]
             known = "\n".join(part for part in parts if part)
-        self.ending = Ending("failed", known, self.ending.traced or traced)
+        before = self.ending
+        self.ending = Ending("failed", known, before.traced or traced, before.cause or error)
 
     def _info(self) -> RunInfo:
         setup = self.setup

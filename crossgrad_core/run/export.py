@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import View
+from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
@@ -116,12 +116,18 @@ def view_named(setup: Setup, name: str) -> View:
 
 def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
     """Renders a view with the current parameters as an evaluation does."""
+    through = camera_renderer(setup, state)
+    return lambda view: through(view.camera)
+
+
+def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
+    """Renders what any camera sees with the current parameters as an evaluation does."""
     background = eval_background(setup)
     phase = setup.phase(state.step, training=False)
 
-    def render_one(view: View) -> Tensor:
-        gaussians = setup.backbone.decode(state.parameters, view.camera, phase)
-        return setup.rasterizer.render(gaussians, view.camera, background).image
+    def render_one(camera: Camera) -> Tensor:
+        gaussians = setup.backbone.decode(state.parameters, camera, phase)
+        return setup.rasterizer.render(gaussians, camera, background).image
 
     return render_one
 

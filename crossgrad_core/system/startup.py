@@ -12,8 +12,8 @@ from typing import Final
 
 from typing_extensions import override
 
-from crossgrad_core import __version__
 from crossgrad_core.system.terminal import is_live
+from crossgrad_core.system.version import VERSION
 
 #: The logger that speaks of kernels, and how its messages begin.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
@@ -37,7 +37,7 @@ def announce(*, quiet: bool = False) -> None:
     level = logging.WARNING if quiet else logging.DEBUG
     logger.addHandler(_Startup(level))
     logger.setLevel(level)
-    logger.info("crossgrad %s: loading libraries", __version__)
+    logger.info("crossgrad %s: loading libraries", VERSION)
 
 
 def finish() -> None:

@@ -4,6 +4,14 @@ import os
 from typing import TextIO
 
 
+def shows_bar(stream: TextIO) -> bool:
+    """Whether a progress bar can move on the stream: on a live terminal, and below a notebook cell.
+
+    A notebook goes back to the start of a line, but knows no other sequence of a terminal.
+    """
+    return is_live(stream) or type(stream).__module__.startswith("ipykernel.")
+
+
 def is_live(stream: TextIO) -> bool:
     """Whether the stream is a terminal on which a line can be overwritten.
 

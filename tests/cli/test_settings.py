@@ -2,8 +2,8 @@
 
 import pytest
 
-from crossgrad_core.cli.settings import merged
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.settings import merged
 
 CONFIG = """
 steps: 100

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from crossgrad_core import __version__
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.folders import STATE, damaged
+from crossgrad_core.system.version import VERSION
 
 #: Version of the layout; raised whenever an older reader could misread a newer checkpoint.
 FORMAT = 1
@@ -15,7 +15,7 @@ FORMAT = 1
 
 def state_text(state: Mapping[str, Any]) -> str:
     """The content of state.json: `state` and the versions that wrote it."""
-    return json.dumps({"format": FORMAT, "crossgrad": __version__, **state}, indent=1)
+    return json.dumps({"format": FORMAT, "crossgrad": VERSION, **state}, indent=1)
 
 
 def check_json(value: object, where: str) -> None:
@@ -60,7 +60,7 @@ def read_state(folder: Path) -> dict[str, Any]:
         raise UserError(
             "checkpoint of another format version",
             where=folder,
-            expected=f"version {FORMAT} (crossgrad {__version__})",
+            expected=f"version {FORMAT} (crossgrad {VERSION})",
             found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
             todo="continue with the version of crossgrad that wrote it",
         )

@@ -5,8 +5,8 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from crossgrad_core import __version__
 from crossgrad_core.contract.state import Json
+from crossgrad_core.system.version import VERSION
 
 _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-image", "pycolmap", "pluggy", "pydantic")
 
@@ -21,7 +21,7 @@ def environment(device: str = "cpu") -> dict[str, Json]:
 
     packages: dict[str, Json] = {name: _version(name) for name in _PACKAGES}
     return {
-        "crossgrad": __version__,
+        "crossgrad": VERSION,
         "python": platform.python_version(),
         "packages": packages,
         "platform": platform.platform(),

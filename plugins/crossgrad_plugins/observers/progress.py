@@ -1,4 +1,4 @@
-"""Progress in the terminal: a bar, or plain lines where stderr is no terminal."""
+"""Progress in a terminal or notebook: a bar; elsewhere plain lines on stderr."""
 
 import sys
 from time import monotonic
@@ -16,7 +16,7 @@ from crossgrad_core.run.results.lines import (
     length_lines,
     progress_line,
 )
-from crossgrad_core.system.terminal import is_live
+from crossgrad_core.system.terminal import shows_bar
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -69,7 +69,7 @@ class Progress(Observer):
         if self.level == "quiet":
             return
         self._pace = self._pace.after(record)
-        if is_live(sys.stderr):
+        if shows_bar(sys.stderr):
             self._move_bar(record)
         elif self._line_is_due(record.step):
             self._last_line = monotonic()

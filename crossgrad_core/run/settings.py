@@ -41,7 +41,8 @@ def merged(
 
     Args:
         config: YAML file, or None.
-        options: Option name -> value; None and empty lists where the user did not give it.
+        options: Option name -> value; None and empty lists where the user did not give it. A name
+            may be that of a component's option, as in `operator.c`.
         assignments: `KEY=VALUE` texts, values in YAML.
 
     Raises:
@@ -49,19 +50,18 @@ def merged(
     """
     settings = {} if config is None else _normalized(read_mapping(config, *_FILE))
     chosen = {
-        _PLACES.get(name, (name,)): _plain(value)
+        _PLACES.get(name, tuple(name.split("."))): _plain(value)
         for name, value in options.items()
-        if value is not None and value != []
+        if not (value is None or (isinstance(value, list) and not value))
     }
     assigned = list(map(_parsed, assignments))
     if any(path in LENGTHS for path in (*chosen, *(path for path, _ in assigned))):
         # A new length replaces that of the file as a whole.
         settings = {key: value for key, value in settings.items() if (key,) not in LENGTHS}
-    for path, value in chosen.items():
-        _assign(settings, path, value)
     # Names first: choosing another component drops the options of the one it replaces.
-    for path, value in sorted(assigned, key=lambda each: not _is_name(each[0])):
-        _assign(settings, path, value)
+    for given in (list(chosen.items()), assigned):
+        for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
+            _assign(settings, path, value)
     return {key: _with_default_name(key, value) for key, value in settings.items()}
 
 
@@ -118,7 +118,11 @@ def _named(value: object) -> object:
 
 
 def _plain(value: object) -> object:
-    return str(value) if isinstance(value, Path) else value
+    """A value as YAML would give it: numbers of numpy become Python's."""
+    if isinstance(value, Path):
+        return str(value)
+    to_python = getattr(value, "item", None)
+    return to_python() if callable(to_python) and getattr(value, "ndim", None) == 0 else value
 
 
 def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:

@@ -1,0 +1,197 @@
+"""A trained run as an object: its figures, its views, its files.
+
+Figures are read without torch; it is imported by what renders.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.metrics_csv import read_metrics
+from crossgrad_core.run.results.summary import read_summary
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.scene import Camera, Scene
+    from crossgrad_core.evaluation.evaluation import EvaluationResult
+    from crossgrad_core.training.setup import Setup
+    from crossgrad_core.training.state import TrainState
+
+#: Name -> [E] numbers, integers where all of them are.
+Columns: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
+
+
+class Run:
+    """A run and its folder.
+
+    What is read from the folder (`metrics`, `summary`) is read anew each time, so that a run that
+    is training can be watched. The scene and the newest checkpoint are loaded when they are first
+    needed, and kept.
+
+    Args:
+        folder: The run's folder.
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        *,
+        device: str | None = None,
+        threads: int | None = None,
+        accept_scene: bool = False,
+    ) -> None:
+        self.folder = Path(folder).resolve()
+        self._opened = _Opened(device, threads, accept_scene)
+
+    @override
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder)!r})"
+
+    @property
+    def metrics(self) -> "Columns":
+        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN where there is none.
+
+        Raises:
+            UserError: There is no metrics.csv, or it does not hold numbers.
+        """
+        rows = read_metrics(self.folder)
+        names = list(rows[0]) if rows else []
+        return {name: _column([row[name] for row in rows]) for name in names}
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The content of summary.json.
+
+        Raises:
+            UserError: There is none: the run has not ended, or its process was killed.
+        """
+        return read_summary(self.folder)
+
+    @property
+    def scene(self) -> "Scene":
+        """The scene as the run sees it, in its local frame.
+
+        Raises:
+            UserError: It cannot be read, or is another one than the run was trained on.
+        """
+        return self._open()[0].scene
+
+    def render(self, view: "str | Camera") -> NDArray[np.float32]:
+        """What a camera sees, drawn as an evaluation does but not rounded to 8 bits.
+
+        Args:
+            view: Name of a view of the scene, or a camera in the scene's local frame, such as
+                `run.scene.views[0].camera`.
+
+        Returns:
+            [H, W, 3] in 0..1.
+
+        Raises:
+            UserError: There is no view of that name, or the run has no checkpoint.
+        """
+        import torch
+
+        from crossgrad_core.run.export import camera_renderer, view_named
+        from crossgrad_core.run.process import as_in_a_command
+
+        setup, state = self._open()
+        camera = view_named(setup, view).camera if isinstance(view, str) else view
+        with as_in_a_command(), torch.no_grad():
+            image = camera_renderer(setup, state)(camera).clamp(0.0, 1.0)
+            return np.asarray(image.cpu().numpy(), dtype=np.float32)
+
+    def evaluate(self) -> "EvaluationResult":
+        """Evaluates the held-out views again and renews per_view.csv, as `crossgrad eval` does.
+
+        Raises:
+            UserError: The run has no checkpoint, or its scene is another one.
+        """
+        from crossgrad_core.run.afterwards import evaluated
+        from crossgrad_core.run.process import as_in_a_command
+
+        with as_in_a_command():
+            return evaluated(self.folder, self._opened)[0]
+
+    def export(self, path: Path | str, camera: str | None = None) -> Path:
+        """Writes the trained scene as a PLY file that viewers open, as `crossgrad export` does.
+
+        Args:
+            path: The file.
+            camera: Name of the view to bake what depends on the view for; by default the average
+                over the training views.
+
+        Returns:
+            The file.
+
+        Raises:
+            UserError: The file exists or cannot be written, there is no such view, or the run has
+                no checkpoint.
+        """
+        from crossgrad_core.run.afterwards import exported
+        from crossgrad_core.run.process import as_in_a_command
+
+        with as_in_a_command():
+            out = Path(path)
+            exported(self.folder, file_format="ply", out=out, camera=camera, how=self._opened)
+            return out
+
+    def _open(self) -> "tuple[Setup, TrainState]":
+        from crossgrad_core.run.opening import require_checkpoint
+        from crossgrad_core.run.process import as_in_a_command
+
+        require_checkpoint(self.folder)
+        with as_in_a_command():
+            return self._opened.open(self.folder)
+
+
+def open(  # noqa: A001 - `cg.open` is the one that users see
+    folder: Path | str,
+    *,
+    device: str | None = None,
+    threads: int | None = None,
+    accept_scene: bool = False,
+) -> Run:
+    """A run that was trained before, or is being trained.
+
+    Args:
+        folder: The run's folder.
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+
+    Raises:
+        UserError: It is not the folder of a run.
+    """
+    read_config(Path(folder))
+    return Run(folder, device=device, threads=threads, accept_scene=accept_scene)
+
+
+def _column(numbers: Sequence[float | None]) -> NDArray[np.float64] | NDArray[np.int64]:
+    if all(isinstance(number, int) for number in numbers):
+        return np.array(numbers, dtype=np.int64)
+    return np.array(numbers, dtype=np.float64)
+
+
+class _Opened:
+    """Opens a run once for each of its checkpoints; see `Run` for the arguments."""
+
+    def __init__(self, device: str | None, threads: int | None, accept_scene: bool) -> None:
+        self._how = device, threads, accept_scene
+        self._kept: tuple[int, tuple[Setup, TrainState]] | None = None
+
+    def open(self, folder: Path) -> "tuple[Setup, TrainState]":
+        """The run's setup and its newest state."""
+        from crossgrad_core.run.afterwards import How
+
+        newest = max(complete_checkpoints(folder / CHECKPOINTS), default=0)
+        if self._kept is None or self._kept[0] != newest:
+            self._kept = newest, How(*self._how).open(folder)
+        return self._kept[1]
