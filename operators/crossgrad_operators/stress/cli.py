@@ -3,13 +3,11 @@
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.system.startup import announce
+from crossgrad_core.commands import Progress, UserError, announce, check_file
 
 if TYPE_CHECKING:
     import torch
@@ -108,7 +106,6 @@ def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     modes = {"--search": search, "--matrices": matrices, "--rows": rows}
     given = {"--case": case, "--elements": elements, "--type": precision, "--seed": seed}
     _refuse_idle(modes, {name: value for name, value in given.items() if value is not None})
-    from crossgrad_core.system.writability import check_file
     from crossgrad_operators.stress.suite import installed
 
     if csv is not None:
@@ -149,7 +146,7 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     from crossgrad_operators.stress.suite import run_suite
 
     chosen = [each for each in cases(large=elements) if (case or "") in each.name]
-    return _table(list(run_suite(names, chosen, progress=_progress)), csv)
+    return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
 
 
 def _rows(names: Sequence[str], dtypes: Types, rows: str, csv: Path | None) -> bool:
@@ -178,7 +175,7 @@ def _search(
 
     seed, seconds = extent
     wanted = Extent(seed=seed, seconds=seconds, dtypes=dtypes)
-    tallies = search(subjects(names), wanted, progress=_Clock(PAUSE).tick)
+    tallies = search(subjects(names), wanted, progress=_Clock().tick)
     typer.echo(as_text(tallies))
     if csv is not None:
         write_csv(tallies, csv)
@@ -192,9 +189,9 @@ def _matrices(
     from crossgrad_operators.stress.search.subject import subjects
 
     seed, matrices = extent
-    found = []
+    found, progress = [], Progress()
     for subject in subjects(names):
-        _progress(subject.name)
+        progress.tell(subject.name)
         found.append(run_finite(subject, matrices, seed, dtypes))
     typer.echo(as_text(found))
     if csv is not None:
@@ -205,16 +202,10 @@ def _matrices(
 class _Clock:
     """Prints how far a search is, now and then."""
 
-    def __init__(self, pause: float) -> None:
-        self._pause = pause
-        self._last = monotonic()
+    def __init__(self) -> None:
+        self._progress = Progress(PAUSE)
 
     def tick(self, turn: int, tallies: "Sequence[Tally]") -> None:
-        if monotonic() - self._last >= self._pause:
-            self._last = monotonic()
+        if self._progress.due:
             matrices, broken = (sum(getattr(t, n) for t in tallies) for n in ("matrices", "broken"))
-            _progress(f"round {turn}: {matrices} matrices, {broken} break a promise")
-
-
-def _progress(name: str) -> None:
-    typer.echo(f"... {name}", err=True)
+            self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a promise")

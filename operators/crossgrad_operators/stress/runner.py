@@ -8,11 +8,11 @@ from typing import Any, cast
 import numpy as np
 from torch import Tensor
 
+from crossgrad_core.commands import gathered
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_operators.stress.case import Case
 from crossgrad_operators.stress.oracles import Oracle
 from crossgrad_operators.stress.promises import ALL, Promise
@@ -139,7 +139,7 @@ def context_of(
         scene=cast("Any", None),
         states={},
         rng=np.random.default_rng(views.seed),
-        gradients=DenseGradients(gradients, blocks),
+        gradients=gathered(gradients, blocks),
         losses=np.ones(len(views.labels)),
         labels=views.labels,
         distances=np.array(views.ratios),

@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
+from crossgrad_core.commands import build
+from crossgrad_core.commands import names as installed_names
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.registry.entries import build, entries
 from crossgrad_operators.stress.case import Case
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.invariances import LAWS, run_law
@@ -16,7 +17,7 @@ from crossgrad_operators.stress.verdict import ExactCase, one_sign
 
 def installed() -> list[str]:
     """Names of all operators, third parties' too."""
-    return list(entries("operators"))
+    return installed_names("operators")
 
 
 def made(name: str) -> Operator:

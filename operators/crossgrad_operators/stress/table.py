@@ -1,10 +1,10 @@
 """The suite's results as text: operator x case, error and time side by side."""
 
-import csv
 from collections.abc import Sequence
 from math import isfinite, isnan
 from pathlib import Path
 
+from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.promises import PROMISED
 from crossgrad_operators.stress.runner import Cell
 
@@ -37,13 +37,18 @@ def failed(cells: Sequence[Cell]) -> list[Cell]:
 
 def write_csv(cells: Sequence[Cell], path: Path) -> None:
     """One row per cell."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["operator", "case", "verdict", "error_u_kappa", "microseconds", "reason"])
-        for c in cells:
-            found = c.finding
-            row = [found.verdict, found.error, c.microseconds, found.reason]
-            writer.writerow([c.operator, c.case, *row])
+    rows: list[dict[str, str | int | float]] = [
+        {
+            "operator": cell.operator,
+            "case": cell.case,
+            "verdict": cell.finding.verdict,
+            "error_u_kappa": cell.finding.error,
+            "microseconds": cell.microseconds,
+            "reason": cell.finding.reason,
+        }
+        for cell in cells
+    ]
+    write_table(path, rows)
 
 
 def _part(cells: Sequence[Cell], names: Sequence[str]) -> str:

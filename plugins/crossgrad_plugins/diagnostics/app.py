@@ -5,12 +5,16 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.run.app import FAILED, with_defaults
-from crossgrad_core.run.opening import opened, parsed
-from crossgrad_core.system.files import disk_errors
-from crossgrad_core.system.writability import check_file, check_folder
-from crossgrad_core.training.failure import TrainingFailedError
+from crossgrad_core.commands import (
+    FAILED,
+    TrainingFailedError,
+    UserError,
+    check_file,
+    check_folder,
+    configured,
+    disk_errors,
+    open_run,
+)
 from crossgrad_plugins.diagnostics.command import Options, diagnose_run, diagnose_scene
 from crossgrad_plugins.diagnostics.report import PICTURE, PROBES, Report
 
@@ -52,11 +56,11 @@ def diagnose(
         check_file(options.signature)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     if run is not None:
-        setup, state = opened(run, settings, -1, accept_scene=accept_scene)
+        setup, state = open_run(run, settings, accept_scene=accept_scene)
         report = diagnose_run(setup, state, run, options)
         folder = out or run / "diagnose" / stamp
     else:
-        config = with_defaults(parsed({**settings, "scene": scene}))
+        config = configured({**settings, "scene": scene})
         try:
             report = diagnose_scene(config, options)
         except TrainingFailedError as error:

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.commands import names
 from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import entries
 from crossgrad_core.scene.bimodality import bimodality
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
@@ -93,7 +93,7 @@ def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], 
     if len(set(regimes)) > 1:
         yield "regime", regimes, ""
     for name in GROUPINGS:
-        if name not in entries("groupings"):
+        if name not in names("groupings"):
             continue
         try:
             yield name, labelled(scene, name, seed)[0], ""

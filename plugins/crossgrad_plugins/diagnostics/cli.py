@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.system.startup import announce
+from crossgrad_core.commands import announce
 
 _PROBE = "Probe"
 _MODEL = "Model"

@@ -6,23 +6,23 @@ from typing import cast
 
 import numpy as np
 
-from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.contexts import Model
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.numerics.threads import configure_threads
-from crossgrad_core.registry.entries import build
-from crossgrad_core.run.assemble import assemble, read_scene
-from crossgrad_core.system.files import write_atomically
-from crossgrad_core.training.budget import steps_for
-from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-from crossgrad_core.training.loop import train
-from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.start import first_state, warm_up
-from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.stopper import Stopper
-from crossgrad_core.training.views import model_of
+from crossgrad_core.commands import (
+    ComponentChoice,
+    RunConfig,
+    Setup,
+    TrainingFailedError,
+    TrainState,
+    affordable_steps,
+    assemble,
+    begin,
+    build,
+    model_of,
+    read_scene,
+    take_steps,
+    with_steps,
+    write_atomically,
+)
+from crossgrad_core.plugin import Grouping, Model, Scene
 from crossgrad_plugins.diagnostics.plan import (
     DEFAULT_GROUPING,
     OF_THE_RUN,
@@ -71,7 +71,6 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
         UserError: The scene cannot be read, or the grouping cannot group it.
         TrainingFailedError: Training failed before the first probe.
     """
-    configure_threads(config.threads)
     vanilla = config.model_copy(
         update={
             "backbone": ComponentChoice(name="vanilla"),
@@ -81,36 +80,23 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
             "seed": options.seed,
         }
     )
-    scene, reader = read_scene(vanilla, cast("Path", vanilla.scene))
+    scene, reader = read_scene(vanilla)
     plan = _plan(scene, options)
     setup = assemble(vanilla, scene, reader)
-    steps = _affordable_steps(setup, options.seconds)
-    setup = replace(setup, schedule=Schedule.for_run(steps, vanilla.schedule))
+    steps = affordable_steps(setup, options.seconds)
+    setup = with_steps(setup, steps)
     watch = Watch(plan, max(1, steps // options.probes), steps, options.seed)
     setup.manager.register(watch, name="diagnostics")
-    state = first_state(setup)
+    state = begin(setup)
     model = f"a vanilla run of {steps} steps, one view each, in epoch order"
     try:
-        train(setup, state, _NoSink(), Stopper())
+        take_steps(setup, state)
     except TrainingFailedError as error:
         if watch.last is None:
             raise
         model = f"{model}, which failed; probed before that"
         return replace(_report(model, watch, model_of(setup, state), options), failure=str(error))
     return _report(model, watch, model_of(setup, state), options)
-
-
-def _affordable_steps(setup: Setup, seconds: float) -> int:
-    """How many steps fit into `seconds`; compiles the kernels first.
-
-    Raises:
-        TrainingFailedError: Not even the steps that are tried out can be taken.
-    """
-    try:
-        warm_up(setup)
-        return steps_for(setup, seconds)[0]
-    except NonFiniteError as error:
-        raise TrainingFailedError(str(error)) from error
 
 
 def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:
@@ -129,19 +115,6 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
         f"at step {state.step}"
     )
     return _report(which, watch, model, options)
-
-
-class _NoSink:
-    """The vanilla run leaves no results."""
-
-    def evaluate(self, setup: Setup, state: TrainState) -> None:
-        pass
-
-    def save(self, setup: Setup, state: TrainState) -> None:
-        pass
-
-    def rewind(self, setup: Setup, step: int) -> None:
-        pass
 
 
 def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:

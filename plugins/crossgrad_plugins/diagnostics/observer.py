@@ -5,9 +5,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field, PrivateAttr
 
-from crossgrad_core.contract.contexts import Model, RunInfo
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.observer import Observer
+from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
@@ -53,9 +51,10 @@ class Diagnostics(Observer):
         watch.crossgrad_model(model)
         folder = self._folder()
         if folder is not None and len(watch.rows) > found:
-            from crossgrad_plugins.diagnostics.report import PROBES, write_csv
+            from crossgrad_core.commands import write_table
+            from crossgrad_plugins.diagnostics.report import PROBES
 
-            write_csv(folder / PROBES, watch.rows)
+            write_table(folder / PROBES, watch.rows)
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:

@@ -9,10 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import BlockKind
-from crossgrad_core.contract.contexts import Model
-from crossgrad_core.gradients.separate import DenseGradients
-from crossgrad_core.training.loss.loss import photometric_loss
+from crossgrad_core.commands import gathered, view_gradients
+from crossgrad_core.plugin import BlockKind, Model
 
 #: Bytes that the gradients of all probed views may take together.
 MEMORY = 512 * 2**20
@@ -68,16 +66,16 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
     rows, share = _rows(model, len(views), rng)
     factors = _Subset(rows, {name for b in blocks if b.per_primitive for name in b.tensors}, share)
     names = [name for block in blocks for name in block.tensors]
-    gradients = [factors.of(_gradients(model, view, names)) for view in views]
+    train_views = model.scene.train_views
+    gradients = [factors.of(view_gradients(model, train_views[view], names)) for view in views]
     finite = [all(bool(torch.isfinite(g).all()) for g in each.values()) for each in gradients]
     kept = [each for each, good in zip(gradients, finite, strict=True) if good]
-    dense = DenseGradients(kept, blocks)
+    dense = gathered(kept, blocks)
     plain, overlap = dense.gramians("block"), dense.overlap("block")
     adam = None
     if model.adam.exp_avg_sq:
         _divide_by_adam(model, factors, kept)
-        adam = DenseGradients(kept, blocks).gramians("block")
-    train_views = model.scene.train_views
+        adam = gathered(kept, blocks).gramians("block")
     return Measurement(
         step=model.phase.step,
         views=tuple(view for view, good in zip(views, finite, strict=True) if good),
@@ -158,25 +156,6 @@ def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | 
     chosen = np.sort(rng.choice(total, size=max(1, fitting), replace=False))
     device = model.parameters[per_primitive[0]].device
     return torch.from_numpy(chosen).to(device), len(chosen) / total
-
-
-def _gradients(model: Model, index: int, names: Sequence[str]) -> _Gradients:
-    """Gradients of one view's photometric loss by tensor; absent where it touches none."""
-    view = model.scene.train_views[index]
-    wanted = {n: model.parameters[n] for n in names if model.parameters[n].requires_grad}
-    gaussians = model.backbone.decode(model.parameters, view.camera, model.phase)
-    image = model.rasterizer.render(gaussians, view.camera, model.background).image
-    mask = view.photo.mask()
-    loss = photometric_loss(
-        image,
-        view.photo.image().to(image.device),
-        None if mask is None else mask.to(image.device),
-        model.ssim_weight,
-    )
-    if not loss.requires_grad:
-        return {}
-    found = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)
-    return {n: g.detach() for n, g in zip(wanted, found, strict=True) if g is not None}
 
 
 def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradients]) -> None:

@@ -1,15 +1,17 @@
 """The results of diagnostics: CSV files, a picture, and a few lines for the terminal."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.system.files import write_atomically
-from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_core.commands import (
+    UserError,
+    parse_number,
+    read_rows,
+    write_atomically,
+    write_table,
+)
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of, touched
 
 PROBES = "diagnostics.csv"
@@ -48,9 +50,9 @@ class Report:
         """
         from crossgrad_plugins.diagnostics.figure import draw
 
-        write_csv(folder / PROBES, self.probes)
-        write_csv(folder / CAMERAS, self.cameras)
-        write_csv(folder / GROUPINGS, self.groupings)
+        write_table(folder / PROBES, self.probes)
+        write_table(folder / CAMERAS, self.cameras)
+        write_table(folder / GROUPINGS, self.groupings)
         write_atomically(folder / PICTURE, draw(self.title, self.probes, self.cameras))
 
     def lines(self) -> list[str]:
@@ -137,23 +139,8 @@ def _figure(value: float, form: str) -> str:
     return "-" if isnan(value) else format(float(format(value, form)) + 0.0, form)
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Writes rows with the union of their columns; a figure that is NaN is left empty.
-
-    Raises:
-        UserError: The disk is full, or the folder is read-only.
-    """
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({name: _cell(value) for name, value in row.items()})
-    write_atomically(path, text.getvalue().encode())
-
-
 def read_probes(path: Path) -> list[Row]:
-    """Rows that `write_csv` wrote of probes, empty cells as NaN; none where there is no file.
+    """Rows that `write_table` wrote of probes, empty cells as NaN; none where there is no file.
 
     Raises:
         UserError: The file cannot be read, or a row lacks cells or a step.
@@ -173,12 +160,6 @@ def read_probes(path: Path) -> list[Row]:
                 todo=todo,
             )
     return rows
-
-
-def _cell(value: float | str) -> str:
-    if isinstance(value, float):
-        return "" if isnan(value) else f"{value:.9g}"
-    return str(value)
 
 
 def _value(cell: str) -> str | int | float:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_core.commands import write_table
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.errors import UserError
@@ -15,7 +16,7 @@ from crossgrad_plugins.diagnostics import probe
 from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import ModelProbe, measure
-from crossgrad_plugins.diagnostics.report import read_probes, write_csv
+from crossgrad_plugins.diagnostics.report import read_probes
 from crossgrad_plugins.diagnostics.table import ALL, table
 from crossgrad_plugins.diagnostics.watch import Watch
 
@@ -94,12 +95,13 @@ def test_the_model_is_left_as_it_is(model):
 def made_up(monkeypatch, model, change=lambda view, gradients: gradients):
     """Replaces the gradients by random ones that are the same each time."""
 
-    def gradient(_, index, names):
+    def gradient(_, view, names):
+        index = model.scene.train_views.index(view)
         rng = torch.Generator().manual_seed(index)
         made = {n: torch.randn(model.parameters[n].shape, generator=rng) + 0.5 for n in names}
         return change(index, made)
 
-    monkeypatch.setattr(probe, "_gradients", gradient)
+    monkeypatch.setattr(probe, "view_gradients", gradient)
 
 
 def test_a_random_subset_of_primitives_is_right_on_average(model, monkeypatch):
@@ -226,7 +228,7 @@ def test_a_watch_that_saw_nothing_has_no_report():
 
 def test_tables_survive_the_file(tmp_path):
     rows = [{"step": 1, "b": 0.25, "c": "x"}, {"step": 2, "b": float("inf"), "d": "y"}]
-    write_csv(tmp_path / "t.csv", rows)
+    write_table(tmp_path / "t.csv", rows)
     found = read_probes(tmp_path / "t.csv")
     assert found[0] == {**rows[0], "d": pytest.approx(float("nan"), nan_ok=True)}
     assert found[1]["b"] == float("inf")

@@ -1,6 +1,5 @@
 """Whether results are finite, over very many short gradients."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Final
 import numpy as np
 import torch
 
+from crossgrad_core.commands import write_table
 from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_operators.stress.search.batch import Batch, results
 from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, rounded
@@ -101,9 +101,14 @@ def as_text(found: Sequence[Finite]) -> str:
 
 def write_csv(found: Sequence[Finite], path: Path) -> None:
     """One row per operator."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["operator", "matrices", "not_finite", "u_longest", "seconds"])
-        for each in found:
-            row = [each.matrices, each.not_finite, each.longest, round(each.seconds, 1)]
-            writer.writerow([each.operator, *row])
+    rows: list[dict[str, str | int | float]] = [
+        {
+            "operator": each.operator,
+            "matrices": each.matrices,
+            "not_finite": each.not_finite,
+            "u_longest": each.longest,
+            "seconds": round(each.seconds, 1),
+        }
+        for each in found
+    ]
+    write_table(path, rows)

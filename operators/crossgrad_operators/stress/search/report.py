@@ -1,9 +1,9 @@
 """What a search found, as text."""
 
-import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.search.specimens import Specimen
 from crossgrad_operators.stress.search.tally import Tally
 
@@ -47,14 +47,18 @@ def as_text(tallies: Sequence[Tally]) -> str:
 
 def write_csv(tallies: Sequence[Tally], path: Path) -> None:
     """One row per operator and type."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["operator", "type", *COUNTS, "error_u_kappa", "u_longest", "jump"])
-        for tally in tallies:
-            worst = [p[0] if p else None for p in (tally.inside_pool, tally.outside_pool)]
-            values = [each.value if each else "" for each in (*worst, tally.jump)]
-            counts = [getattr(tally, name) for name in COUNTS]
-            writer.writerow([tally.operator, tally.precision, *counts, *values])
+    write_table(path, [_row(tally) for tally in tallies])
+
+
+def _row(tally: Tally) -> dict[str, str | int | float]:
+    worst = [pool[0] if pool else None for pool in (tally.inside_pool, tally.outside_pool)]
+    figures = zip(("error_u_kappa", "u_longest", "jump"), (*worst, tally.jump), strict=True)
+    return {
+        "operator": tally.operator,
+        "type": tally.precision,
+        **{name: getattr(tally, name) for name in COUNTS},
+        **{name: each.value if each else "" for name, each in figures},
+    }
 
 
 def failed(tally: Tally) -> bool:

@@ -1,0 +1,272 @@
+"""The door for command rooms: what a command of a plugin needs of the core, from one place.
+
+Importing it is quick; what takes long (torch, numba) is imported when a function below is called
+or a class is asked for, so that a command says within two seconds that it has started: import this
+module at the top, call `announce()` first, and import `crossgrad_core.plugin` (the types of scenes,
+models and components) in the modules that do the work. What is listed here keeps its meaning within
+a minor version; see docs/plugins.md.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry import entries as registry
+from crossgrad_core.system.files import disk_errors, write_atomically
+from crossgrad_core.system.grouped import GroupedCommand
+from crossgrad_core.system.progress import Progress
+from crossgrad_core.system.startup import announce
+from crossgrad_core.system.tables import write_table
+from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_core.system.writability import check_file, check_folder
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from crossgrad_core.config import ComponentChoice, RunConfig
+    from crossgrad_core.contract.blocks import Block
+    from crossgrad_core.contract.component import Component
+    from crossgrad_core.contract.contexts import Model
+    from crossgrad_core.contract.gradients import SeparateGradients
+    from crossgrad_core.contract.scene import Scene, View
+    from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+    from crossgrad_core.training.setup import Setup
+    from crossgrad_core.training.state import TrainState
+
+__all__ = [
+    "FAILED",
+    "ComponentChoice",
+    "GroupedCommand",
+    "NonFiniteError",
+    "Progress",
+    "RunConfig",
+    "Setup",
+    "TrainState",
+    "TrainingFailedError",
+    "UserError",
+    "affordable_steps",
+    "announce",
+    "assemble",
+    "begin",
+    "build",
+    "check_file",
+    "check_folder",
+    "configured",
+    "disk_errors",
+    "gathered",
+    "model_of",
+    "names",
+    "open_run",
+    "parse_number",
+    "read_rows",
+    "read_scene",
+    "take_steps",
+    "view_gradients",
+    "with_steps",
+    "write_atomically",
+    "write_table",
+]
+
+#: Exit code of a command whose training failed.
+FAILED: Final = 1
+#: Classes that are imported when they are asked for -> where they are.
+_CLASSES: Final = {
+    "ComponentChoice": "crossgrad_core.config",
+    "NonFiniteError": "crossgrad_core.training.failure",
+    "RunConfig": "crossgrad_core.config",
+    "Setup": "crossgrad_core.training.setup",
+    "TrainState": "crossgrad_core.training.state",
+    "TrainingFailedError": "crossgrad_core.training.failure",
+}
+
+
+def __getattr__(name: str) -> object:
+    """The class of that name; imports its module."""
+    if name in _CLASSES:
+        return getattr(import_module(_CLASSES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def names(slot: str) -> list[str]:
+    """Names of the installed plugins of a slot such as `operators`, third parties' too, sorted.
+
+    Raises:
+        KeyError: There is no such slot.
+    """
+    return list(registry.entries(slot))
+
+
+def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
+    """The component of that name with validated options.
+
+    Raises:
+        UserError: There is none, it cannot be imported, or an option is wrong.
+    """
+    return registry.build(slot, name, options)
+
+
+def configured(settings: Mapping[str, Any]) -> "RunConfig":
+    """The configuration that `crossgrad run` would have, with scene and length filled in.
+
+    Args:
+        settings: As in a configuration file, components in their long form: `{"name": ...}`.
+
+    Raises:
+        UserError: A setting does not exist or has a wrong value.
+    """
+    from crossgrad_core.run.app import with_defaults
+    from crossgrad_core.run.opening import parsed
+
+    return with_defaults(parsed(settings))
+
+
+def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
+    """The scene of a configuration, and the name of the reader that read it.
+
+    Sets the number of CPU threads first.
+
+    Raises:
+        UserError: No reader accepts the folder, or the one that does cannot read it.
+    """
+    from crossgrad_core.numerics.threads import configure_threads
+    from crossgrad_core.run import assemble as assembling
+
+    configure_threads(config.threads)
+    if config.scene is None:
+        raise UserError("no scene is named", where="scene", todo="name its folder")
+    return assembling.read_scene(config, config.scene)
+
+
+def assemble(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
+    """Everything that a configuration names, loaded, fitted to the scene and checked.
+
+    Args:
+        config: The configuration.
+        scene: Its scene.
+        reader: Name of the reader that read the scene.
+
+    Raises:
+        UserError: A name or option is wrong, or the components cannot work together.
+    """
+    from crossgrad_core.run import assemble as assembling
+
+    return assembling.assemble(config, scene, reader)
+
+
+def with_steps(setup: "Setup", steps: int) -> "Setup":
+    """The run with the published schedule stretched to so many steps, whoever fills its slots."""
+    from crossgrad_core.contract.schedule import Schedule
+
+    return replace(setup, schedule=Schedule.for_run(steps, setup.config.schedule))
+
+
+def affordable_steps(setup: "Setup", seconds: float) -> int:
+    """How many steps fit into seconds of training; compiles the kernels first, off that clock.
+
+    Raises:
+        TrainingFailedError: Not even the steps that are tried out can be taken.
+    """
+    from crossgrad_core.training.budget import steps_for
+    from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+    from crossgrad_core.training.start import warm_up
+
+    try:
+        warm_up(setup)
+        return steps_for(setup, seconds)[0]
+    except NonFiniteError as error:
+        raise TrainingFailedError(str(error)) from error
+
+
+def begin(setup: "Setup") -> "TrainState":
+    """The state before the first step."""
+    from crossgrad_core.training.start import first_state
+
+    return first_state(setup)
+
+
+def take_steps(setup: "Setup", state: "TrainState") -> None:
+    """Trains to the end of the schedule without a folder: nothing is evaluated or saved.
+
+    `state` is moved on in place. Whoever wants to look on registers a plugin first,
+    `setup.manager.register(plugin, name=...)`.
+
+    Raises:
+        TrainingFailedError: Training failed; the state is the last one that was good.
+    """
+    from crossgrad_core.training.loop import train
+    from crossgrad_core.training.stopper import Stopper
+
+    train(setup, state, _NoFolder(), Stopper())
+
+
+def open_run(
+    folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
+) -> "tuple[Setup, TrainState]":
+    """A finished or stopped run and its newest state, to look at; it may be training meanwhile.
+
+    Args:
+        folder: The run's folder.
+        settings: Only `device` and `threads` may differ from the run's own.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, a setting would change the training, or the
+            scene is another one.
+    """
+    from crossgrad_core.run.opening import opened
+
+    return opened(folder, settings, -1, accept_scene=accept_scene)
+
+
+def model_of(setup: "Setup", state: "TrainState") -> "Model":
+    """The model of a run as plugins see it, for drawing views and for gradients."""
+    from crossgrad_core.training import views
+
+    return views.model_of(setup, state)
+
+
+def view_gradients(model: "Model", view: "View", tensors: Sequence[str]) -> "dict[str, Tensor]":
+    """Gradients of one view's photometric loss at the model's parameters, which stay as they are.
+
+    Args:
+        model: The model.
+        view: The view, of any part of the scene.
+        tensors: Names of tensors of `model.parameters`.
+
+    Returns:
+        Name -> gradient in the shape of its tensor; absent for a tensor that is frozen or that the
+        view does not touch.
+    """
+    from crossgrad_core.training import frozen
+
+    return frozen.view_gradients(model, view, tensors)
+
+
+def gathered(
+    per_view: "Sequence[Mapping[str, Tensor | None]]", blocks: "tuple[Block, ...]"
+) -> "SeparateGradients":
+    """The gradients of K views as operators get them: Gramians, overlaps, weighted sums.
+
+    Args:
+        per_view: Of each view, tensor name -> gradient or None; they stay as they are.
+        blocks: The blocks that the tensors belong to.
+    """
+    from crossgrad_core.gradients.separate import DenseGradients
+
+    return DenseGradients(per_view, blocks)
+
+
+class _NoFolder:
+    """Where the results of steps without a folder go."""
+
+    def evaluate(self, setup: "Setup", state: "TrainState") -> None:
+        pass
+
+    def save(self, setup: "Setup", state: "TrainState") -> None:
+        pass
+
+    def rewind(self, setup: "Setup", step: int) -> None:
+        pass

@@ -1,0 +1,38 @@
+"""Looking at a model without training it."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.contexts import Model
+from crossgrad_core.contract.scene import View
+from crossgrad_core.training.loss.loss import photometric_loss
+
+
+def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str, Tensor]:
+    """Gradients of one view's photometric loss at the model's parameters, which stay as they are.
+
+    Args:
+        model: The model.
+        view: The view, of any part of the scene.
+        tensors: Names of tensors of `model.parameters`.
+
+    Returns:
+        Name -> gradient in the shape of its tensor; absent for a tensor that is frozen or that the
+        view does not touch.
+    """
+    wanted = {n: model.parameters[n] for n in tensors if model.parameters[n].requires_grad}
+    gaussians = model.backbone.decode(model.parameters, view.camera, model.phase)
+    image = model.rasterizer.render(gaussians, view.camera, model.background).image
+    mask = view.photo.mask()
+    loss = photometric_loss(
+        image,
+        view.photo.image().to(image.device),
+        None if mask is None else mask.to(image.device),
+        model.ssim_weight,
+    )
+    if not loss.requires_grad:
+        return {}
+    found = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)
+    return {n: g.detach() for n, g in zip(wanted, found, strict=True) if g is not None}
