@@ -163,8 +163,7 @@ def diagnosed(scene, out):
 def test_a_training_that_fails_reports_its_probes_and_the_reason(
     scene, tmp_path, monkeypatch, capfd
 ):
-    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.steps_for", lambda *given: (40, ""))
-    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.warm_up", lambda setup: 0.0)
+    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.affordable_steps", lambda *given: 40)
     failing_from(monkeypatch, 25)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()
@@ -181,9 +180,8 @@ def test_a_training_that_fails_before_the_first_probe_says_so(
 ):
     if not compiling:
         monkeypatch.setattr(
-            "crossgrad_plugins.diagnostics.command.steps_for", lambda *given: (40, "")
+            "crossgrad_plugins.diagnostics.command.affordable_steps", lambda *given: 40
         )
-        monkeypatch.setattr("crossgrad_plugins.diagnostics.command.warm_up", lambda setup: 0.0)
     failing_from(monkeypatch, 1)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()
