@@ -10,13 +10,6 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response
 from crossgrad_core.contract.scene import Camera
 
-#: A Gaussian touches a pixel where its alpha reaches this value.
-ALPHA_THRESHOLD = 1.0 / 255.0
-#: Compositing stops before a blend that would bring the transmittance below this value.
-TRANSMITTANCE_STOP = 1e-4
-#: The Jacobian is evaluated inside the image plus this share of half its extent on either side.
-JACOBIAN_MARGIN = 0.3
-
 
 class Rasterizer(Component):
     """Draws Gaussians by one common rule set (see docs/rasterizers.md).

@@ -15,6 +15,7 @@ from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Elementwise, Granularity, SeparateGradients
 from crossgrad_core.gradients import exact, generic, native
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
+from crossgrad_core.gradients.passes import passes_of
 from crossgrad_core.gradients.squares import column_gramians, column_remainders
 
 KINDS: Final = ("geometry", "appearance", "neutral")
@@ -208,7 +209,7 @@ class DenseGradients(SeparateGradients):
         parts = []
         for block, columns, rows in self._by_block():
             touched = [c for c in columns if any(g is not None for g in c)]
-            passes = native if all(is_native(c) for c in touched) else generic
+            passes = passes_of(*touched)
             if touched and block.per_primitive:
                 parts.append(passes.row_gramians(touched, rows))
             else:
@@ -247,7 +248,7 @@ class DenseGradients(SeparateGradients):
         found = np.zeros_like(doubtful)
         for group, column in zip(self._groups(granularity).of_tensor, self._columns, strict=True):
             if doubtful[group] and not found[group]:
-                passes = native if is_native(column) else generic
+                passes = passes_of(column)
                 found[group] = passes.overlap(column, i, j)
         return found
 
@@ -256,7 +257,7 @@ class DenseGradients(SeparateGradients):
         for block, columns, rows in self._by_block():
             shared = np.zeros(rows, np.bool_)
             for column in columns:
-                passes = native if is_native(column) else generic
+                passes = passes_of(column)
                 if block.per_primitive:
                     passes.row_overlap(column, i, j, rows, shared)
                 else:
@@ -317,7 +318,7 @@ class DenseGradients(SeparateGradients):
                 if out is None:
                     continue
                 results[name] = out
-                passes = native if is_native(column) else generic
+                passes = passes_of(column)
                 passes.row_combine(column, part, out)
         self._spent = self._overwrite
         return results

@@ -93,8 +93,7 @@ class DensifierRun:
         require(isinstance(state, PluginState), f"the new state is {state!r}, not a PluginState")
         self._require_rows(state)
         self.state = state
-        if isinstance(edit, Edit):
-            self._apply(edit)
+        self._apply(edit)
         return edit
 
     def _rendered(self, index: int, step: int) -> ViewRecord:

@@ -17,7 +17,8 @@ from crossgrad_core.training.step import take_step
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.views import model_of
 
-Status = Literal["finished", "stopped", "paused"]
+#: Why the loop came back.
+Ending = Literal["finished", "stopped", "paused"]
 
 #: Steps between looks at all parameters. Losses and gradients are looked at in every step; a bad
 #: parameter that touches neither (a Gaussian that is not drawn any more) can wait so long.
@@ -48,7 +49,7 @@ def train(
     sink: Sink,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None = None,
-) -> Status:
+) -> Ending:
     """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
 
     Raises:
@@ -81,7 +82,7 @@ def _steps(
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None,
     keeper: Keeper,
-) -> Status:
+) -> Ending:
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
     while state.step < last and not stopper.requested:

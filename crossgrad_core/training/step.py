@@ -114,13 +114,13 @@ def _finish(
     else:
         edit, edited = _densify(setup, state, rendered)
         # In the published order an edit replaces tensors, whose gradients are then gone.
-        gone = set(gradients) if edited else set(edit.values if isinstance(edit, Edit) else ())
+        gone = set(gradients) if edited else set(edit.values)
         if state.step < setup.schedule.total:
             left = {name: g for name, g in gradients.items() if name not in gone}
             _optimize(setup, state, left, scale)
     if setup.acts_after_step:
         _after_step(setup, state, edited=edited)
-    return edit.counts if isinstance(edit, Edit) else {}
+    return edit.counts
 
 
 def _optimize(setup: Setup, state: TrainState, gradients: TensorGradients, scale: Scale) -> None:

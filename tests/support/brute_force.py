@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD, JACOBIAN_MARGIN, TRANSMITTANCE_STOP
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, JACOBIAN_MARGIN, TRANSMITTANCE_STOP
 
 Array: TypeAlias = NDArray[np.float64]
 

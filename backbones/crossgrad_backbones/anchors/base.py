@@ -21,10 +21,10 @@ from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.contexts import RegularizeContext, Regularized
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD
 from crossgrad_core.contract.scene import Camera, Scene
 from crossgrad_core.contract.schedule import Phase
 from crossgrad_core.errors import UserError
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.contract.rasterizer import ALPHA_THRESHOLD, Rasterizer
+from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.reference.compositing import (
     Drawing,

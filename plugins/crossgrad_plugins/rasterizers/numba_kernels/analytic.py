@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -39,7 +40,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
     COSINE,
-    LEAST_ALPHA,
     LOG2_E,
     REACH_1,
     REACH_2,
@@ -132,7 +132,7 @@ def squared_radius(opacity: float) -> float:
     a mean of F' over [t - h, t + h], sigma W is at most F'(0) exp(-TAIL d^2 / 2), so that alpha is
     at most 2 pi F'(0)^2 exp(-TAIL (d1^2 + d2^2) / 2) times the opacity.
     """
-    contrast = 2.0 * math.pi * (LINEAR / 4.0) ** 2 * opacity / LEAST_ALPHA
+    contrast = 2.0 * math.pi * (LINEAR / 4.0) ** 2 * opacity / ALPHA_THRESHOLD
     # The spare outweighs the rounding of everything that is compared with it.
     return 2.0 / TAIL * math.log(max(contrast, 1.0)) + SPARE
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.gaussians import Response
-from crossgrad_plugins.rasterizers.numba_kernels.ewa import Pinhole
+from crossgrad_plugins.rasterizers.numba_kernels.ewa import KernelCamera
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
@@ -92,7 +92,7 @@ class Projected:
         limits: [N, 2] int32, columns of 16 pixels that each record may touch; None for no limits.
     """
 
-    camera: Pinhole
+    camera: KernelCamera
     radii: Int32
     records: Float32
     owners: Int32

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -20,9 +21,7 @@ from crossgrad_core.numerics.simd import (
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
-    LEAST_ALPHA,
     SEGMENT,
-    STOP,
     TOUCH,
 )
 
@@ -45,7 +44,15 @@ OFFSETS = 14 * LANES  # pixel offsets of each column of segments
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     """Returns the constants for one cap of alpha, eight equal numbers each (offsets: 0, 1, ...)."""
-    shared = (max_alpha, TOUCH, STOP, 1.0, -1.0, math.log2(max_alpha), LEAST_ALPHA)
+    shared = (
+        max_alpha,
+        TOUCH,
+        TRANSMITTANCE_STOP,
+        1.0,
+        -1.0,
+        math.log2(max_alpha),
+        ALPHA_THRESHOLD,
+    )
     values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
     offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32)
     return np.concatenate([np.repeat(np.array(values, dtype=np.float32), LANES), offsets])

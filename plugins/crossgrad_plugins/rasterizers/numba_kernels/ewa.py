@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
-
-#: Jacobian clamp beyond the image, as a share of half the field of view.
-_MARGIN = 0.3
 
 #: px^4; footprints whose determinant is not larger are erased by the antialiased response.
 LEAST_DET = 1e-6
@@ -23,7 +21,7 @@ Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row]
 
 
-class Pinhole(NamedTuple):
+class KernelCamera(NamedTuple):
     """A camera as the kernels take it (all float64).
 
     Attributes:
@@ -50,12 +48,12 @@ class Pinhole(NamedTuple):
 
 def pinhole(
     viewmat: NDArray[np.floating], intrinsics: NDArray[np.floating], width: int, height: int
-) -> Pinhole:
+) -> KernelCamera:
     """Makes a camera from a world-to-camera matrix [4, 4] and K [3, 3]."""
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    extra_x, extra_y = _MARGIN * width / (2.0 * fx), _MARGIN * height / (2.0 * fy)
+    extra_x, extra_y = JACOBIAN_MARGIN * width / (2.0 * fx), JACOBIAN_MARGIN * height / (2.0 * fy)
     pose = np.array(viewmat, dtype=np.float64, order="C")[:3]
-    return Pinhole(
+    return KernelCamera(
         pose=pose,
         fx=fx,
         fy=fy,
@@ -114,7 +112,7 @@ def rotation(unit: Row) -> tuple[Triple, Triple, Triple]:
 
 @device
 def jacobian_rows(
-    camera: Pinhole, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
+    camera: KernelCamera, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
 ) -> tuple[Triple, Triple]:
     """Returns both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
     pose = camera.pose

@@ -10,6 +10,8 @@ so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of 
 
 import math
 
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+
 #: Pixels of a tile, a multiple of eight on both sides.
 TILE_WIDTH = 32
 TILE_HEIGHT = 16
@@ -51,10 +53,6 @@ SUM_U, SUM_V, SUM_SIGMA_1, SUM_SIGMA_2, SUM_TURN = 1, 2, 3, 4, 5
 
 LOG2_E = 1.0 / math.log(2.0)
 #: A pixel is touched where the exponent plus log2 of the opacity reaches this.
-TOUCH = -math.log2(255.0)
-#: The same as an alpha.
-LEAST_ALPHA = 1.0 / 255.0
+TOUCH = math.log2(ALPHA_THRESHOLD)
 #: Row extents are computed with this much to spare, so that rounding loses no touched pixel.
 SPARE = 1e-4
-#: Compositing stops before a blend that would bring the transmittance below this.
-STOP = 1e-4

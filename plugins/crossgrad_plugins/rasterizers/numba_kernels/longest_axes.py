@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.directions import BINS, FIELDS, SUMS
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
-    Pinhole,
+    KernelCamera,
     clamped,
     dot,
     in_registers,
@@ -29,7 +29,7 @@ _PLAIN_UNIT = 2.0 * math.log(2.0)
 
 @device
 def _axis(
-    camera: Pinhole,
+    camera: KernelCamera,
     mean: NDArray[np.float32],
     quat: NDArray[np.float32],
     scale: NDArray[np.float32],
@@ -59,7 +59,7 @@ def _axis(
 @kernel
 def longest_axes(
     jobs: Jobs,
-    camera: Pinhole,
+    camera: KernelCamera,
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],

@@ -5,10 +5,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import BLOCK, get, put
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
-    Pinhole,
+    KernelCamera,
     Row,
     Triple,
     clamped,
@@ -28,7 +29,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     DEPTH,
     GREEN,
-    LEAST_ALPHA,
     RECORD,
     RED,
 )
@@ -67,7 +67,7 @@ def _four(flat: NDArray[np.float32], k: int) -> Row:
 @device
 def _project_block(
     count: int,
-    camera: Pinhole,
+    camera: KernelCamera,
     dilation: float,
     antialiased: bool,
     means: NDArray[np.float32],
@@ -126,7 +126,7 @@ def _record_block(
     begin: int,
     size: int,
     first_record: int,
-    camera: Pinhole,
+    camera: KernelCamera,
     near: float,
     analytic: NDArray[np.float32] | None,
     limits: NDArray[np.int32] | None,
@@ -152,7 +152,7 @@ def _record_block(
             if z > near and z < math.inf:
                 # Seen by the published code, whether or not it touches a pixel.
                 radii[i] = published
-        if not (z > near and z < math.inf and opacity >= LEAST_ALPHA and opacity < math.inf):
+        if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
         if analytic is None:
             radius = plain_record(k, j, opacity, width, height, within, found, records, boxes)
@@ -175,7 +175,7 @@ def _record_block(
 @kernel
 def project(
     jobs: Jobs,
-    camera: Pinhole,
+    camera: KernelCamera,
     near: float,
     dilation: float,
     antialiased: bool,

@@ -17,7 +17,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.blocks import (
     put_three,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
-    Pinhole,
+    KernelCamera,
     clamped,
     covariance,
     dot,
@@ -77,7 +77,7 @@ _ROWS = _INVERSE_VARIANCE + 1
 @device
 def _unproject_block(
     count: int,
-    camera: Pinhole,
+    camera: KernelCamera,
     dilation: float,
     antialiased: bool,
     analytic: NDArray[np.float32] | None,
@@ -258,7 +258,7 @@ def _write_block(
 @kernel
 def unproject(
     jobs: Jobs,
-    camera: Pinhole,
+    camera: KernelCamera,
     dilation: float,
     antialiased: bool,
     analytic: NDArray[np.float32] | None,

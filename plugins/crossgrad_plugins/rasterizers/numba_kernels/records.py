@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     SIGMA_CEILING,
     SIGMA_FLOOR,
@@ -21,7 +22,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     DECAY,
     INVERSE_1,
     INVERSE_2,
-    LEAST_ALPHA,
     LOG2_E,
     LOG_OPACITY,
     PEAK,
@@ -256,7 +256,7 @@ def _covers(
     along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
     if abs(along) > reach[0] or abs(across) > reach[1]:
         return False
-    return opacity * window(along, sigma[0]) * window(across, sigma[1]) >= LEAST_ALPHA
+    return opacity * window(along, sigma[0]) * window(across, sigma[1]) >= ALPHA_THRESHOLD
 
 
 @device
@@ -279,7 +279,7 @@ def analytic_record(
     cosine, sine, variance_1, variance_2 = main_axes(a, get(found, COVARIANCE, k), c, det)
     sigma_1 = clamped(math.sqrt(variance_1), SIGMA_FLOOR, SIGMA_CEILING)
     sigma_2 = clamped(math.sqrt(variance_2), SIGMA_FLOOR, SIGMA_CEILING)
-    if not opacity * central_window(sigma_1) * central_window(sigma_2) >= LEAST_ALPHA:
+    if not opacity * central_window(sigma_1) * central_window(sigma_2) >= ALPHA_THRESHOLD:
         return 0
     squared = squared_radius(opacity)
     reach_1 = 0.5 + sigma_1 * math.sqrt(squared)
@@ -309,4 +309,4 @@ def analytic_record(
     records[at + REACH_1], records[at + REACH_2] = reach_1, reach_2
     records[at + RADIUS] = squared
     records[at + PEAK] = 2.0 * math.pi * opacity * sigma_1 * sigma_2
-    return _radius(math.sqrt(2.0 * math.log(opacity / LEAST_ALPHA) * max(a, c)))
+    return _radius(math.sqrt(2.0 * math.log(opacity / ALPHA_THRESHOLD) * max(a, c)))
