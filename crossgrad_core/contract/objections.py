@@ -24,14 +24,14 @@ def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
     if operator.views.admits(selection.views_per_step):
         return []
     name = selection.names["operator"]
-    return [f"operator {name} needs {operator.views}; K = {selection.views_per_step} was asked for"]
+    return [f"operator {name} needs {operator.views} (--views); K is {selection.views_per_step}"]
 
 
 def _of_the_sampler(selection: Selection) -> Iterator[str]:
     sampler, views, labels = selection.sampler, selection.views_per_step, selection.labels
     name = selection.names["sampler"]
     if not sampler.view_counts.admits(views):
-        yield f"sampler {name} needs {sampler.view_counts}; K = {views} was asked for"
+        yield f"sampler {name} needs {sampler.view_counts} (--views); K is {views}"
     if sampler.groups is not None and labels is not None and len(labels) != sampler.groups:
         yield (
             f"sampler {name} draws from {sampler.groups} groups; grouping "

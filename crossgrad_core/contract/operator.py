@@ -23,12 +23,20 @@ class Operator(Component):
         views: For which K the operator has a meaning.
         idle_at_one: Whether it leaves the gradient of a single view as it is. A run with K = 1 then
             says that the operator does nothing.
+        default_grouping: Name of the grouping it needs unless the user names another; None where
+            it needs no labels.
     """
 
     slot: ClassVar[str] = "operators"
     separate: ClassVar[bool] = True
     views: ClassVar[ViewCounts] = ViewCounts()
     idle_at_one: ClassVar[bool] = False
+    default_grouping: ClassVar[str | None] = None
+
+    @property
+    def usual_grouping(self) -> str | None:
+        """The grouping it needs with its options as they are, where the user names none."""
+        return self.default_grouping
 
     def does_nothing(self, views: int) -> bool:
         """Whether the result is the plain sum, whatever the gradients of that many views are."""

@@ -32,6 +32,8 @@ from crossgrad_core.training.setup import Setup
 _LOG = logging.getLogger(__name__)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
+#: Up to which K one that suits both sampler and operator is looked for.
+_MOST_VIEWS = 13
 
 
 def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
@@ -187,8 +189,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "Rasterizer",
         build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
     )
-    views = config.views or sampler.usual_views
-    grouping_choice = _grouping_choice(config, sampler, notes)
+    views = config.views or _usual_views(sampler, operator, notes)
+    grouping_choice = _grouping_choice(config, sampler, operator, notes)
     names = {
         "backbone": config.backbone.name,
         "sampler": config.sampler.name,
@@ -279,16 +281,30 @@ def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str,
     return options
 
 
+def _usual_views(sampler: Sampler, operator: Operator, notes: list[str]) -> int:
+    """K where the user names none: the sampler's, or the least that the operator allows, too."""
+    usual = sampler.usual_views
+    both = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
+    found = usual if operator.views.admits(usual) else next(filter(operator.views.admits, both), 0)
+    if found and found != usual:
+        notes.append(f"K = {found}: the operator needs {operator.views}")
+    # Where no K suits both, the objections say so.
+    return found or usual
+
+
 def _grouping_choice(
-    config: RunConfig, sampler: Sampler, notes: list[str]
+    config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]
 ) -> ComponentChoice | None:
     if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
-    if sampler.default_grouping is not None:
-        return _or_default(config.grouping, sampler.default_grouping)
+    # Labels that the sampler makes up leave a grouping nothing to do.
+    of_operator = None if sampler.own_labels else operator.usual_grouping
+    name = sampler.default_grouping or of_operator
+    if name is not None:
+        return _or_default(config.grouping, name)
     if config.grouping is not None:
         raise UserError(
-            f"sampler {config.sampler.name} uses no grouping that could have options",
+            "neither the sampler nor the operator uses a grouping that could have options",
             where="grouping",
             todo="name the grouping with --grouping, or leave its options out",
         )

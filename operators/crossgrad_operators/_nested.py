@@ -64,6 +64,11 @@ def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
     return any(isinstance(each, GramianOperator) and each.reads_gramians() for each in operators)
 
 
+def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
+    """The grouping that the first of them needs that needs one."""
+    return next(filter(None, (each.usual_grouping for each in operators)), None)
+
+
 def inner_state(state: PluginState, key: str) -> PluginState:
     """The part of a state that belongs to the inner operator of that key."""
     start = key + STATE_SEPARATOR

@@ -25,6 +25,7 @@ class Anchors(GramianOperator):
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
+    default_grouping: ClassVar[str | None] = "anchors"
 
     near: str = Field("near", description="label of the near anchors")
     far: str = Field("far", description="label of the far anchors")

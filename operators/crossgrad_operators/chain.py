@@ -16,6 +16,7 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_operators._nested import (
     OperatorField,
+    first_grouping,
     inner_idle,
     inner_objections,
     inner_state,
@@ -40,6 +41,11 @@ class Chain(GramianOperator):
     @override
     def does_nothing(self, views: int) -> bool:
         return views == 1 and all(link.does_nothing(views) for link in self.links)
+
+    @property
+    @override
+    def usual_grouping(self) -> str | None:
+        return first_grouping(self.links)
 
     @override
     def reads_gramians(self) -> bool:

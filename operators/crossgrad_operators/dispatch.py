@@ -17,6 +17,7 @@ from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import PluginState
 from crossgrad_operators._nested import (
     OperatorField,
+    first_grouping,
     inner_idle,
     inner_objections,
     inner_state,
@@ -74,6 +75,11 @@ class Dispatch(GramianOperator):
     @override
     def does_nothing(self, views: int) -> bool:
         return all(operator.does_nothing(views) for operator in self._operators().values())
+
+    @property
+    @override
+    def usual_grouping(self) -> str | None:
+        return first_grouping(self._operators().values())
 
     @override
     def reads_gramians(self) -> bool:

@@ -30,6 +30,7 @@ class GradNorm(GramianOperator):
     """
 
     idle_at_one: ClassVar[bool] = True
+    default_grouping: ClassVar[str | None] = "radial"
     alpha: float = Field(1.5, ge=0, description="how strongly slow groups are favoured")
     lr: float = Field(0.025, gt=0, description="step of log w")
     baseline: int = Field(50, ge=1, description="losses that make up a group's loss at the start")

@@ -3,8 +3,11 @@
 import pytest
 from support.selections import selection_of
 
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.objections import objections_to_views
 from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import sample_scene
 
 LABELLED = "operator {} needs labelled views; sampler random draws from no groups"
 
@@ -37,7 +40,7 @@ def test_anchors_need_near_and_far_views():
 
 def test_anchors_need_pairs():
     assert objections("anchors", "anchors-30", "anchors", views=4) == [
-        "operator anchors needs K = 2; K = 4 was asked for"
+        "operator anchors needs K = 2 (--views); K is 4"
     ]
 
 
@@ -45,3 +48,16 @@ def test_anchors_need_pairs():
 @pytest.mark.parametrize("views", [1, 2, 5])
 def test_other_operators_take_any_views(name, views):
     assert objections(name, "random", views=views) == []
+
+
+@pytest.mark.parametrize(
+    "operator", ["anchors", "gradnorm", {"name": "chain", "links": ["gradnorm"]}]
+)
+@pytest.mark.parametrize("sampler", ["epoch", "random", "fps"])
+def test_an_operator_brings_the_grouping_that_it_needs(operator, sampler):
+    config = RunConfig.model_validate(
+        {"steps": 10, "operator": operator, "sampler": {"name": sampler}}
+    )
+    setup = assemble(config, sample_scene(), "none")
+    assert {"near", "far"} <= set(setup.groups)
+    assert setup.operator.views.admits(setup.selection.views_per_step)
