@@ -50,9 +50,10 @@ def test_other_operators_take_any_views(name, views):
     assert objections(name, "random", views=views) == []
 
 
-@pytest.mark.parametrize(
-    "operator", ["anchors", "gradnorm", {"name": "chain", "links": ["gradnorm"]}]
-)
+CHAIN = {"name": "chain", "links": ["gradnorm"]}
+
+
+@pytest.mark.parametrize("operator", [{"name": "anchors"}, {"name": "gradnorm"}, CHAIN], ids=str)
 @pytest.mark.parametrize("sampler", ["epoch", "random", "fps"])
 def test_an_operator_brings_the_grouping_that_it_needs(operator, sampler):
     config = RunConfig.model_validate(

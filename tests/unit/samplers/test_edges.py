@@ -42,7 +42,7 @@ def test_other_numbers_of_views_are_refused_with_the_reason(name):
     for views in range(1, 7):
         refused = objections(sampler, name, views)
         assert (not refused) == (views in ADMITTED[name])
-        assert all(f"K = {views}" in reason and name in reason for reason in refused)
+        assert all(f"K is {views}" in reason and name in reason for reason in refused)
 
 
 @pytest.mark.parametrize("name", ADMITTED)

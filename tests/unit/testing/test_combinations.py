@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.combinations import as_lines, every_combination, from_lines, refused
 
 ROWS = list(product("abc", "de", "fgh", "ij"))
-REASONS = ("needs K = 2; K = 1 was asked for", "has no: tensors", "is late")
+REASONS = ("needs K = 2 (--views); K is 1", "has no: tensors", "is late")
 
 
 @given(
@@ -35,7 +35,7 @@ def test_a_reason_against_everything_names_nothing():
 
 
 def test_refusals_name_their_reasons_one_by_one():
-    row = ("epoch", "anchors", "vanilla", "adc")
+    row = ("three-way", "anchors", "vanilla", "anchor")
     assert row in every_combination()
     (reasons,) = refused([row]).values()
     assert len(reasons) == 2
