@@ -5,6 +5,7 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator
 
+from crossgrad_core import defaults
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import ScheduleMode
 
@@ -38,10 +39,12 @@ class RunConfig(BaseModel):
     )
     out: Path | None = Field(None, description="output folder")
 
-    backbone: ComponentChoice = ComponentChoice(name="vanilla")
-    sampler: ComponentChoice = ComponentChoice(name="random")
+    backbone: ComponentChoice = ComponentChoice(name=defaults.BACKBONE)
+    sampler: ComponentChoice = ComponentChoice(name=defaults.SAMPLER)
     grouping: ComponentChoice | None = None
-    operator: ComponentChoice | tuple[ComponentChoice, ...] = ComponentChoice(name="sum")
+    operator: ComponentChoice | tuple[ComponentChoice, ...] = ComponentChoice(
+        name=defaults.OPERATOR
+    )
     densifier: ComponentChoice | None = None
     rasterizer: ComponentChoice = ComponentChoice(name=AUTO)
     reader: ComponentChoice = ComponentChoice(name=AUTO)

@@ -10,6 +10,7 @@ from typer.main import get_command
 from crossgrad_core.cli import evaluate, export, plugins, render, run
 from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
+from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.startup import finish
@@ -22,7 +23,7 @@ app = typer.Typer(
     name="crossgrad",
     cls=WithPlugins,
     help="Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts.",
-    epilog="Example: crossgrad run SCENE --sampler near-far --operator symmetric",
+    epilog=f"Example: crossgrad run SCENE --sampler {GROUP_SAMPLER} --operator {EXAMPLE_OPERATOR}",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     add_completion=False,

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from crossgrad_core import defaults
 from crossgrad_core.contract.blocks import Block, Parameters
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians, Response
@@ -28,7 +29,7 @@ class Backbone(Component):
     """
 
     slot: ClassVar[str] = "backbones"
-    default_densifier: ClassVar[str] = "adc"
+    default_densifier: ClassVar[str] = defaults.DENSIFIER
     response: ClassVar[Response] = "plain"
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = False
@@ -66,7 +67,8 @@ class Backbone(Component):
             "this backbone cannot start from a PLY of Gaussians",
             where="--init",
             found=type(self).__name__,
-            todo="use --init points, or a backbone of explicit Gaussians such as vanilla",
+            todo="use --init points, or a backbone of explicit Gaussians such as "
+            f"{defaults.BACKBONE}",
         )
 
     def prepare(self, parameters: Parameters, scene: Scene, phase: Phase) -> Parameters:

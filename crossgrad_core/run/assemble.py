@@ -21,10 +21,12 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.defaults import CHAIN, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.idle import idle_note
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
@@ -48,9 +50,9 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
         reader = cast("Reader", build("readers", name, config.reader.options))
         if config.reader.name != AUTO or reader.accepts(path):
             return reader.read(path, config.reading), name
-    # No reader recognises it: the first one explains what it misses.
-    reader = cast("Reader", build("readers", "colmap", {}))
-    return reader.read(path, config.reading), "colmap"
+    # No reader recognises it: the default one explains what it misses.
+    reader = cast("Reader", build("readers", READER, {}))
+    return reader.read(path, config.reading), READER
 
 
 def check_names(config: RunConfig) -> None:
@@ -117,15 +119,6 @@ def _require_cuda(device: torch.device) -> None:
     )
 
 
-def choose_rasterizer(choice: ComponentChoice, device: torch.device) -> tuple[str, str]:
-    """The name of the rasterizer and why it was chosen."""
-    if choice.name != AUTO:
-        return choice.name, f"rasterizer {choice.name}: asked for"
-    if device.type == "cpu":
-        return "numba", "rasterizer numba: the fast one on a CPU"
-    return "torch", "rasterizer torch: the only one here that runs on CUDA (a slow reference)"
-
-
 def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     """Loads and checks everything that the configuration names.
 
@@ -183,8 +176,14 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes += left_out
     densifier_choice = _or_default(config.densifier, backbone.default_densifier)
     densifier = cast("Densifier", _built("densifiers", densifier_choice))
-    rasterizer_name, why = choose_rasterizer(config.rasterizer, device)
-    notes.append(why)
+    wanted = Wanted(
+        device=device.type,
+        response=backbone.response,
+        outputs=densifier.needs,
+        options=frozenset({"footprint"} if config.preset == "inria" else ()),
+    )
+    rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
+    notes += choosing
     rasterizer = cast(
         "Rasterizer",
         build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
@@ -226,8 +225,7 @@ def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule
 
 def growth_note(setup: Setup) -> tuple[str, ...]:
     """Says that density control is left out, where the run is too short for it."""
-    name = setup.selection.names["densifier"]
-    if name == "none" or setup.schedule.grows:
+    if not setup.densifier.edits or setup.schedule.grows:
         return ()
     start, end = setup.schedule.densify_from, setup.schedule.densify_until
     return (
@@ -261,7 +259,7 @@ def _operator(config: RunConfig) -> tuple[Operator, str]:
     if len(links) == 1:
         return cast("Operator", _built("operators", links[0])), links[0].name
     built = tuple(_built("operators", link) for link in links)
-    chain = build("operators", "chain", {"links": built})
+    chain = build("operators", CHAIN, {"links": built})
     return cast("Operator", chain), "+".join(link.name for link in links)
 
 
@@ -272,8 +270,8 @@ def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str,
             raise UserError(
                 f"rasterizer {name} does not have the footprint of the original code",
                 where="--preset inria",
-                expected="a rasterizer with the option footprint (numba, torch)",
-                todo="choose another rasterizer, or leave the preset out",
+                expected="a rasterizer with the option footprint",
+                todo="leave --rasterizer out: auto takes one that has it; or leave the preset out",
             )
         options.setdefault("footprint", "3-sigma")
         # The published near plane is 0.2 units of the input frame.

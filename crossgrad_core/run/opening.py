@@ -10,6 +10,7 @@ from typing import Any, cast
 from pydantic import ValidationError
 
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.validation import as_user_error
@@ -69,8 +70,8 @@ def set_up(
     scene = replace(scene, notes=(*notes, *scene.notes))
     seconds = perf_counter() - start
     level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
-    if not any(choice.name == "progress" for choice in config.observers):
-        progress = ComponentChoice.model_validate({"name": "progress", "level": level})
+    if not any(choice.name == PROGRESS for choice in config.observers):
+        progress = ComponentChoice.model_validate({"name": PROGRESS, "level": level})
         config = config.model_copy(update={"observers": (*config.observers, progress)})
     return assemble(config, scene, reader), seconds
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
+from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.training.setup import Setup
 
 
@@ -29,7 +30,7 @@ def resolved(setup: Setup) -> RunConfig:
             **chosen,
             "operator": _operator(config, setup),
             "reader": ComponentChoice(name=names["reader"]),
-            "observers": tuple(c for c in config.observers if c.name != "progress"),
+            "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,
             "reading": config.reading.model_copy(update={"init": init}),
             "out": None,

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeAlias
 import yaml
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
@@ -234,7 +235,7 @@ def _no_options(path: tuple[str, ...], depth: int) -> UserError:
 
 def _whose(links: list[object], path: tuple[str, ...]) -> UserError:
     names = [str(link.get("name")) for link in _links(links)]
-    whole = f"for all of them: --operator chain --set 'operator.links=[{listed(names)}]'"
+    whole = f"for all of them: --operator {CHAIN} --set 'operator.links=[{listed(names)}]'"
     return UserError(
         f"{path[0]} is a list; the option must say whose it is",
         where=f"--set {'.'.join(path)}",

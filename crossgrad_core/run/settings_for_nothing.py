@@ -11,6 +11,7 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
@@ -97,7 +98,7 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     """A grouping that somebody named and nobody looks at."""
     selection = setup.selection
     sampler, operator = selection.sampler, selection.operator
-    watched = any(choice.name != "progress" for choice in config.observers)
+    watched = any(choice.name != PROGRESS for choice in config.observers)
     named = config.grouping is not None and config.grouping.name != AUTO
     if not named or sampler.reads_groups or watched:
         return
@@ -107,7 +108,8 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
         yield (
             "grouping",
             f"sampler {selection.names['sampler']} draws from all views alike, and operator "
-            f"{selection.names['operator']} reads no labels; --sampler near-far draws from groups",
+            f"{selection.names['operator']} reads no labels; --sampler {GROUP_SAMPLER} "
+            "draws from groups",
         )
 
 

@@ -16,6 +16,7 @@ from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
+from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
@@ -80,7 +81,7 @@ class DensifierRun:
             **fields,
             parameters=self.parameters,
             backbone=self.backbone,
-            rasterizer=cast("Rasterizer", build("rasterizers", "torch", {})),
+            rasterizer=cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {})),
             views=tuple(self._rendered(index, step) for index in (step % 4, 4 + step % 5)),
             means_lr=1e-4,
             room=room,
@@ -167,7 +168,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 
 
 def _backbones() -> Iterator[Backbone]:
-    for name in sorted(entries("backbones"), key=lambda each: (each != "vanilla", each)):
+    for name in sorted(entries("backbones"), key=lambda each: (each != BACKBONE, each)):
         try:
             yield cast("Backbone", build("backbones", name, {}))
         except UserError:

@@ -32,6 +32,7 @@ from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.topology import NO_EDIT
+from crossgrad_core.defaults import BACKBONE, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
@@ -156,13 +157,13 @@ def seams_stay_answered(make: Make[Observer]) -> None:
 
 def _model(step: int) -> Model:
     """The model of a new run on the sample scene."""
-    backbone = cast("Backbone", build("backbones", "vanilla", {}))
+    backbone = cast("Backbone", build("backbones", BACKBONE, {}))
     parameters = created(backbone)
     return Model(
         phase=sample_phase(step),
         scene=sample_scene(),
         backbone=backbone,
-        rasterizer=cast("Rasterizer", build("rasterizers", "torch", {})),
+        rasterizer=cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {})),
         parameters=parameters,
         adam=AdamState(
             exp_avg={name: torch.zeros_like(tensor) for name, tensor in parameters.items()},
@@ -182,7 +183,7 @@ def _seams(hooks: Hooks, step: int) -> list[Answer]:
     sample = SampleContext(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=None
     )
-    quiet = cast("Densifier", build("densifiers", "none", {}))
+    quiet = cast("Densifier", build("densifiers", NO_DENSIFIER, {}))
     return [
         call_seam(hooks.crossgrad_sample_views, sample, Sampled),
         call_seam(

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.defaults import REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
@@ -198,7 +199,7 @@ def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
     """Image and gradients agree with rasterizer `torch`, the readable form of the rule set."""
     rasterizer = make()
     shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
-    reference = cast("Rasterizer", build("rasterizers", "torch", shared))
+    reference = cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, shared))
     for harmonics in (False, True):
         ours = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
         theirs = _moved(sample_gaussians(harmonics=harmonics), torch.device("cpu"))
@@ -222,8 +223,20 @@ def _same_gradient(name: str, ours: Tensor | None, theirs: Tensor | None) -> Non
     require(error < _GRADIENT, f"the gradient of {name} is {error:.2g} off the reference's")
 
 
+def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
+    """`--rasterizer auto` never takes it for a device on which it does not run."""
+    rasterizer = make()
+    for device in ("cpu", "cuda"):
+        speed = rasterizer.speed(device)
+        require(
+            speed == 0.0 or (speed > 0.0 and device in rasterizer.devices),
+            f"speed({device!r}) is {speed}, and devices are {sorted(rasterizer.devices)}",
+        )
+
+
 RASTERIZER_CHECKS: tuple[Check[Rasterizer], ...] = (
     *COMPONENT_CHECKS,
+    speed_says_where_it_runs,
     renders_have_the_shape,
     the_background_shows_through,
     nothing_to_draw_is_no_error,

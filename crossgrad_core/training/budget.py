@@ -205,7 +205,7 @@ def _cost_ahead(setup: Setup, step: int, left: int) -> float:
 
 
 def _growth(setup: Setup, schedule: Schedule, step: int) -> float:
-    if setup.selection.names["densifier"] == "none":
+    if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
     done = schedule.edits() - ahead

@@ -4,6 +4,7 @@ import numpy as np
 
 from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.defaults import SAMPLER
 from crossgrad_core.scene.bimodality import bimodality
 
 #: Sarle's coefficient of a uniform sample, cut off: what lies below has one mode.
@@ -33,5 +34,5 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
     return (
         f"grouping {name} splits what has one mode: the bimodality of {quantity.name} is "
         f"{figure:.2f} over {found.size} training views (below {ONE_MODE}), so the split is "
-        "arbitrary there; sampler random needs none",
+        f"arbitrary there; sampler {SAMPLER} needs none",
     )

@@ -47,6 +47,11 @@ class TorchRasterizer(Rasterizer):
 
     footprint: Footprint = Field("alpha", description=DESCRIPTION)
 
+    @classmethod
+    @override
+    def speed(cls, device: str) -> float:
+        return 1.0 if device in cls.devices else 0.0
+
     @override
     def render(
         self,

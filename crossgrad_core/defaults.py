@@ -1,0 +1,28 @@
+"""The plugins that the core names: what a run takes where the user names none, and examples.
+
+No other file of the core names a plugin of a shelf.
+"""
+
+from typing import Final
+
+#: What a run takes where the user names nothing.
+BACKBONE: Final = "vanilla"
+SAMPLER: Final = "random"
+OPERATOR: Final = "sum"
+#: The densifier of a backbone that names none.
+DENSIFIER: Final = "adc"
+#: The reader that says what is missing in a folder that no reader accepts.
+READER: Final = "colmap"
+#: The operator that runs the links of `--operator a+b`.
+CHAIN: Final = "chain"
+#: The observer that every run has.
+PROGRESS: Final = "progress"
+
+#: What contract checks draw with, and the densifier that they switch edits off with.
+REFERENCE_RASTERIZER: Final = "torch"
+NO_DENSIFIER: Final = "none"
+
+#: A sampler that draws from groups, an operator and a chain: examples in help and in hints.
+GROUP_SAMPLER: Final = "near-far"
+EXAMPLE_OPERATOR: Final = "symmetric"
+EXAMPLE_CHAIN: Final = "preconditioner+symmetric"

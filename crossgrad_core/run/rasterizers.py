@@ -1,0 +1,81 @@
+"""Which rasterizer draws where the user names none."""
+
+from dataclasses import dataclass
+from typing import cast
+
+from crossgrad_core.config import AUTO
+from crossgrad_core.contract.gaussians import Response
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import entries, load
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a run asks of its rasterizer.
+
+    Attributes:
+        device: Torch device type.
+        response: The backbone's pixel response.
+        outputs: Optional outputs that the densifier needs.
+        options: Options that a preset sets.
+    """
+
+    device: str
+    response: Response
+    outputs: frozenset[str] = frozenset()
+    options: frozenset[str] = frozenset()
+
+    def given_by(self, rasterizer: type[Rasterizer]) -> bool:
+        """Whether a rasterizer can do all of it."""
+        return (
+            self.response in rasterizer.responses
+            and self.outputs <= rasterizer.provides
+            and self.options <= rasterizer.model_fields.keys()
+        )
+
+
+def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
+    """The name of the rasterizer, and notes on why it was chosen.
+
+    Every installed one says how fast it is on the device; the fastest that can do what is wanted is
+    taken, of equally fast ones the first by name. One that cannot be imported is left out.
+
+    Args:
+        name: What the user asked for; `auto` leaves it open.
+        wanted: What the run asks of it.
+
+    Raises:
+        UserError: It is left open, and no installed rasterizer runs on the device.
+    """
+    if name != AUTO:
+        return name, (f"rasterizer {name}: asked for",)
+    speeds, notes = _speeds(wanted)
+    if not speeds:
+        raise UserError(
+            f"no installed rasterizer runs on device {wanted.device}",
+            where="--rasterizer",
+            todo="install one, or use --device cpu",
+        )
+    chosen = min(speeds, key=lambda each: (-speeds[each], each))
+    others = [each for each in speeds if each != chosen]
+    why = f"the fastest of {len(speeds)} here" if others else "the only one here that runs"
+    return chosen, (*notes, f"rasterizer {chosen}: {why} on {wanted.device}")
+
+
+def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Name -> speed of those that do all that is wanted, or else of all; notes on the others."""
+    able: dict[str, float] = {}
+    running: dict[str, float] = {}
+    notes = []
+    for name in entries("rasterizers"):
+        try:
+            rasterizer = cast("type[Rasterizer]", load("rasterizers", name))
+        except UserError as error:
+            notes.append(f"rasterizer {name} left out: {error.what}")
+            continue
+        if (speed := rasterizer.speed(wanted.device)) > 0.0:
+            running[name] = speed
+            if wanted.given_by(rasterizer):
+                able[name] = speed
+    return able or running, tuple(notes)
