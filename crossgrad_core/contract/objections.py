@@ -10,7 +10,7 @@ from crossgrad_core.contract.selection import HasIdleOptions, Selection
 
 
 def objections_to(selection: Selection) -> list[str]:
-    """Why the selection cannot work, whoever wrote its components."""
+    """Why the selection cannot work, for components of any author."""
     return [
         *_of_the_sampler(selection),
         *objections_to_views(selection.operator, selection),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Up to this many elements one core is done before the others are awake.
+#: Up to this many elements one core is faster than several.
 SMALL: Final = 1 << 17
 
 

@@ -1,4 +1,4 @@
-"""What the pairwise projections share."""
+"""Orders and gates of pairwise projections."""
 
 import numpy as np
 from numpy.typing import NDArray

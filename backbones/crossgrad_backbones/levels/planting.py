@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_backbones.levels.lattice import Lattice
-from crossgrad_core.splats import nearest_neighbour_scales
+from crossgrad_backbones.neighbours import nearest_neighbour_scales
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from crossgrad_core.contract.schedule import Phase
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.numerics.elementwise import sigmoid
-from crossgrad_core.splats import rotation_matrices
+from crossgrad_core.numerics.rotations import rotation_matrices
 
 #: A split divides the scales by this (3DGS).
 SPLIT_SHRINK = 1.6

@@ -10,7 +10,7 @@ from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, s
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Rows
 from crossgrad_core.numerics.elementwise import logsigmoid
-from crossgrad_core.splats import rotation_matrices
+from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,

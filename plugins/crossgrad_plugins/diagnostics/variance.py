@@ -10,7 +10,7 @@ from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 
 @dataclass(frozen=True)
 class VarianceSplit:
-    """Unbiased estimates of the paper's variances; `between` may be negative by chance.
+    """Unbiased estimates of the paper's variances; `between` may come out negative.
 
     Attributes:
         within: sigma_w^2, weighted mean over groups of E||g - group mean||^2.

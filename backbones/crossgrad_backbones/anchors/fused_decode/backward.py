@@ -1,4 +1,4 @@
-"""The way back from the gradients of the Gaussians to those of features and networks."""
+"""The backward pass from the gradients of the Gaussians to those of features and networks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the fused decoding takes, and what it keeps for the way back."""
+"""What the fused decoding takes, and what it keeps for the backward pass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What the way back needs besides the inputs; G Gaussians are drawn.
+    """What the backward pass needs besides the inputs; G Gaussians are drawn.
 
     Attributes:
         joined: [A or more, F + V] inputs of the networks, padded with rows of 0.

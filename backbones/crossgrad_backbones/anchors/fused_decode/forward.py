@@ -17,7 +17,7 @@ STRETCH = 2048
 
 
 def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
-    """The G Gaussians of positive opacity, and what the way back needs.
+    """The G Gaussians of positive opacity, and what the backward pass needs.
 
     Returns:
         Means, quaternions, scales, opacities, colours, origin [G] and slot [G].

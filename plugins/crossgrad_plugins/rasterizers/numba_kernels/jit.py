@@ -1,7 +1,7 @@
 """How the kernels of this package are compiled: IEEE arithmetic in the order written.
 
-Without fast-math results do not depend on the compiler's mood, and infinities and NaN are seen by
-the tests that look for them.
+Without fast-math results do not depend on the compiler's choices, and infinities and NaN are seen
+by the tests that look for them.
 """
 
 from collections.abc import Callable

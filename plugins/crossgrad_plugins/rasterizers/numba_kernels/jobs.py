@@ -1,4 +1,4 @@
-"""Jobs that threads share: whoever is free takes the next one.
+"""Jobs that threads share: each takes the next one when it is done.
 
 A kernel takes jobs until there are none left,
 

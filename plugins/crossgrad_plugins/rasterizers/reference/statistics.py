@@ -52,7 +52,7 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """The same table [V, C], noted on the way back, and a probe [V, R].
+    """The same table [V, C], noted in the backward pass, and a probe [V, R].
 
     The first two columns are projected means. The probe reaches the pixels as means do and changes
     nothing there; what comes back to it as its gradient are sums over pixels (see `offsets`).

@@ -1,9 +1,7 @@
-"""Small geometry that several backbones and densifiers share."""
+"""Distances to nearest neighbours."""
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 #: Floor of the mean squared neighbour distance (3DGS), in squared local units.
 SQUARED_DISTANCE_FLOOR = 1e-7
@@ -28,14 +26,3 @@ def nearest_neighbour_scales(points: NDArray[np.float64]) -> NDArray[np.float64]
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
     squared = np.mean(distances[:, 1:] ** 2, axis=1)
     return np.asarray(np.sqrt(np.maximum(squared, SQUARED_DISTANCE_FLOOR)))
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotations of quaternions wxyz [N, 4], normalised first."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
