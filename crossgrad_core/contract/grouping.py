@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.contexts import Model
 from crossgrad_core.contract.scene import Scene, View
 
 
@@ -94,3 +95,21 @@ class Grouping(Component):
             None (the default) for rules that look at more than one number per view.
         """
         return None
+
+
+class Regrouping(Grouping):
+    """A grouping that is fitted anew once the model has learnt something."""
+
+    @property
+    @abstractmethod
+    def refit_after(self) -> int:
+        """The step after which the training views are grouped anew."""
+
+    @abstractmethod
+    def refit(self, model: Model, rng: np.random.Generator) -> Rule:
+        """The rule for the rest of the run.
+
+        Args:
+            model: The model after step `refit_after`; nothing in it may be changed.
+            rng: The only source of random numbers.
+        """

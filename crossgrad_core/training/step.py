@@ -27,6 +27,7 @@ from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.operator_scale import Scale
+from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import (
@@ -45,6 +46,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     Raises:
         NonFiniteError: A loss or gradient is not finite; `state` is then not usable any more.
     """
+    regroup_if_due(setup, state)
     state.step += 1
     draw = _sample(setup, state)
     rendered = render_views(setup, state, draw)
@@ -73,7 +75,7 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     context = SampleContext(
         **_common(setup, state, "sampler"),
         views_per_step=setup.selection.views_per_step,
-        groups=setup.groups,
+        groups=groups_of(setup, state),
         centers=setup.scene.centers,
         last=state.last,
     )

@@ -9,10 +9,12 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
+from crossgrad_core.contract.contexts import Model
+from crossgrad_core.contract.grouping import GradientProbe, Regrouping, Rule
 from crossgrad_core.contract.poses import radial_distances
 from crossgrad_core.contract.scene import Scene, View, centers_of
 from crossgrad_core.errors import UserError
+from crossgrad_plugins.groupings.radial import Radial
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
@@ -25,18 +27,20 @@ from crossgrad_plugins.groupings.split import (
 _SMALLEST_GAP = 1e-9
 
 
-class ConflictSignature(Grouping):
+class ConflictSignature(Regrouping):
     """The two sides of the spectral cut of the cosines between the cameras' gradients.
 
     Gradients are normalised per block, their cosines averaged over blocks; (1 + cosine) / 2 is the
     similarity. The side with the smaller mean radial distance is near. A view that was not probed
-    has the label of the nearest probed camera.
+    has the label of the nearest probed camera. Until there are gradients to look at, after step
+    `at`, the views are grouped as by `radial`.
 
     Source: the paper names it without a definition; this one is ours.
     """
 
     needs_probe: ClassVar[bool] = True
 
+    at: int = Field(500, ge=1, description="step after which gradients group the views")
     cameras: int = Field(
         96, ge=2, description="probe at most so many training views, evenly spaced by name"
     )
@@ -47,12 +51,9 @@ class ConflictSignature(Grouping):
     ) -> Rule:
         require_training_views(scene, "conflict-signature")
         if probe is None:
-            raise UserError(
-                "grouping conflict-signature needs the gradients of a trained model",
-                where="grouping",
-                todo="write its labels with `crossgrad diagnose SCENE --signature LABELS.csv` and "
-                "use them with --grouping lists --set grouping.file=LABELS.csv",
-            )
+            early = Radial().fit(scene, rng)
+            later = f"grouping conflict-signature: by gradients after step {self.at}, until then:"
+            return Rule(early.labels, (later, *early.notes))
         count = min(self.cameras, len(scene.train))
         probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
         cosines = mean_cosines(probe.gramians([int(i) for i in probed]))
@@ -69,6 +70,22 @@ class ConflictSignature(Grouping):
 
         note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
         return Rule(labels, (note,))
+
+    @property
+    @override
+    def refit_after(self) -> int:
+        return self.at
+
+    @override
+    def refit(self, model: Model, rng: np.random.Generator) -> Rule:
+        from crossgrad_plugins.diagnostics.probe import ModelProbe
+
+        try:
+            return self.fit(model.scene, rng, ModelProbe(model, rng))
+        except UserError as error:
+            # Gradients that all agree make one group; a run goes on with those it has.
+            early = Radial().fit(model.scene, rng)
+            return Rule(early.labels, (f"the groups stay as they are: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:

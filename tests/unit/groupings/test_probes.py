@@ -13,6 +13,7 @@ from crossgrad_plugins.groupings.conflict_signature import (
 )
 from crossgrad_plugins.groupings.footprint import Footprint
 from crossgrad_plugins.groupings.lists import Lists
+from crossgrad_plugins.groupings.radial import Radial
 
 RNG = np.random.default_rng(0)
 
@@ -48,10 +49,11 @@ def test_the_focal_length_decides_at_one_place():
     assert labels == ("far", "near", "near", "far")
 
 
-def test_without_a_probe_the_signature_says_how_to_get_one():
-    scene = names("a.png", "b.png")
-    with pytest.raises(UserError, match="crossgrad diagnose"):
-        ConflictSignature().fit(scene, RNG)
+def test_without_a_probe_the_signature_begins_with_the_radial_split():
+    scene = names("a.png", "b.png", "c.png", "d.png")
+    rule = ConflictSignature(at=7).fit(scene, RNG)
+    assert rule.labels(scene.views) == Radial().fit(scene, RNG).labels(scene.views)
+    assert "after step 7" in rule.notes[0]
 
 
 class VectorProbe:

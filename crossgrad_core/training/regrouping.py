@@ -1,0 +1,33 @@
+"""New groups of the training views in the middle of a run."""
+
+from crossgrad_core.contract import sampler
+from crossgrad_core.contract.grouping import Regrouping
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import model_of
+
+#: Name of the state that holds the labels, and of their stream of random numbers.
+STATE = "grouping"
+_LABELS = "labels"
+
+
+def regroup_if_due(setup: Setup, state: TrainState) -> None:
+    """Groups the training views anew where the step that was done last is the one for it.
+
+    The sampler starts afresh: what it remembers (decks of views, turns) is about the old groups.
+    """
+    grouping = setup.selection.grouping
+    if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
+        return
+    rule = grouping.refit(model_of(setup, state), state.rngs[STATE])
+    labels = rule.labels(setup.train_views)
+    state.commit({STATE: PluginState({_LABELS: list(labels)}), sampler.STATE: EMPTY_STATE})
+    for note in rule.notes:
+        setup.hook.crossgrad_message(text=f"step {state.step}: {note}")
+
+
+def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:
+    """The label of each training view now; None where there is no grouping."""
+    known = state.states.get(STATE, EMPTY_STATE).values.get(_LABELS)
+    return tuple(map(str, known)) if isinstance(known, list) else setup.groups
