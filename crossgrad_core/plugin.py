@@ -5,6 +5,7 @@ Names that are listed here keep their meaning within a minor version; see docs/p
 
 from pydantic import Field
 
+from crossgrad_core.contract import screen_statistics
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate, Parameters
 from crossgrad_core.contract.component import Component, ViewCounts
@@ -33,22 +34,38 @@ from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View
+from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
+from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.registry.entries import build as build_component
+from crossgrad_core.registry.entries import entries as installed_plugins
+from crossgrad_core.run.results.lines import (
+    Pace,
+    evaluation_line,
+    figures,
+    length_lines,
+    progress_line,
+)
+from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.system.terminal import shows_bar
+from crossgrad_core.system.text_files import read_rows
+from crossgrad_core.training.loss.reference import masked, ssim_map, unit_range
 
 __all__ = [
     "EMPTY_STATE",
     "NO_EDIT",
+    "SHORTEST_ANCHOR_INTERVAL",
     "AfterStepContext",
     "AggregateContext",
     "Aggregated",
@@ -71,12 +88,14 @@ __all__ = [
     "Grouping",
     "HasIdleOptions",
     "IncompatibleSelectionError",
+    "Json",
     "LearningRate",
     "MatrixOperator",
     "Model",
     "Observer",
     "Operator",
     "OperatorContext",
+    "Pace",
     "Parameters",
     "Phase",
     "Photo",
@@ -108,5 +127,26 @@ __all__ = [
     "ViewCounts",
     "ViewRecord",
     "Weighting",
+    "altitudes",
+    "apply_to_parameters",
+    "bimodality",
+    "build_component",
+    "centers_of",
+    "evaluation_line",
+    "figures",
+    "footprint_of",
     "hookimpl",
+    "installed_plugins",
+    "length_lines",
+    "masked",
+    "objections_to_views",
+    "progress_line",
+    "radial_distances",
+    "read_rows",
+    "screen_statistics",
+    "set_for_nothing",
+    "shows_bar",
+    "ssim_map",
+    "unit_range",
+    "upward",
 ]

@@ -10,9 +10,7 @@ from typing_extensions import override
 from crossgrad_backbones.baking import as_plain
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_backbones.visibility import NEAR
-from crossgrad_core.contract.gaussians import Gaussians, Response
-from crossgrad_core.contract.scene import Camera
-from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.plugin import Camera, Gaussians, Phase, Response
 
 #: Variance of a window of one pixel, px^2: what integrating over it adds to a Gaussian's own.
 PIXEL_VARIANCE = 1.0 / 12.0

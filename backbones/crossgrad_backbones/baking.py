@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.visibility import columns_of, depths_in_view, finest_pixels
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera
 from crossgrad_core.numerics.rotations import rotation_matrices
+from crossgrad_core.plugin import Camera, Gaussians
 
 #: What viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
 FILE_DILATION = 0.3

@@ -22,13 +22,19 @@ from crossgrad_backbones.distances import (
     told_apart,
 )
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
-from crossgrad_core.contract.contexts import RegularizeContext, Regularized
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.contract.selection import Selection
+from crossgrad_core.plugin import (
+    Block,
+    Camera,
+    Gaussians,
+    LearningRate,
+    Parameters,
+    Phase,
+    RegularizeContext,
+    Regularized,
+    Scene,
+    Selection,
+    hookimpl,
+)
 
 #: Tensor of the scale that distances are measured on.
 SCALE = "distances"

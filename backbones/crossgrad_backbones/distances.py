@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera
+from crossgrad_core.plugin import Camera
 
 #: Distances are at least this, local units: the mean itself has no logarithm.
 NEAREST = 1e-3

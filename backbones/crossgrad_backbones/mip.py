@@ -14,13 +14,22 @@ from crossgrad_backbones.baking import as_plain
 from crossgrad_backbones.smoothing import filter_widths, kept_opacity, smoothed
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_backbones.visibility import NEAR
-from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
-from crossgrad_core.contract.contexts import AfterStepContext, Densified
-from crossgrad_core.contract.gaussians import Gaussians, Response
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase, Schedule
-from crossgrad_core.contract.topology import Edit, Rows
+from crossgrad_core.plugin import (
+    AfterStepContext,
+    Block,
+    Camera,
+    Densified,
+    Edit,
+    Gaussians,
+    LearningRate,
+    Parameters,
+    Phase,
+    Response,
+    Rows,
+    Scene,
+    Schedule,
+    hookimpl,
+)
 
 #: Dilation of the 2-D mip filter, px^2.
 DILATION = 0.1

@@ -15,11 +15,16 @@ from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.planting import planted, visible_share
-from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.contract.selection import Selection
+from crossgrad_core.plugin import (
+    Block,
+    Camera,
+    Gaussians,
+    LearningRate,
+    Parameters,
+    Phase,
+    Scene,
+    Selection,
+)
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
 

@@ -10,9 +10,7 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size, voxel_centers
 from crossgrad_backbones.neighbours import nearest_neighbour_scales
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.plugin import Camera, Parameters, Phase, Scene
 
 
 class Scaffold(AnchorBackbone):

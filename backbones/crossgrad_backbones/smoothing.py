@@ -9,8 +9,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_backbones.visibility import finest_pixels
-from crossgrad_core.contract.scene import Camera
 from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.plugin import Camera
 
 #: Variance of the filter in squared pixels of the camera that sees a Gaussian finest.
 VARIANCE = 0.2

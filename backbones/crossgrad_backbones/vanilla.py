@@ -11,14 +11,19 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_backbones.neighbours import nearest_neighbour_scales
-from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Block, LearningRate, Parameters
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.contract.selection import Selection
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.spherical import COEFFICIENTS, SH_C0
+from crossgrad_core.plugin import (
+    Backbone,
+    Block,
+    Camera,
+    Gaussians,
+    LearningRate,
+    Parameters,
+    Phase,
+    Scene,
+    Selection,
+)
 
 #: Opacity of a new Gaussian.
 INITIAL_OPACITY = 0.1

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera
+from crossgrad_core.plugin import Camera
 
 #: A centre counts as seen in the image and this share of its extent beyond each border.
 MARGIN = 0.15

@@ -3,9 +3,7 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import OperatorContext, Selection, UserError
 
 
 def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import OperatorContext, PluginState
 
 #: More Gramians than this are those of primitives.
 _BLOCKS = 64

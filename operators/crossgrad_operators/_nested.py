@@ -6,12 +6,17 @@ from typing import Annotated, Any, TypeAlias, cast
 
 from pydantic import BeforeValidator, PlainSerializer
 
-from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
-from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.registry.entries import build, entries
+from crossgrad_core.plugin import (
+    GramianOperator,
+    MatrixOperator,
+    Operator,
+    PluginState,
+    Selection,
+    build_component,
+    installed_plugins,
+    objections_to_views,
+    set_for_nothing,
+)
 
 STATE_SEPARATOR = "/"
 
@@ -25,7 +30,7 @@ def operator_of(value: object) -> MatrixOperator:
     if not isinstance(value, Mapping) or "name" not in value:
         raise ValueError("must be an operator's name, or a name with options")
     options = {key: option for key, option in value.items() if key != "name"}
-    return _checked(cast("Operator", build("operators", str(value["name"]), options)))
+    return _checked(cast("Operator", build_component("operators", str(value["name"]), options)))
 
 
 def _checked(operator: Operator) -> MatrixOperator:
@@ -44,7 +49,7 @@ def name_of(operator: Operator) -> str:
     """The name under which an operator is installed, else that of its class."""
     kind = type(operator)
     value = f"{kind.__module__}:{kind.__qualname__}"
-    found = [name for name, entry in entries("operators").items() if entry.value == value]
+    found = [name for name, entry in installed_plugins("operators").items() if entry.value == value]
     return found[0] if found else kind.__name__
 
 

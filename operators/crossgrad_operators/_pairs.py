@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.contexts import OperatorContext
+from crossgrad_core.plugin import OperatorContext
 
 
 def slot_order(views: int) -> NDArray[np.int64]:

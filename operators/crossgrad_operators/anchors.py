@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import (
+    GramianOperator,
+    OperatorContext,
+    PluginState,
+    Selection,
+    ViewCounts,
+    hookimpl,
+)
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._pairs import project, slot_order
 

@@ -8,10 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 from crossgrad_operators._weights import weighting
 
 

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 from typing_extensions import override
 
-from crossgrad_core.contract.blocks import BlockKind
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import (
+    BlockKind,
+    GramianOperator,
+    MatrixOperator,
+    OperatorContext,
+    PluginState,
+    Selection,
+    hookimpl,
+)
 from crossgrad_operators._nested import (
     OperatorField,
     first_grouping,

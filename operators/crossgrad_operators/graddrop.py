@@ -7,9 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import AggregateContext, Aggregated, Operator, PluginState
 
 
 class GradDrop(Operator):

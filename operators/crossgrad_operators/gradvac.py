@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._pairs import random_order
 

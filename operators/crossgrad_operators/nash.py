@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
 from crossgrad_operators._weights import weighting
 
 

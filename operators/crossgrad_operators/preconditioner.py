@@ -5,9 +5,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import MatrixOperator
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState
 from crossgrad_operators._weights import weighting
 
 #: Bounds of r / r_ref: a camera at the centroid must not lose all weight.

@@ -6,9 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
-from crossgrad_core.contract.gramian_operator import MatrixOperator
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import (
+    AggregateContext,
+    Aggregated,
+    MatrixOperator,
+    OperatorContext,
+    PluginState,
+)
 
 
 class Sum(MatrixOperator):

@@ -8,10 +8,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, UserError
 from crossgrad_operators._weights import weighting
 
 _Value: TypeAlias = bool | int | float | str

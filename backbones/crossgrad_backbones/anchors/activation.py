@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.anchors.heads import COVARIANCE, Raw
-from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.plugin import Gaussians
 
 
 @dataclass(frozen=True)

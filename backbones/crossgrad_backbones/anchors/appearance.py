@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.scene import Camera, Scene
+from crossgrad_core.plugin import Camera, Parameters, Scene
 
 #: Names of the codes [V, C] and of the poses [V, 3, 4] (float64, frozen) that they belong to.
 CODES, POSES = "appearance", "appearance_poses"

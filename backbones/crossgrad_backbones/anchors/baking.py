@@ -10,10 +10,9 @@ from torch.nn.functional import normalize
 from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.directional import ColorFit
 from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.plugin import Camera, Gaussians
 
 #: The average is taken over at most so many cameras.
 BAKED_CAMERAS = 32

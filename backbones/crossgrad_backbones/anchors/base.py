@@ -17,14 +17,18 @@ from crossgrad_backbones.anchors.decode import decoded
 from crossgrad_backbones.anchors.frustum import in_frustum
 from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_backbones.anchors.volume import mean_volume
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.contexts import RegularizeContext, Regularized
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.scene import Camera, Scene
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.plugin import (
+    Camera,
+    Gaussians,
+    Parameters,
+    Phase,
+    RegularizeContext,
+    Regularized,
+    Scene,
+    UserError,
+    hookimpl,
+)
 
 
 @dataclass(frozen=True)

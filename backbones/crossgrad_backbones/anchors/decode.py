@@ -10,8 +10,7 @@ from crossgrad_backbones.anchors.activation import Seen, activated
 from crossgrad_backbones.anchors.fused_decode.data import View
 from crossgrad_backbones.anchors.fused_decode.function import gaussians_of
 from crossgrad_backbones.anchors.heads import Heads
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Camera
+from crossgrad_core.plugin import Camera, Gaussians
 
 
 def decoded(

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.plugin import Block, BlockKind, LearningRate, Parameters
 
 #: Width of the direction from the camera to the anchor.
 DIRECTION = 3

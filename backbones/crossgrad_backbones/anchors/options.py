@@ -8,9 +8,7 @@ from typing_extensions import override
 
 from crossgrad_backbones.anchors import appearance
 from crossgrad_backbones.anchors.heads import Heads
-from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
-from crossgrad_core.contract.selection import Selection
+from crossgrad_core.plugin import Backbone, Block, BlockKind, LearningRate, Selection
 
 _FROZEN = LearningRate(0.0)
 

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.plugin import Gaussians
 
 
 def mean_volume(gaussians: Gaussians) -> Tensor:

@@ -13,9 +13,7 @@ from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
 from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Schedule
+from crossgrad_core.plugin import SHORTEST_ANCHOR_INTERVAL, DensifyContext, Parameters, Schedule
 
 #: The published schedule is one of 40,000 steps: anchors grow after 1500 and before 25,000 of them.
 _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100

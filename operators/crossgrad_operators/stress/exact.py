@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 from crossgrad_operators.stress.case import Case, Rows
 
 #: A 50-digit number; mpmath carries no types.

@@ -7,10 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.gramian_operator import MatrixOperator
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.plugin import EMPTY_STATE, Block, LearningRate, MatrixOperator, Operator
 from crossgrad_operators.stress.case import Case, short
 from crossgrad_operators.stress.promises import PROMISED
 from crossgrad_operators.stress.reference import Views, usual_views

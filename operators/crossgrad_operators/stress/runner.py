@@ -9,10 +9,14 @@ import numpy as np
 from torch import Tensor
 
 from crossgrad_core.commands import gathered
-from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.contexts import AggregateContext
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.plugin import (
+    EMPTY_STATE,
+    AggregateContext,
+    Block,
+    LearningRate,
+    Operator,
+    PluginState,
+)
 from crossgrad_operators.stress.case import Case
 from crossgrad_operators.stress.oracles import Oracle
 from crossgrad_operators.stress.promises import ALL, Promise

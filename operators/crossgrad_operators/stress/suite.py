@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from crossgrad_core.commands import build
 from crossgrad_core.commands import names as installed_names
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.plugin import Operator
 from crossgrad_operators.stress.case import Case
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.invariances import LAWS, run_law

@@ -8,17 +8,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.screen_statistics import (
-    add,
-    mean,
-    ndc_abs_gradient,
-    ndc_gradient,
-    sums,
-    visible,
-)
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import DensifyContext, PluginState, Selection, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
 
 #: Criterion -> the thresholds that it compares with.
@@ -56,21 +46,23 @@ class AbsGradDensityControl(CloneSplit):
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        totals = sums(context, state, ("gradient", "absolute", "renders"))
+        totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
         order = 1 if self.criterion == "quantile" else 2
         for record in context.views:
-            seen = visible(record)
-            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
-            absolute = torch.linalg.vector_norm(ndc_abs_gradient(record), ord=order, dim=1)
-            add(record, totals["gradient"], norms * seen)
-            add(record, totals["absolute"], absolute * seen)
-            add(record, totals["renders"], seen)
+            seen = screen_statistics.visible(record)
+            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+            absolute = torch.linalg.vector_norm(
+                screen_statistics.ndc_abs_gradient(record), ord=order, dim=1
+            )
+            screen_statistics.add(record, totals["gradient"], norms * seen)
+            screen_statistics.add(record, totals["absolute"], absolute * seen)
+            screen_statistics.add(record, totals["renders"], seen)
         return PluginState(per_primitive=totals)
 
     @override
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
-        gradient = mean(state.per_primitive, "gradient", "renders")
-        absolute = mean(state.per_primitive, "absolute", "renders")
+        gradient = screen_statistics.mean(state.per_primitive, "gradient", "renders")
+        absolute = screen_statistics.mean(state.per_primitive, "absolute", "renders")
         if self.criterion == "abs":
             clones = gradient >= self.grad_threshold
             splits = absolute >= self.abs_threshold

@@ -5,9 +5,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, sums, visible
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import DensifyContext, PluginState, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
 
 
@@ -23,16 +21,16 @@ class AdaptiveDensityControl(CloneSplit):
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        totals = sums(context, state, ("gradient", "renders"))
+        totals = screen_statistics.sums(context, state, ("gradient", "renders"))
         for record in context.views:
-            seen = visible(record)
-            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
-            add(record, totals["gradient"], norms * seen)
-            add(record, totals["renders"], seen)
+            seen = screen_statistics.visible(record)
+            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+            screen_statistics.add(record, totals["gradient"], norms * seen)
+            screen_statistics.add(record, totals["renders"], seen)
         return PluginState(per_primitive=totals)
 
     @override
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
-        gradient = mean(state.per_primitive, "gradient", "renders")
+        gradient = screen_statistics.mean(state.per_primitive, "gradient", "renders")
         grows = gradient >= self.grad_threshold
         return Growth(clone=grows & small, split=grows & ~small, strength=gradient)

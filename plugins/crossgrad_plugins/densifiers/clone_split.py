@@ -11,13 +11,18 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.rotations import rotation_matrices
+from crossgrad_core.plugin import (
+    NO_EDIT,
+    Densifier,
+    DensifyContext,
+    Edit,
+    Phase,
+    PluginState,
+    Rows,
+    apply_to_parameters,
+)
 
 #: A split divides the scales by this (3DGS).
 SPLIT_SHRINK = 1.6

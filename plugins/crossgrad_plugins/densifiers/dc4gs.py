@@ -5,12 +5,9 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, sums, visible
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Rows
 from crossgrad_core.numerics.elementwise import logsigmoid
 from crossgrad_core.numerics.rotations import rotation_matrices
+from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,
@@ -37,22 +34,22 @@ class DirectionalConsistency(CloneSplit):
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        totals = sums(context, state, ("gradient", "inconsistency", "renders"))
+        totals = screen_statistics.sums(context, state, ("gradient", "inconsistency", "renders"))
         zeros = totals["renders"].new_zeros(totals["renders"].shape[0], PLANES)
         totals["planes"] = state.per_primitive.get("planes", zeros).clone()
         for record in context.views:
-            seen, bins = visible(record), ndc_directions(record)
-            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
-            add(record, totals["gradient"], norms * seen)
-            add(record, totals["inconsistency"], inconsistency(bins.sum(dim=0)))
-            add(record, totals["planes"], plane_scores(bins).T)
-            add(record, totals["renders"], seen)
+            seen, bins = screen_statistics.visible(record), ndc_directions(record)
+            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+            screen_statistics.add(record, totals["gradient"], norms * seen)
+            screen_statistics.add(record, totals["inconsistency"], inconsistency(bins.sum(dim=0)))
+            screen_statistics.add(record, totals["planes"], plane_scores(bins).T)
+            screen_statistics.add(record, totals["renders"], seen)
         return PluginState(per_primitive=totals)
 
     @override
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
-        gradient = mean(state.per_primitive, "gradient", "renders")
-        parting = mean(state.per_primitive, "inconsistency", "renders")
+        gradient = screen_statistics.mean(state.per_primitive, "gradient", "renders")
+        parting = screen_statistics.mean(state.per_primitive, "inconsistency", "renders")
         clone = (gradient >= self.grad_threshold) & small
         split = (parting >= self.split_threshold) & ~small
         # In units of the thresholds clones and splits compare where room is short.

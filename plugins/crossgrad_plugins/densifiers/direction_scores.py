@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import ViewRecord
-from crossgrad_core.contract.screen_statistics import half_size
+from crossgrad_core.plugin import ViewRecord, screen_statistics
 
 #: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5
@@ -19,7 +18,7 @@ def ndc_directions(record: ViewRecord) -> Tensor:
     if directions is None:
         raise RuntimeError("densification statistics were read before the backward pass")
     bins = directions.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
-    bins[:, 2:4] *= half_size(record, bins)[:, None]
+    bins[:, 2:4] *= screen_statistics.half_size(record, bins)[:, None]
     return bins
 
 

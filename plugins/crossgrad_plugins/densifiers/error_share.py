@@ -8,11 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import View
-from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.training.loss.reference import masked, ssim_map, unit_range
+from crossgrad_core.plugin import (
+    DensifyContext,
+    Gaussians,
+    Phase,
+    View,
+    masked,
+    ssim_map,
+    unit_range,
+)
 
 ErrorKind = Literal["ssim", "l1"]
 

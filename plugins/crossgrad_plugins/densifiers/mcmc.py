@@ -10,20 +10,22 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.contexts import (
+from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.plugin import (
+    NO_EDIT,
     AfterStepContext,
     Densified,
+    Densifier,
     DensifyContext,
+    Edit,
+    Parameters,
+    PluginState,
     RegularizeContext,
     Regularized,
+    Rows,
+    Schedule,
+    hookimpl,
 )
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
-from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_plugins.densifiers.position_noise import position_noise
 from crossgrad_plugins.densifiers.relocation import Pool
 

@@ -4,10 +4,7 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit
+from crossgrad_core.plugin import NO_EDIT, Densifier, DensifyContext, Edit, PluginState
 
 
 class NoDensification(Densifier):

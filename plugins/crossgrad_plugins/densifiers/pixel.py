@@ -5,9 +5,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
-from crossgrad_core.contract.screen_statistics import add, mean, ndc_gradient, pixels, sums
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import DensifyContext, PluginState, ViewRecord, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
 
 
@@ -30,12 +28,14 @@ class PixelDensityControl(CloneSplit):
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        totals = sums(context, state, ("gradient", "pixels"))
+        totals = screen_statistics.sums(context, state, ("gradient", "pixels"))
         for record in context.views:
-            weights = pixels(record)
-            norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
-            add(record, totals["gradient"], weights * self._nearness(record) * norms)
-            add(record, totals["pixels"], weights)
+            weights = screen_statistics.pixels(record)
+            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+            screen_statistics.add(
+                record, totals["gradient"], weights * self._nearness(record) * norms
+            )
+            screen_statistics.add(record, totals["pixels"], weights)
         return PluginState(per_primitive=totals)
 
     def _nearness(self, record: ViewRecord) -> Tensor:
@@ -50,6 +50,6 @@ class PixelDensityControl(CloneSplit):
 
     @override
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
-        gradient = mean(state.per_primitive, "gradient", "pixels")
+        gradient = screen_statistics.mean(state.per_primitive, "gradient", "pixels")
         grows = gradient >= self.grad_threshold
         return Growth(clone=grows & small, split=grows & ~small, strength=gradient)

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.plugin import Parameters
 
 #: Steepness of the gate and the opacity at which it is half open (3DGS-MCMC).
 GATE_STEEPNESS = 100.0

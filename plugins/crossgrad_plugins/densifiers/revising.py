@@ -8,11 +8,15 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, Rows, apply_to_parameters
 from crossgrad_core.numerics.elementwise import logsigmoid, sigmoid
+from crossgrad_core.plugin import (
+    DensifyContext,
+    Edit,
+    PluginState,
+    Rows,
+    Schedule,
+    apply_to_parameters,
+)
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.error_share import ErrorKind, largest_shares, spread_views
 

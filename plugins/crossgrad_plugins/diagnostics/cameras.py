@@ -6,10 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.commands import names
-from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
-from crossgrad_core.contract.scene import Scene
-from crossgrad_core.errors import UserError
-from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.plugin import (
+    Scene,
+    UserError,
+    altitudes,
+    bimodality,
+    footprint_of,
+    radial_distances,
+    upward,
+)
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement

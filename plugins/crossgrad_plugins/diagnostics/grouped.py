@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 
 #: Views per group that an unbiased estimate of a variance needs.
 SMALLEST_GROUP = 2

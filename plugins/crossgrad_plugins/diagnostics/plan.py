@@ -8,10 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.commands import build
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.poses import footprint_of, radial_distances
-from crossgrad_core.contract.scene import Scene
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Grouping, Scene, UserError, footprint_of, radial_distances
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
 #: The grouping of a probe where the run has none: the paper's.

@@ -6,10 +6,7 @@ from time import perf_counter
 
 import numpy as np
 
-from crossgrad_core.contract.contexts import Model
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.scene import Scene
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Model, Scene, UserError, hookimpl
 from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_plugins.diagnostics.plan import ProbePlan
 from crossgrad_plugins.diagnostics.probe import Measurement, measure

@@ -8,9 +8,16 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
-from crossgrad_core.contract.poses import altitudes, upward
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    Quantity,
+    Rule,
+    Scene,
+    View,
+    altitudes,
+    upward,
+)
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

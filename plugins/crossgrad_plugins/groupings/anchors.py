@@ -7,8 +7,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import rule_by_shares
 

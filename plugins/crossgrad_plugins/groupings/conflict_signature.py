@@ -9,11 +9,17 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import Model
-from crossgrad_core.contract.grouping import GradientProbe, Regrouping, Rule
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.scene import Scene, View, centers_of
-from crossgrad_core.errors import UserError
+from crossgrad_core.contract.grouping import Regrouping
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Model,
+    Rule,
+    Scene,
+    UserError,
+    View,
+    centers_of,
+    radial_distances,
+)
 from crossgrad_plugins.groupings.radial import Radial
 from crossgrad_plugins.groupings.split import (
     FAR,

@@ -6,10 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
-from crossgrad_core.contract.poses import footprint_of
-from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    Quantity,
+    Rule,
+    Scene,
+    UserError,
+    View,
+    footprint_of,
+)
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

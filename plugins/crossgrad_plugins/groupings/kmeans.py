@@ -7,9 +7,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.scene import Scene, View, centers_of
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    Rule,
+    Scene,
+    View,
+    centers_of,
+    radial_distances,
+)
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -8,10 +8,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
-from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.errors import UserError
-from crossgrad_core.system.text_files import read_rows
+from crossgrad_core.plugin import GradientProbe, Grouping, Rule, Scene, UserError, View, read_rows
 from crossgrad_plugins.groupings.split import require_training_views
 
 

@@ -5,9 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    Quantity,
+    Rule,
+    Scene,
+    View,
+    radial_distances,
+)
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

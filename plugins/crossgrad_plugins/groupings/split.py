@@ -5,10 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import Quantity
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Quantity, Scene, UserError, View, radial_distances
 
 #: Distances below this share of the median one are rounding.
 _NOWHERE = 1e-9

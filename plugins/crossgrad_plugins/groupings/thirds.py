@@ -5,9 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import Rule
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.scene import Scene
+from crossgrad_core.plugin import Rule, Scene, radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     MIDDLE,

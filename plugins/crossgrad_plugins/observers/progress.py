@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
-from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.observer import Observer
-from crossgrad_core.run.results.lines import (
+from crossgrad_core.plugin import (
+    EvaluationReport,
+    Observer,
     Pace,
+    RunInfo,
+    StepRecord,
     evaluation_line,
     figures,
+    hookimpl,
     length_lines,
     progress_line,
+    shows_bar,
 )
-from crossgrad_core.system.terminal import shows_bar
 
 if TYPE_CHECKING:
     from tqdm import tqdm

@@ -9,9 +9,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.scene import Camera
+from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Response, Screen
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,

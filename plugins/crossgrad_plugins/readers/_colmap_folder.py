@@ -4,7 +4,7 @@ import difflib
 import re
 from pathlib import Path
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 from crossgrad_plugins.readers._colmap_model import count_images, has_model
 
 _PARENTS = ("sparse", "colmap/sparse")

@@ -16,7 +16,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_plugins.readers._colmap_types import (
     ColmapImage,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 

@@ -7,10 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.reader import Reader
-from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count

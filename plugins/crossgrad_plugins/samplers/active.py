@@ -8,10 +8,15 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.state import Json, PluginState
+from crossgrad_core.plugin import (
+    Draw,
+    Json,
+    PluginState,
+    SampleContext,
+    Sampler,
+    StepRecord,
+    ViewCounts,
+)
 from crossgrad_plugins.samplers.draws import training_views
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 

@@ -5,13 +5,16 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.marks import hookimpl
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import (
+    Draw,
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    UserError,
+    ViewCounts,
+    hookimpl,
+)
 from crossgrad_plugins.samplers.draws import training_views
 from crossgrad_plugins.samplers.groups import drawn, members_of
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import Draw, PluginState, SampleContext
 from crossgrad_plugins.samplers.draws import Deck, Order, draw
 
 

@@ -6,9 +6,7 @@ from typing import Literal, cast
 
 import numpy as np
 
-from crossgrad_core.contract.contexts import SampleContext
-from crossgrad_core.contract.state import Json
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Json, SampleContext, UserError
 
 Order = Literal["iid", "distinct", "epoch"]
 

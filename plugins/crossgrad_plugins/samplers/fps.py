@@ -7,10 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, ViewCounts
 from crossgrad_plugins.samplers.draws import Deck, require_enough, training_views
 from crossgrad_plugins.samplers.groups import drawn
 

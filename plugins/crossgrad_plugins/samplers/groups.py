@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Draw, SampleContext, UserError
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:

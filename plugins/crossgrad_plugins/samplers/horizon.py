@@ -6,11 +6,15 @@ from typing import ClassVar, cast
 from pydantic import Field, PositiveInt
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import Json, PluginState
+from crossgrad_core.plugin import (
+    Draw,
+    Json,
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    ViewCounts,
+)
 from crossgrad_plugins.samplers.draws import Deck, draw
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 

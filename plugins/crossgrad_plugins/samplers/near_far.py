@@ -6,11 +6,7 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, Selection, ViewCounts
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
 from crossgrad_plugins.samplers.groups import groups_of

@@ -6,12 +6,16 @@ from typing import ClassVar, cast
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Draw, SampleContext
-from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.state import Json, PluginState
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import (
+    Draw,
+    Json,
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    UserError,
+    ViewCounts,
+)
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order, training_views
 

@@ -9,7 +9,7 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.fused_decode.backward import backward
 from crossgrad_backbones.anchors.fused_decode.data import Inputs, View
 from crossgrad_backbones.anchors.fused_decode.forward import forward
-from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.plugin import Gaussians
 
 #: What `forward` returns; the first five are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")

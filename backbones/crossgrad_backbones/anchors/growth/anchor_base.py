@@ -18,12 +18,16 @@ from crossgrad_backbones.anchors.growth.anchor_statistics import (
     observed,
 )
 from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.screen_statistics import mean
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
+from crossgrad_core.plugin import (
+    NO_EDIT,
+    Densifier,
+    DensifyContext,
+    Edit,
+    Parameters,
+    PluginState,
+    Rows,
+    screen_statistics,
+)
 
 
 class AnchorDensifier(Densifier):
@@ -80,7 +84,7 @@ class AnchorDensifier(Densifier):
         enough = self.success_threshold * context.schedule.densify_every
         judged = sums[VIEWS] > enough
         transparent = sums[OPACITY] < self.prune_opacity * sums[VIEWS]
-        urge = Urge(mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
+        urge = Urge(screen_statistics.mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
         new, held_back = self.grown(context, parameters, urge).limited(context.room)
         changed = self.changed(parameters, urge)
         edit = edit_of(parameters, changed, judged & transparent, new)

@@ -5,9 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
-from crossgrad_core.contract.screen_statistics import ndc_gradient, visible
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.plugin import DensifyContext, PluginState, ViewRecord, screen_statistics
 
 #: Sums per anchor [P]: of the opacities of its Gaussians, and of the views that decoded it.
 OPACITY, VIEWS = "opacity", "views"
@@ -46,8 +44,8 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
     views = totals[VIEWS]
     views += 1.0 if gaussians.decoded is None else gaussians.decoded
     totals[OPACITY].index_add_(0, origin, gaussians.opacities.clamp(min=0.0))
-    seen = visible(record)
+    seen = screen_statistics.visible(record)
     place = origin * totals[RENDERS].shape[1] + slot
-    norms = torch.linalg.vector_norm(ndc_gradient(record), dim=1)
+    norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
     totals[GRADIENT].view(-1).index_add_(0, place, norms * seen)
     totals[RENDERS].view(-1).index_add_(0, place, seen)

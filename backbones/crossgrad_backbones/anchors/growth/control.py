@@ -10,10 +10,7 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
 from crossgrad_backbones.anchors.growth.anchor_growing import Level, grown
 from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
-from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.contexts import DensifyContext
-from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.selection import Selection
+from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selection
 
 
 class AnchorControl(AnchorDensifier):

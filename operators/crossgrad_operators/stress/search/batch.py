@@ -7,10 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.plugin import EMPTY_STATE, Block, GramianOperator, LearningRate, Operator
 from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import context_of
 from crossgrad_operators.stress.search.families import Rows

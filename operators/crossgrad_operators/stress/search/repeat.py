@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError
 from crossgrad_operators.stress.case import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.runner import Cell, judged

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from crossgrad_core.contract.component import ViewCounts
+from crossgrad_core.plugin import ViewCounts
 from crossgrad_operators.stress.search.batch import Batch
 from crossgrad_operators.stress.search.families import ELEMENTS, VIEWS, Rows, rounded
 

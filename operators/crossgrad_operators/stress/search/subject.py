@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.plugin import Operator
 from crossgrad_operators.stress.promises import Promise
 from crossgrad_operators.stress.runner import Reference
 from crossgrad_operators.stress.search.quick import QUICK, Quick

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.gaussians import Response
+from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import KernelCamera
 
 Float32 = NDArray[np.float32]

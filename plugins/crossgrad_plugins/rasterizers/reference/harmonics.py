@@ -5,7 +5,7 @@ from math import pi, sqrt
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.plugin import Gaussians
 
 
 def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:

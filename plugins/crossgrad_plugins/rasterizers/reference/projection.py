@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera
 from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
+from crossgrad_core.plugin import Camera
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from math import pi, sqrt
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.reference.projection import Projection
 
 #: Mip-Splatting draws nothing whose 2-D determinant is at most this, px^4.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.gaussians import Screen
+from crossgrad_core.plugin import Screen
 from crossgrad_plugins.rasterizers.reference.directions import BINS, FIELDS, binned_directions
 
 
