@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from crossgrad_core.cli.resuming import refuse_beside_resume
+from crossgrad_core.defaults import BACKBONE, EXAMPLE_CHAIN, OPERATOR, SAMPLER
 from crossgrad_core.system.startup import announce
 
 _PARTS = "Components (`crossgrad plugins list` shows the names)"
@@ -58,7 +59,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         str | None,
         typer.Option(
             metavar="NAME",
-            help="What is trained. Default: vanilla.",
+            help=f"What is trained. Default: {BACKBONE}.",
             rich_help_panel=_PARTS,
         ),
     ] = None,
@@ -66,7 +67,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Which views a step renders. Default: random (two views).",
+            help=f"Which views a step renders. Default: {SAMPLER} (two views).",
             rich_help_panel=_PARTS,
         ),
     ] = None,
@@ -83,7 +84,7 @@ def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command lin
         typer.Option(
             metavar="NAME[+NAME]",
             help="How the views' gradients become one; a chain is written "
-            "preconditioner+symmetric. Default: sum.",
+            f"{EXAMPLE_CHAIN}. Default: {OPERATOR}.",
             rich_help_panel=_PARTS,
         ),
     ] = None,

@@ -12,11 +12,7 @@ from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.assemble import (
-    DEFAULT_STEPS,
-    growth_note,
-    schedule_of,
-)
+from crossgrad_core.run.assemble import DEFAULT_STEPS
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
@@ -48,6 +44,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.schedules import growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState

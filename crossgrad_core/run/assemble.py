@@ -19,7 +19,6 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import CHAIN, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -29,6 +28,7 @@ from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import Setup
 
 _LOG = logging.getLogger(__name__)
@@ -214,24 +214,6 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         grouping=grouping,
     )
     return selection, notes
-
-
-def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
-    """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
-    names = ("densify_from", "densify_until", "densify_every", "reset_every", "sh_from")
-    given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
-    return replace(densifier.window(Schedule.for_run(steps, config.schedule)), **given)
-
-
-def growth_note(setup: Setup) -> tuple[str, ...]:
-    """Says that density control is left out, where the run is too short for it."""
-    if not setup.densifier.edits or setup.schedule.grows:
-        return ()
-    start, end = setup.schedule.densify_from, setup.schedule.densify_until
-    return (
-        f"no density control: in {setup.schedule.total} steps it would end (step {end}) before the "
-        f"first transient is over (step {start}); --set densify_from=N forces it",
-    )
 
 
 def _require_points(config: RunConfig, scene: Scene) -> None:

@@ -7,8 +7,8 @@ from math import ceil
 from typing import Protocol
 
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.run.assemble import growth_note, schedule_of
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.schedules import growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import TrainState

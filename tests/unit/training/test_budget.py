@@ -10,7 +10,6 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run.assemble import growth_note
 from crossgrad_core.training.budget import (
     Planned,
     Timed,
@@ -20,6 +19,7 @@ from crossgrad_core.training.budget import (
     caught_up,
     lengthened,
 )
+from crossgrad_core.training.schedules import growth_note
 from crossgrad_core.training.state import Clock
 
 
