@@ -1,6 +1,8 @@
 """The rooms of the core and the doors of the shelves: who may import whom."""
 
 import re
+import subprocess
+import sys
 
 import pytest
 from support.imports import CORE, ROOT, SHELVES, circle, import_graph, imports, modules
@@ -112,3 +114,12 @@ def test_the_page_on_the_architecture_shows_these_floors():
     rows = re.findall(r"^\| (\d+) \| (.+?) \|", page, re.MULTILINE)
     shown = {int(number): tuple(re.findall(r"`([\w_]+)", cell)) for number, cell in rows}
     assert shown == dict(enumerate(FLOORS, 1))
+
+
+def test_the_door_of_components_opens_quickly():
+    program = "import sys, crossgrad_core.plugin; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, check=True, text=True
+    )
+    heavy = {"numba", "scipy", "PIL", "matplotlib", "skimage", "pycolmap", "yaml", "typer"}
+    assert not heavy & set(done.stdout.split())
