@@ -14,7 +14,7 @@ FLOORS = (
     ("system",),
     ("numerics",),
     ("contract",),
-    ("gradients", "ply", "scene", "splats", "config"),
+    ("gradients", "ply", "scene", "config"),
     ("registry",),
     ("training",),
     ("evaluation",),
