@@ -32,7 +32,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Rule
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
@@ -103,6 +103,7 @@ __all__ = [
     "Quantity",
     "Rasterizer",
     "Reader",
+    "Regrouping",
     "RegularizeContext",
     "Regularized",
     "Render",

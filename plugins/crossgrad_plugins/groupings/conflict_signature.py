@@ -9,10 +9,10 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
-from crossgrad_core.contract.grouping import Regrouping
 from crossgrad_core.plugin import (
     GradientProbe,
     Model,
+    Regrouping,
     Rule,
     Scene,
     UserError,
