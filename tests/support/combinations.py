@@ -1,4 +1,4 @@
-"""Every combination of sampler, operator, backbone and densifier: which are refused, and why.
+"""Every combination of components of five slots: which are refused, and why.
 
     python -m support.combinations > tests/matrix/refusals.txt
 
@@ -11,16 +11,18 @@ import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import combinations, product
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, cast
 
 from support.pairwise import Row
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.registry.entries import offers
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.registry.entries import build, offers
 from crossgrad_core.run.assemble import reasons_against, select
 from crossgrad_core.testing.fixtures import sample_scene
 
-SLOTS: Final = ("sampler", "operator", "backbone", "densifier")
+SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 #: Options without which a component has nothing to do in so few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
@@ -50,7 +52,19 @@ def config_of(row: Row) -> RunConfig:
         slot: ComponentChoice.model_validate({"name": name, **NEEDED.get((slot, name), {})})
         for slot, name in zip(SLOTS, row, strict=True)
     }
-    return RunConfig.model_validate({"steps": 100, **choices, **_TIMES})
+    views = _several_views(choices["sampler"], choices["operator"])
+    return RunConfig.model_validate({"steps": 100, "views": views, **choices, **_TIMES})
+
+
+@cache
+def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int | None:
+    """The smallest K above 1 that both admit, so that operators have something to do."""
+    counts = (
+        cast("Sampler", build("samplers", sampler.name, sampler.options)).view_counts,
+        cast("Operator", build("operators", operator.name, operator.options)).views,
+    )
+    both = (k for k in range(2, 7) if all(each.admits(k) for each in counts))
+    return next(both, None)
 
 
 def refused(rows: Iterable[Row]) -> dict[Row, tuple[str, ...]]:

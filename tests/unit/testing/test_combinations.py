@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.combinations import as_lines, every_combination, from_lines, refused
 
-ROWS = list(product("abc", "de", "fgh", "ij"))
+ROWS = list(product("abc", "de", "fgh", "ij", "kl"))
 REASONS = ("needs K = 2 (--views); K is 1", "has no: tensors", "is late")
 
 
@@ -35,8 +35,8 @@ def test_a_reason_against_everything_names_nothing():
 
 
 def test_refusals_name_their_reasons_one_by_one():
-    row = ("three-way", "anchors", "vanilla", "anchor")
+    row = ("three-way", "anchors", "vanilla", "anchor", "numba")
     assert row in every_combination()
     (reasons,) = refused([row]).values()
     assert len(reasons) == 2
-    assert not refused([("random", "sum", "vanilla", "adc")])
+    assert not refused([("random", "sum", "vanilla", "adc", "numba")])
