@@ -14,6 +14,7 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.run.migration import migrated
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, singular
 
@@ -49,7 +50,7 @@ def merged(
     Raises:
         UserError: The file cannot be read, or an assignment makes no sense.
     """
-    settings = {} if config is None else _normalized(read_mapping(config, *_FILE))
+    settings = {} if config is None else _of_file(config)
     chosen = {
         _PLACES.get(name, tuple(name.split("."))): _plain(value)
         for name, value in options.items()
@@ -72,6 +73,11 @@ def _with_default_name(key: str, value: object) -> object:
         return value
     default = RunConfig.model_fields[key].default
     return {"name": default.name if isinstance(default, ComponentChoice) else AUTO, **value}
+
+
+def _of_file(path: Path) -> Settings:
+    """The settings of a file, of whatever version."""
+    return migrated(_normalized(read_mapping(path, *_FILE)), path)
 
 
 def _normalized(settings: Settings) -> Settings:

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 import torch
-import yaml
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
@@ -15,6 +14,7 @@ from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.ply.file import read_ply
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.results.config_file import read_config
 
 #: Density control within a few dozen steps; by default it waits for step 500.
 GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}
@@ -85,7 +85,7 @@ def test_same_seed_same_bits_other_seed_other_bits(scene, tmp_path):
 
 def test_the_written_config_repeats_the_run(scene, tmp_path):
     run(scene, tmp_path / "a", sampler={"name": "near-far"}, operator={"name": "symmetric"})
-    stored = yaml.safe_load((tmp_path / "a" / "config.yaml").read_text())
+    stored = read_config(tmp_path / "a")
     assert app.run({**stored, "out": str(tmp_path / "b")}, verbosity=-1) == 0
     assert quality(tmp_path / "a") == quality(tmp_path / "b")
 
@@ -110,7 +110,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
     # Whatever the probe of this machine says, the first plan is wrong.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps"))
     run(scene, tmp_path / "timed", steps=None, seconds=1.5, **GROWTH)
-    stored = yaml.safe_load((tmp_path / "timed" / "config.yaml").read_text())
+    stored = read_config(tmp_path / "timed")
     assert (stored["steps"], stored["seconds"]) == (40, None)
     last = load(latest(tmp_path / "timed")).step
     assert stored["revisions"][-1][1] == last != 40

@@ -5,6 +5,7 @@ from typing import Any
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.migration import marked, migrated
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 
@@ -17,10 +18,11 @@ def write_config(folder: Path, config: RunConfig) -> None:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The settings in a run's config.yaml.
+    """The settings in a run's config.yaml, as this version has them.
 
     Raises:
-        UserError: There is none, so it is not the folder of a run, or it is damaged.
+        UserError: There is none, so it is not the folder of a run, it is damaged, or of a newer
+            version.
     """
     path = folder / FILE
     if not path.is_file():
@@ -30,9 +32,9 @@ def read_config(folder: Path) -> dict[str, Any]:
             expected=f"a folder with {FILE}",
             todo="name the folder that `crossgrad run` printed",
         )
-    return read_mapping(path, "the configuration of the run", "start a new run")
+    return migrated(read_mapping(path, "the configuration of the run", "start a new run"), path)
 
 
 def as_yaml(config: RunConfig) -> str:
-    """The configuration as a user would write it."""
-    return write_yaml(config.model_dump(mode="json"))
+    """The configuration as a user would write it, and the version that writes it."""
+    return write_yaml(marked(config.model_dump(mode="json")))

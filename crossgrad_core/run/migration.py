@@ -1,0 +1,79 @@
+"""Configurations of older versions, as this version has them.
+
+A file says by its key `crossgrad` which version wrote it; up to 0.1 there was no such key.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import load
+from crossgrad_core.system.version import VERSION
+
+#: The key that says which version wrote a configuration, and the version of this one.
+KEY: Final = "crossgrad"
+CURRENT: Final = ".".join(VERSION.split(".")[:2])
+#: What wrote files without the key.
+_FIRST: Final = "0.1"
+_KNOWN: Final = (_FIRST, CURRENT)
+#: Granularities of 0.1 -> those of 0.2.
+_GRANULARITIES: Final = {"tensor": "block", "group": "kind"}
+
+
+def marked(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with the version that writes them."""
+    return {KEY: CURRENT, **settings}
+
+
+def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The settings of a file as this version has them, without the version.
+
+    Args:
+        settings: What a file holds, choices of components in their long form.
+        path: The file.
+
+    Raises:
+        UserError: A version wrote it that is newer than this one, or none that there ever was.
+    """
+    version = str(settings.get(KEY, _FIRST))
+    if version not in _KNOWN:
+        raise UserError(
+            "the configuration is of another version of crossgrad",
+            where=f"{path}, {KEY}",
+            expected=f"one of {', '.join(_KNOWN)}",
+            found=version,
+            todo=f"install crossgrad {version}, or remove the line if the file is of this version",
+        )
+    rest = {name: value for name, value in settings.items() if name != KEY}
+    if version == _FIRST and "operator" in rest:
+        rest["operator"] = _operators(rest["operator"])
+    return rest
+
+
+def _operators(value: object) -> object:
+    """Operators of 0.1, wherever they stand: alone, as links of a chain, as rules of blocks."""
+    if isinstance(value, list):
+        return [_operators(each) for each in value]
+    if not isinstance(value, dict):
+        return value
+    inner = {name: _operators(each) for name, each in value.items()}
+    return _with_granularity(inner) if "granularity" in inner else inner
+
+
+def _with_granularity(operator: dict[str, Any]) -> dict[str, Any]:
+    """The operator with what its granularity is called now; without one where it has none now.
+
+    In 0.1 all operators had one, and it did nothing where there are no Gramians.
+    """
+    old = operator["granularity"]
+    if _has_no_granularity(str(operator.get("name"))):
+        return {name: option for name, option in operator.items() if name != "granularity"}
+    return {**operator, "granularity": _GRANULARITIES.get(old, old)}
+
+
+def _has_no_granularity(name: str) -> bool:
+    try:
+        return "granularity" not in load("operators", name).model_fields
+    except UserError:  # Whoever builds the operator says what is wrong with it.
+        return False
