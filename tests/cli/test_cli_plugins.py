@@ -147,7 +147,7 @@ def test_show_tells_options_bounds_docstring_and_package(ran, third_party):
         "--set operator.OPTION=VALUE",
         "share  (float, default 0.5, > 0, <= 1)",
         "what is left of each gradient",
-        "granularity  (tensor | group | global | gaussian, default tensor)",
+        "granularity  (block | kind | global | gaussian, default block)",
     ):
         assert words in out
 

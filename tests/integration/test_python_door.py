@@ -41,7 +41,7 @@ def reference(scene, tmp_path_factory):
 
 def command(scene, out, *arguments):
     line = [sys.executable, "-m", "crossgrad_core", "run", str(scene), "--out", str(out)]
-    subprocess.run([*line, "--quiet", *arguments], check=True, timeout=200, capture_output=True)
+    subprocess.run([*line, "--quiet", *arguments], check=True, timeout=290, capture_output=True)
 
 
 def run(scene, out, **options):
