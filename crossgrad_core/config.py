@@ -1,16 +1,28 @@
 """The fully resolved configuration of a run: one schema for command line, file and results."""
 
+from collections.abc import Container
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator, model_validator
 
 from crossgrad_core import defaults
+from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS, TRAINING, Flag
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import ScheduleMode
 
 #: Name of a choice that the run makes at its start.
 AUTO: Final = "auto"
+
+
+#: Settings of earlier versions -> what they are called now.
+_RENAMED: Final = {"views": "views_per_step"}
+
+
+def current_name(setting: str, beside: Container[str] = ()) -> str:
+    """What a setting is called now; the old name stays where the new one stands beside it."""
+    new = _RENAMED.get(setting, setting)
+    return setting if new in beside else new
 
 
 class ComponentChoice(BaseModel):
@@ -34,32 +46,70 @@ class RunConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    scene: Path | None = Field(
-        None, description="scene folder; the bundled one where none is given"
+    scene: Annotated[Path | None, Flag("SCENE")] = Field(
+        None,
+        description="Scene folder (COLMAP: images/ and sparse/). Default: the bundled example "
+        "scene.",
     )
-    out: Path | None = Field(None, description="output folder")
-
-    backbone: ComponentChoice = ComponentChoice(name=defaults.BACKBONE)
-    sampler: ComponentChoice = ComponentChoice(name=defaults.SAMPLER)
-    grouping: ComponentChoice | None = None
-    operator: ComponentChoice | tuple[ComponentChoice, ...] = ComponentChoice(
-        name=defaults.OPERATOR
+    out: Annotated[Path | None, Flag("DIR", RESULTS)] = Field(
+        None, description="Output folder; it must not hold a run. Default: below runs/."
     )
-    densifier: ComponentChoice | None = None
-    rasterizer: ComponentChoice = ComponentChoice(name=AUTO)
-    reader: ComponentChoice = ComponentChoice(name=AUTO)
-    observers: tuple[ComponentChoice, ...] = ()
 
-    views: int | None = Field(None, ge=1, description="views per step, K; default: the sampler's")
-    steps: int | None = Field(None, ge=1, description="optimizer steps")
-    seconds: float | None = Field(
-        None, gt=0, description="training seconds; the number of steps follows the clock"
+    backbone: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.BACKBONE),
+        description=f"What is trained. Default: {defaults.BACKBONE}.",
+    )
+    sampler: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.SAMPLER),
+        description=f"Which views a step renders. Default: {defaults.SAMPLER} (two views).",
+    )
+    grouping: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+        None, description="How views are labelled near or far. Default: what the sampler needs."
+    )
+    operator: Annotated[
+        ComponentChoice | tuple[ComponentChoice, ...], Flag("NAME[+NAME]", PARTS)
+    ] = Field(
+        ComponentChoice(name=defaults.OPERATOR),
+        description="How the views' gradients become one; a chain is written "
+        f"{defaults.EXAMPLE_CHAIN}. Default: {defaults.OPERATOR}.",
+    )
+    densifier: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+        None,
+        description=f"How primitives are added and removed; {defaults.NO_DENSIFIER} keeps them. "
+        "Default: the backbone's.",
+    )
+    rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=AUTO),
+        description="What draws. Default: auto, the fastest one for the device.",
+    )
+    reader: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=AUTO),
+        description="What reads the scene. Default: auto, the one that accepts the folder.",
+    )
+    observers: Annotated[tuple[ComponentChoice, ...], Flag("NAME", PARTS, "observe")] = Field(
+        (), description="Adds an observer, repeatable."
+    )
+
+    views_per_step: Annotated[int | None, Flag("K", TRAINING, "views")] = Field(
+        None, ge=1, description="Views per step. Default: the sampler's."
+    )
+    steps: Annotated[int | None, Flag("N", TRAINING)] = Field(
+        None, ge=1, description="Optimizer steps; every schedule stretches with them."
+    )
+    seconds: Annotated[float | None, Flag("S", TRAINING)] = Field(
+        None, gt=0, description="Training seconds; the number of steps follows the clock."
     )
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (), description="(step, steps in all from there on) of a run that followed the clock"
     )
-    seed: int = Field(0, ge=0, description="seed of every random number of the run")
-    schedule: ScheduleMode = "scaled"
+    seed: Annotated[int, Flag("N", TRAINING)] = Field(
+        0, ge=0, description="Seed of every random number. Default: 0."
+    )
+    schedule: Annotated[ScheduleMode, Flag("scaled|absolute", TRAINING)] = Field(
+        "scaled",
+        description="Stretch the published schedule to the run, or keep its numbers. "
+        "Default: scaled.",
+    )
     densify_from: int | None = Field(None, ge=0, description="density control after this step ...")
     densify_until: int | None = Field(None, ge=0, description="... and before this one")
     densify_every: int | None = Field(None, ge=1, description="steps between its edits")
@@ -67,20 +117,51 @@ class RunConfig(BaseModel):
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
-    preset: Literal["default", "inria"] = "default"
-    backward: Literal["separate", "joint"] = "separate"
-    device: str = "cpu"
-    threads: int | None = Field(None, ge=1, description="CPU threads; default: all there are")
+    preset: Annotated[Literal["default", "inria"], Flag("NAME", CONFIGURATION)] = Field(
+        "default",
+        description="Training rules: default, or inria (order of a step, 3-sigma footprint and "
+        "near plane of the original code).",
+    )
+    backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
+        "separate",
+        description="One backward pass per view, or one for all views. Default: separate.",
+    )
+    device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
+        "cpu", description="Where tensors live. Default: cpu."
+    )
+    threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
+        None, ge=1, description="CPU threads. Default: all there are."
+    )
     reading: SceneOptions = SceneOptions()
     ssim_weight: float = Field(0.2, ge=0, le=1, description="share of 1 - SSIM in the loss")
-    background: str = Field("black", description="black, white, random, or r,g,b in [0, 1]")
-    max_gaussians: int | None = Field(None, ge=1, description="density control stops growing here")
-    eval_every: int | None = Field(None, ge=1, description="steps between evaluations")
-    save_every: int | None = Field(None, ge=1, description="steps between checkpoints")
-    stop_after: int | None = Field(None, ge=1, description="stop, resumable, after this step")
+    background: Annotated[str, Flag("COLOR", TRAINING)] = Field(
+        "black",
+        description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
+    )
+    max_gaussians: Annotated[int | None, Flag("N", TRAINING)] = Field(
+        None,
+        ge=1,
+        description="Density control stops growing here. Default: what fits into memory.",
+    )
+    eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
+        None, ge=1, description="Steps between evaluations."
+    )
+    save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
+        None, ge=1, description="Steps between checkpoints."
+    )
+    stop_after: Annotated[int | None, Flag("STEP", RESULTS)] = Field(
+        None, ge=1, description="Stops after this step with a checkpoint; --resume continues."
+    )
     max_dropped: int = Field(
         100, ge=1, description="stop after so many blocks were dropped as non-finite"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _old_names(cls, value: object) -> object:
+        if not isinstance(value, dict):
+            return value
+        return {current_name(key, value): each for key, each in value.items()}
 
     @field_validator("operator", mode="before")
     @classmethod

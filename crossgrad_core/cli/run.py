@@ -1,339 +1,163 @@
-"""`crossgrad run`: train, evaluate, export."""
+"""`crossgrad run`: train, evaluate, export. Its options are made from the schema of a run."""
 
+from collections.abc import Callable, Iterator
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 import typer
 
 from crossgrad_core.cli.resuming import refuse_beside_resume
-from crossgrad_core.defaults import BACKBONE, EXAMPLE_CHAIN, OPERATOR, SAMPLER
+from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS
+from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.startup import announce
 
-_PARTS = "Components (`crossgrad plugins list` shows the names)"
-_TRAINING = "Training"
-_SCENE = "Scene"
-_MACHINE = "Machine"
-_RESULTS = "Results"
-_CONFIGURATION = "Configuration"
+
+def _own(name: str, kind: object, option: object, default: object = None) -> Parameter:
+    """An option of this start of the command, which is no setting."""
+    return Parameter(
+        name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
+    )
 
 
-def run(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
-    scene: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="SCENE",
-            help="Scene folder (COLMAP: images/ and sparse/). Default: the bundled example scene.",
-            show_default=False,
-        ),
-    ] = None,
-    config: Annotated[
+#: What is no setting, below its heading: in front of the settings, behind the first of them, last.
+_FRONT: Final = (
+    _own(
+        "config",
         Path | None,
         typer.Option(
             "--config",
             metavar="FILE",
             help="YAML file with settings, such as the config.yaml of a run. Options given here "
             "win over the file.",
-            rich_help_panel=_CONFIGURATION,
+            rich_help_panel=CONFIGURATION,
         ),
-    ] = None,
-    assignments: Annotated[
+    ),
+    _own(
+        "assignments",
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
             help="One setting, repeatable: operator.c=0.4, rasterizer.max_alpha=0.999. Wins over "
             "everything else.",
-            rich_help_panel=_CONFIGURATION,
+            rich_help_panel=CONFIGURATION,
         ),
-    ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Training rules: default, or inria (order of a step, 3-sigma footprint and near "
-            "plane of the original code).",
-            rich_help_panel=_CONFIGURATION,
-        ),
-    ] = None,
-    backbone: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help=f"What is trained. Default: {BACKBONE}.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    sampler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help=f"Which views a step renders. Default: {SAMPLER} (two views).",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    grouping: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="How views are labelled near or far. Default: what the sampler needs.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    operator: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[+NAME]",
-            help="How the views' gradients become one; a chain is written "
-            f"{EXAMPLE_CHAIN}. Default: {OPERATOR}.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    densifier: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="How primitives are added and removed; none keeps them. Default: the backbone's.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    rasterizer: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="What draws. Default: auto, the fastest one for the device.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    reader: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="What reads the scene. Default: auto, the one that accepts the folder.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    observe: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Adds an observer, repeatable.",
-            rich_help_panel=_PARTS,
-        ),
-    ] = None,
-    views: Annotated[
-        int | None,
-        typer.Option(
-            metavar="K",
-            help="Views per step. Default: the sampler's.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Optimizer steps; every schedule stretches with them.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            help="Training seconds; the number of steps follows the clock.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Seed of every random number. Default: 0.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    schedule: Annotated[
-        str | None,
-        typer.Option(
-            metavar="scaled|absolute",
-            help="Stretch the published schedule to the run, or keep its numbers. Default: scaled.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    backward: Annotated[
-        str | None,
-        typer.Option(
-            metavar="separate|joint",
-            help="One backward pass per view, or one for all views. Default: separate.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    background: Annotated[
-        str | None,
-        typer.Option(
-            metavar="COLOR",
-            help="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    max_gaussians: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Density control stops growing here. Default: what fits into memory.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
-    max_size: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PIXELS",
-            help="Longest image side; larger photos are resized.",
-            rich_help_panel=_SCENE,
-        ),
-    ] = None,
-    split: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|every|none",
-            help="auto: train_list.txt and test_list.txt where present, else every; every: hold "
-            "out each n-th image of each folder; none: train on all. Default: auto.",
-            rich_help_panel=_SCENE,
-        ),
-    ] = None,
-    test_every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Each N-th image of a folder, by name, is held out. Default: 8.",
-            rich_help_panel=_SCENE,
-        ),
-    ] = None,
-    init: Annotated[
-        str | None,
-        typer.Option(
-            metavar="points|random|PLY",
-            help="Where training starts: the scene's points, random ones, or a PLY file. "
-            "Default: points.",
-            rich_help_panel=_SCENE,
-        ),
-    ] = None,
-    device: Annotated[
-        str | None,
-        typer.Option(
-            metavar="cpu|cuda|cuda:N",
-            help="Where tensors live. Default: cpu.",
-            rich_help_panel=_MACHINE,
-        ),
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="CPU threads. Default: all there are.",
-            rich_help_panel=_MACHINE,
-        ),
-    ] = None,
-    out: Annotated[
+    ),
+)
+_RESUMING: Final = (
+    _own(
+        "resume",
         Path | None,
         typer.Option(
-            metavar="DIR",
-            help="Output folder; it must not hold a run. Default: below runs/.",
-            rich_help_panel=_RESULTS,
-        ),
-    ] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(
+            "--resume",
             metavar="RUN",
             help="Continues the stopped run in that folder, bit for bit.",
-            rich_help_panel=_RESULTS,
+            rich_help_panel=RESULTS,
         ),
-    ] = None,
-    accept_scene: Annotated[
+    ),
+    _own(
+        "accept_scene",
         bool,
         typer.Option(
             "--accept-scene",
             help="With --resume: go on although photos, masks or points of the scene have changed.",
-            rich_help_panel=_RESULTS,
+            rich_help_panel=RESULTS,
         ),
-    ] = False,
-    eval_every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Steps between evaluations.",
-            rich_help_panel=_RESULTS,
-        ),
-    ] = None,
-    save_every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Steps between checkpoints.",
-            rich_help_panel=_RESULTS,
-        ),
-    ] = None,
-    stop_after: Annotated[
-        int | None,
-        typer.Option(
-            metavar="STEP",
-            help="Stops after this step with a checkpoint; --resume continues.",
-            rich_help_panel=_RESULTS,
-        ),
-    ] = None,
-    dry_run: Annotated[
+        default=False,
+    ),
+)
+_LAST: Final = (
+    _own(
+        "dry_run",
         bool,
         typer.Option(
             "--dry-run",
             help="Checks everything and prints the resolved settings; trains nothing.",
-            rich_help_panel=_RESULTS,
+            rich_help_panel=RESULTS,
         ),
-    ] = False,
-    quiet: Annotated[
+        default=False,
+    ),
+    _own(
+        "quiet",
         bool,
         typer.Option(
-            "--quiet", "-q", help="Prints errors and the result only.", rich_help_panel=_RESULTS
+            "--quiet", "-q", help="Prints errors and the result only.", rich_help_panel=RESULTS
         ),
-    ] = False,
-    verbose: Annotated[
+        default=False,
+    ),
+    _own(
+        "verbose",
         bool,
         typer.Option(
-            "--verbose", "-v", help="Prints every decision and event.", rich_help_panel=_RESULTS
+            "--verbose", "-v", help="Prints every decision and event.", rich_help_panel=RESULTS
         ),
-    ] = False,
-) -> None:
+        default=False,
+    ),
+)
+
+
+def _parameters() -> Iterator[Parameter]:
+    """All parameters of the command in the order of its help."""
+    for option in OPTIONS:
+        if not option.flag.heading:
+            yield _setting(option)
+    yield from _FRONT
+    for heading in HEADINGS:
+        first, *others = (each for each in OPTIONS if each.flag.heading == heading)
+        yield _setting(first)
+        if heading == RESULTS:
+            yield from _RESUMING
+        yield from map(_setting, others)
+    yield from _LAST
+
+
+def _setting(option: Option) -> Parameter:
+    """The parameter of a setting; None where the user does not give it."""
+    flag = option.flag
+    info = (
+        typer.Option(
+            f"--{option.name.replace('_', '-')}",
+            metavar=flag.metavar,
+            help=option.help,
+            rich_help_panel=flag.heading,
+        )
+        if flag.heading
+        else typer.Argument(metavar=flag.metavar, help=option.help, show_default=False)
+    )
+    return _own(option.name, option.kind | None, info)
+
+
+def _with_options(function: Callable[..., None]) -> Callable[..., None]:
+    """The function with the signature that typer reads options from."""
+    parameters = list(_parameters())
+    function.__dict__["__signature__"] = Signature(parameters)
+    function.__annotations__ = {each.name: each.annotation for each in parameters}
+    return function
+
+
+@_with_options
+def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     """Train on a scene, evaluate, and write the results to a folder.
 
     Every setting has a default; what a run decided is written to its config.yaml, and
     `crossgrad run --config config.yaml` repeats it.
     """
-    given = dict(locals())
-    announce(quiet=quiet)
-    if resume is not None:
-        refuse_beside_resume(resume, given)
+    announce(quiet=given["quiet"])
+    if given["resume"] is not None:
+        refuse_beside_resume(given["resume"], given)
     from crossgrad_core.run.settings import merged
 
-    of_the_command = (
-        "config",
-        "assignments",
-        "resume",
-        "accept_scene",
-        "dry_run",
-        "quiet",
-        "verbose",
-    )
-    for name in of_the_command:
-        del given[name]
-    settings = merged(config, given, assignments or [])
+    settings = {option.name: given[option.name] for option in OPTIONS}
+    wanted = merged(given["config"], settings, given["assignments"] or [])
 
     from crossgrad_core.run import app
 
     code = app.run(
-        settings,
-        resume=resume,
-        dry_run=dry_run,
-        verbosity=int(verbose) - int(quiet),
-        accept_scene=accept_scene,
+        wanted,
+        resume=given["resume"],
+        dry_run=given["dry_run"],
+        verbosity=int(given["verbose"]) - int(given["quiet"]),
+        accept_scene=given["accept_scene"],
     )
     raise typer.Exit(code)

@@ -1,9 +1,11 @@
 """What a user can say about how a scene is read."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from crossgrad_core.contract.flags import SCENE, Flag
 
 
 class SceneOptions(BaseModel):
@@ -11,16 +13,22 @@ class SceneOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_size: int | None = Field(
-        None, ge=16, description="longest image side in pixels; larger photos are resized"
+    max_size: Annotated[int | None, Flag("PIXELS", SCENE)] = Field(
+        None, ge=16, description="Longest image side; larger photos are resized."
     )
-    split: Literal["auto", "every", "none"] = Field(
+    split: Annotated[Literal["auto", "every", "none"], Flag("auto|every|none", SCENE)] = Field(
         "auto",
-        description="auto: train_list.txt/test_list.txt if present, else every; "
-        "every: each --test-every-th image of each folder; none: train on all",
+        description="auto: train_list.txt and test_list.txt where present, else every; every: hold "
+        "out each n-th image of each folder; none: train on all. Default: auto.",
     )
-    test_every: int = Field(8, ge=2, description="each n-th image by name of a folder is held out")
-    init: str = Field("points", description="points (SfM), random, or the path of a PLY file")
+    test_every: Annotated[int, Flag("N", SCENE)] = Field(
+        8, ge=2, description="Each N-th image of a folder, by name, is held out. Default: 8."
+    )
+    init: Annotated[str, Flag("points|random|PLY", SCENE)] = Field(
+        "points",
+        description="Where training starts: the scene's points, random ones, or a PLY file. "
+        "Default: points.",
+    )
     cache_mib: int = Field(2048, ge=16, description="memory for decoded photos, MiB")
     masks: Path | None = Field(None, description="mask folder; default <scene>/masks if present")
 

@@ -188,7 +188,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "Rasterizer",
         build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
     )
-    views = config.views or _usual_views(sampler, operator, notes)
+    views = config.views_per_step or _usual_views(sampler, operator, notes)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     names = {
         "backbone": config.backbone.name,

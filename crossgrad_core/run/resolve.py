@@ -34,7 +34,7 @@ def resolved(setup: Setup) -> RunConfig:
             "scene": scene,
             "reading": config.reading.model_copy(update={"init": init}),
             "out": None,
-            "views": selection.views_per_step,
+            "views_per_step": selection.views_per_step,
             "steps": config.steps or setup.schedule.total,
         }
     )

@@ -10,11 +10,12 @@ from typing import Any, Final, TypeAlias
 
 import yaml
 
-from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.run.migration import migrated
+from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, singular
 
@@ -26,14 +27,8 @@ CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
 #: Settings that say how long a run is.
 LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
 _FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")
-#: Options of the command line whose setting has another name.
-_PLACES: Final[dict[str, tuple[str, ...]]] = {
-    "observe": (OBSERVERS,),
-    "max_size": ("reading", "max_size"),
-    "split": ("reading", "split"),
-    "test_every": ("reading", "test_every"),
-    "init": ("reading", "init"),
-}
+#: Options of the command line -> their setting.
+_PLACES: Final = {option.name: option.path for option in OPTIONS}
 
 
 def merged(
@@ -82,7 +77,8 @@ def _of_file(path: Path) -> Settings:
 
 def _normalized(settings: Settings) -> Settings:
     """The settings with every choice of components in its long form."""
-    return {key: _long_form(key, value) for key, value in settings.items()}
+    named = {current_name(key, settings): value for key, value in settings.items()}
+    return {key: _long_form(key, value) for key, value in named.items()}
 
 
 def _long_form(key: str, value: object) -> object:
@@ -161,6 +157,7 @@ def _is_name(path: tuple[str, ...]) -> bool:
 
 def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
     """Puts a value in its place; a newly chosen component keeps none of the old one's options."""
+    path = (current_name(path[0]), *path[1:])
     key, *rest = path
     if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str):
         settings[key] = _renamed(settings.get(key), _choice(value))

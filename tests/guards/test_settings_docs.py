@@ -29,7 +29,10 @@ TABLES = {"run": rows(BEFORE), "reading": rows(AFTER)}
 def options():
     """The options of `crossgrad run` by the setting that they are for."""
     parameters = get_command(app).commands["run"].params
-    return {each.name: each.opts[0] for each in parameters} | {"observers": "--observe"}
+    return {each.name: each.opts[0] for each in parameters} | {
+        "observers": "--observe",
+        "views_per_step": "--views",
+    }
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -76,7 +76,7 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
             "backbone": ComponentChoice(name="vanilla"),
             "sampler": ComponentChoice(name="epoch"),
             "operator": ComponentChoice(name="sum"),
-            "views": 1,
+            "views_per_step": 1,
             "seed": options.seed,
         }
     )

@@ -1,0 +1,60 @@
+"""The options of `crossgrad run` that are settings, read from the schema of a run."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Any, Final, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.flags import Flag
+
+#: Types that an option has itself; everything else is read as text and validated by the schema.
+_OWN_TYPES: Final = (int, float, Path)
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of the command line.
+
+    Attributes:
+        path: The setting that it is for, such as `("reading", "split")`.
+        flag: How it appears.
+        kind: Its type.
+        help: Its help.
+    """
+
+    path: tuple[str, ...]
+    flag: Flag
+    kind: Any
+    help: str
+
+    @property
+    def name(self) -> str:
+        """Its name as a keyword: `max_size` for `--max-size`."""
+        return self.flag.name or self.path[-1]
+
+
+def _options(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[Option]:
+    for name, field in model.model_fields.items():
+        for each in field.metadata:
+            if isinstance(each, Flag):
+                yield Option((*path, name), each, _kind(field), field.description or "")
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from _options(inner, (*path, name))
+
+
+def _kind(field: FieldInfo) -> object:
+    if get_origin(field.annotation) is tuple:
+        return list[str]
+    kinds = [each for each in get_args(field.annotation) if each is not NoneType]
+    kind = kinds[0] if len(kinds) == 1 else field.annotation
+    return kind if kind in _OWN_TYPES else str
+
+
+#: All of them in the order of the schema.
+OPTIONS: Final = tuple(_options(RunConfig))
