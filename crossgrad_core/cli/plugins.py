@@ -1,5 +1,6 @@
 """`crossgrad plugins`: what is installed, which options it has, whether it keeps the contract."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,7 +12,7 @@ from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.wording import did_you_mean, listed, sentences
 
 app = typer.Typer(
-    help="List, explain and check plugins.",
+    help="List, explain, check and begin plugins.",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -24,7 +25,7 @@ SlotOption = Annotated[
 
 @app.callback(invoke_without_command=True)
 def plugins(context: typer.Context) -> None:
-    """List, explain and check plugins. Without a command: list."""
+    """List, explain, check and begin plugins. Without a command: list."""
     if context.invoked_subcommand is None:
         list_plugins(None)
 
@@ -79,6 +80,32 @@ def check(
     typer.echo(report)
     if not passed:
         raise typer.Exit(1)
+
+
+@app.command("new", cls=GroupedCommand)
+def new(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the plugin and of its package.")
+    ],
+    slot: Annotated[
+        str, typer.Option("--slot", metavar="SLOT", help=f"What it fills: {listed(OFFERED)}.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Its folder. Default: NAME.")
+    ] = None,
+) -> None:
+    """Write a small package with one plugin, to begin with.
+
+    The package holds a pyproject.toml, one module and one test, and passes `crossgrad plugins
+    check`. Nothing is overwritten.
+    """
+    from crossgrad_core.cli.new import write_package
+
+    (wanted,) = _slots(slot)
+    folder = out or Path(name)
+    files = write_package(name, wanted, folder)
+    typer.echo("\n".join(f"wrote {path}" for path in files))
+    typer.echo(f"\npip install -e {folder}\ncrossgrad plugins check {name}")
 
 
 def _slots(slot: str | None) -> tuple[str, ...]:

@@ -1,0 +1,131 @@
+"""`crossgrad plugins new`: a small package with one plugin, to begin with."""
+
+import re
+from importlib.util import find_spec
+from keyword import iskeyword
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import entries
+from crossgrad_core.registry.slots import COMMANDS, OFFERED
+from crossgrad_core.system.files import disk_errors
+from crossgrad_core.system.version import VERSION
+from crossgrad_core.wording import listed, singular
+
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+_NAME: Final = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_PROJECT: Final = """\
+[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+
+[project]
+name = "{name}"
+version = "0.1.0"
+description = "A {word} for crossgrad"
+requires-python = ">=3.11"
+dependencies = ["crossgrad>={version}"]
+
+[project.optional-dependencies]
+test = ["pytest"]
+
+[project.entry-points."{group}"]
+{name} = "{module}:{member}"
+
+[tool.hatch.build.targets.wheel]
+only-include = ["{module}.py"]
+"""
+_TEST: Final = '''\
+"""The contract checks of a {word}."""
+
+import pytest
+from {module} import {member}
+
+from crossgrad_core.testing.{slot} import {checks}
+
+
+@pytest.mark.parametrize("check", {checks}, ids=lambda check: check.__name__)
+def test_contract(check):
+    check({member})
+'''
+
+
+def slots() -> tuple[str, ...]:
+    """The slots, and commands, for which a package can be written."""
+    return tuple(slot for slot in OFFERED if (_TEMPLATES / f"{slot}.py").is_file())
+
+
+def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
+    """Writes pyproject.toml, one module and one test.
+
+    Args:
+        name: Name of the plugin and of the package.
+        slot: The slot, one of `slots()`.
+        folder: Where to; made here.
+
+    Returns:
+        The files.
+
+    Raises:
+        UserError: The name cannot be one, or is taken; or there is something in the folder.
+    """
+    module = name.replace("-", "_")
+    _check(name, module, slot)
+    _check_empty(folder)
+    files = {folder / path: text for path, text in _contents(name, module, slot).items()}
+    with disk_errors(folder):
+        for path, text in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return tuple(files)
+
+
+def _contents(name: str, module: str, slot: str) -> dict[str, str]:
+    """Path below the folder -> text."""
+    kind = "".join(part.capitalize() for part in name.split("-"))
+    member = module if slot == COMMANDS else kind
+    source = (_TEMPLATES / f"{slot}.py").read_text(encoding="utf-8")
+    words = {
+        "name": name,
+        "module": module,
+        "member": member,
+        "slot": slot,
+        "word": singular(slot),
+        "group": OFFERED[slot],
+        "checks": f"{singular(slot).upper()}_CHECKS",
+        "version": ".".join(VERSION.split(".")[:2]),
+    }
+    return {
+        "pyproject.toml": _PROJECT.format(**words),
+        f"{module}.py": source.replace("Template", kind).replace("def template(", f"def {module}("),
+        f"tests/test_{module}.py": _TEST.format(**words),
+    }
+
+
+def _check(name: str, module: str, slot: str) -> None:
+    if not _NAME.fullmatch(name) or iskeyword(module):
+        raise UserError(
+            f"{name!r} cannot be the name of a plugin",
+            where="NAME",
+            expected="lower-case words joined by hyphens, such as equal-length",
+            todo="choose another name",
+        )
+    taken = entries(slot).get(name)
+    if taken is not None or find_spec(module) is not None:
+        found = taken.origin if taken else f"an installed package {module}"
+        raise UserError(
+            f"the name {name} is taken", where="NAME", found=found, todo="choose another name"
+        )
+
+
+def _check_empty(folder: Path) -> None:
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise UserError(
+            "there is something in the folder already",
+            where=folder,
+            found=listed(sorted(each.name for each in folder.iterdir())[:5])
+            if folder.is_dir()
+            else "a file",
+            todo="choose another name, or another folder with --out",
+        )

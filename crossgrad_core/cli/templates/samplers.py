@@ -1,0 +1,19 @@
+"""Which views a step renders."""
+
+from typing import ClassVar
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler
+
+
+class Template(Sampler):
+    """Draws K training views at random."""
+
+    default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+        views = context.rng.integers(len(context.scene.train), size=context.views_per_step)
+        return Draw(tuple(int(view) for view in views)), state
