@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import sharpened, weighting
 
 
 class Aligned(GramianOperator):
@@ -29,5 +29,7 @@ class Aligned(GramianOperator):
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.balance import aligned
+        from crossgrad_operators.numba_kernels.exact_balance import exact_aligned
 
-        return weighting(aligned(gramians, context.present)), state
+        weights, doubtful = aligned(gramians, context.present, context.unit)
+        return weighting(sharpened(weights, doubtful, gramians, context, exact_aligned)), state

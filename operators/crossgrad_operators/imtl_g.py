@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import sharpened, weighting
 
 
 class IMTLG(GramianOperator):
@@ -29,5 +29,7 @@ class IMTLG(GramianOperator):
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.balance import imtl_g
+        from crossgrad_operators.numba_kernels.exact_balance import exact_imtl_g
 
-        return weighting(imtl_g(gramians, context.present)), state
+        weights, doubtful = imtl_g(gramians, context.present, context.unit)
+        return weighting(sharpened(weights, doubtful, gramians, context, exact_imtl_g)), state

@@ -1,8 +1,9 @@
 """Gramians as norms and cosines, which no ratio of norms can spoil."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import strict_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -11,9 +12,17 @@ Indices = NDArray[np.int64]
 #: Two directions with 1 + cos up to this count as exactly opposite: what is left of them after a
 #: projection is rounding noise, which a scale-free optimizer would follow.
 OPPOSITE = 1e-12
+#: A combination whose square is up to this share of that of its longest summand is zero. For two
+#: opposite directions this is the same as `OPPOSITE`.
+CANCELLED = 2.0 * OPPOSITE
+#: |cos| up to which two directions have no product: sums that cancel round to about that.
+UNRELATED = 1e-14
+EPSILON = 2.220446049250313e-16
+#: Errors of float64 algorithms on K rows, in units of K eps, generously.
+CAUTION = 4.0
 
 
-@njit(cache=True)
+@strict_kernel
 def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
     """Fills norms [K] and cosines [K, K] of one Gramian; zero for views that are not present."""
     views = present.size
@@ -29,7 +38,7 @@ def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) 
             cosines[j, i] = c
 
 
-@njit(cache=True)
+@strict_kernel
 def form(a: Floats, cosines: Floats, b: Floats) -> float:
     """a^T C b."""
     total = 0.0
@@ -42,7 +51,7 @@ def form(a: Floats, cosines: Floats, b: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@strict_kernel
 def times(cosines: Floats, j: int, b: Floats) -> float:
     """(C b)_j."""
     total = 0.0

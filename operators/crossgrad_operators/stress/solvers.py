@@ -1,27 +1,24 @@
 """Oracles of the methods that solve a small problem, in 50 digits and by other ways.
 
-The operators enumerate supports or follow active sets in float64; here optimality conditions are
-solved as complementarity problems, and checked.
+See `polyhedra` for those that minimise over convex combinations.
 """
 
-from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
 
 from crossgrad_operators.stress.algebra import (
-    ENUMERATED,
     Vector,
     apply,
-    complementary,
     dot,
     form,
-    null_vector,
     solve,
-    supports,
 )
-from crossgrad_operators.stress.exact import Matrix, Number, require_mpmath
+from crossgrad_operators.stress.exact import Matrix, require_mpmath
 from crossgrad_operators.stress.oracles import (
     OPPOSITE,
     Question,
-    column_sums,
+    cancels,
     cosines,
     is_noise,
     lengths,
@@ -29,158 +26,21 @@ from crossgrad_operators.stress.oracles import (
     zeros,
 )
 
+#: Digits for matrices whose eigenvalues are 60 decades apart.
+WIDE: Final = 150
+#: Newton decrement down to which, and beta up to which, float64 is good enough to start from.
+ROUGH: Final = 1e-3
+LONG: Final = 1e7
+#: Ratio of eigenvalues at which float64 is no doubt right about the rank.
+FAR: Final = 1e-10
+
 
 class UnprovenError(RuntimeError):
     """The oracle found no point that meets the optimality conditions."""
 
 
-def _projection(cosine: Matrix, b: Vector) -> Vector:
-    """Coefficients of the projection of sum b_k e_k on the cone {x: x.e_l >= 0}."""
-    y = complementary(cosine, apply(cosine, b))
-    if y is None:
-        raise UnprovenError
-    x = [u + v for u, v in zip(b, y, strict=True)]
-    return zeros(len(b)) if is_noise(cosine, x) else x
-
-
-def upgrad(question: Question) -> Vector:
-    """Each gradient projected, over K."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    rows = []
-    for k in range(question.count):
-        x = _projection(cosine, [number(int(i == k)) for i in range(question.count)])
-        rows.append([v * n[k] / n[i] / question.views for i, v in enumerate(x)])
-    return column_sums(rows)
-
-
-def dualproj(question: Question) -> Vector:
-    """The mean projected."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    longest = max(n)
-    x = _projection(cosine, [v / longest for v in n])
-    return [v * longest / n[k] / question.views for k, v in enumerate(x)]
-
-
-def _meets_zero(cosine: Matrix) -> bool:
-    """Whether some convex combination of the directions is exactly zero."""
-    if len(cosine) > ENUMERATED:
-        return False
-    for support in supports(len(cosine)):
-        x = null_vector(cosine, support)
-        if x is not None and (all(v >= 0 for v in x) or all(v <= 0 for v in x)):
-            return True
-    return False
-
-
-def mgda(question: Question) -> Vector:
-    """Shortest convex combination: C x = r + s, x >= 0, s >= 0, x.s = 0 up to a factor."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    shortest = min(n)
-    r = [shortest / v for v in n]
-    x = None if _meets_zero(cosine) else complementary(cosine, [-v for v in r])
-    if x is None:
-        if _meets_zero(cosine):
-            return zeros(question.count)
-        raise UnprovenError
-    if is_noise(cosine, x):
-        return zeros(question.count)
-    total = dot(x, r)
-    return [v * w / total for v, w in zip(x, r, strict=True)]
-
-
-def cagrad(question: Question) -> Vector:
-    """g_0 + c |g_0| g_w / |g_w| with g_w from its optimality conditions on the simplex."""
-    mp = require_mpmath().mp
-    gramian, c = question.gramian, number(question.options["c"])
-    share = number(question.count) / question.views
-    if question.count == 1:
-        return [share]
-    mean = [number(1) / question.count] * question.count
-    cosine = cosines(gramian)
-    if question.count == 2 and 1 + cosine[0][1] <= number(OPPOSITE):  # noqa: PLR2004
-        return [(1 - c) * share * m for m in mean]
-    length = mp.sqrt(max(form(gramian, mean), number(0)))
-    if length <= mp.sqrt(max(gramian[k][k] for k in range(question.count))) * number("1e-40"):
-        return zeros(question.count)
-    try:
-        w = _worst_off(gramian, apply(gramian, mean), c * length)
-    except UnprovenError:
-        if _meets_zero(cosine):
-            return zeros(question.count)
-        raise
-    n = lengths(gramian)
-    if question.count > 2 and is_noise(cosine, [v * x for v, x in zip(w, n, strict=True)]):  # noqa: PLR2004
-        return zeros(question.count)
-    factor = c * length / mp.sqrt(form(gramian, w))
-    return [share * (m + factor * v) for m, v in zip(mean, w, strict=True)]
-
-
-def _worst_off(gramian: Matrix, q: Vector, rho: Number) -> Vector:
-    """Minimum of w.q + rho |g_w| on the simplex."""
-    size = len(gramian)
-    candidates = supports(size) if size <= ENUMERATED else _growing_supports(gramian, q, rho)
-    for support in candidates:
-        w = _stationary(gramian, q, rho, support)
-        if w is not None and _optimal(gramian, q, rho, w):
-            return w
-    raise UnprovenError
-
-
-def _growing_supports(gramian: Matrix, q: Vector, rho: Number) -> Iterator[tuple[int, ...]]:
-    """Supports that take up the most violated view and let go of the most negative weight."""
-    size = len(gramian)
-    support = {min(range(size), key=lambda k: q[k])}
-    for _ in range(20 * size):
-        chosen = tuple(sorted(support))
-        yield chosen
-        w = _stationary(gramian, q, rho, chosen)
-        lowest = min(chosen, key=lambda k: w[k]) if w is not None else chosen[0]
-        if w is None or w[lowest] < 0:
-            support -= {lowest}
-        else:
-            slope = _slope(gramian, q, rho, w)
-            support |= {min(range(size), key=lambda k: slope[k])}
-        if not support:
-            return
-
-
-def _stationary(gramian: Matrix, q: Vector, rho: Number, support: Sequence[int]) -> Vector | None:
-    """Weights with q + rho G w / |g_w| = lambda on the support, adding up to 1."""
-    mp = require_mpmath().mp
-    size = len(gramian)
-    if len(support) == 1:
-        return [number(int(k == support[0])) for k in range(size)]
-    a = solve(gramian, support, [number(1)] * size)
-    p = solve(gramian, support, q)
-    if a is None or p is None:
-        return None
-    sum_a, sum_p = sum(a), sum(p)
-    square = sum_p**2 - sum_a * (dot([q[k] for k in support], [p[k] for k in support]) - rho**2)
-    if square <= 0:
-        return None
-    root = mp.sqrt(square)
-    level = (sum_p + root) / sum_a
-    return [(level * u - v) / root for u, v in zip(a, p, strict=True)]
-
-
-def _optimal(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> bool:
-    mp = require_mpmath().mp
-    if any(v < 0 for v in w):
-        return False
-    slope = _slope(gramian, q, rho, w)
-    level = dot(slope, w)
-    scale = max(abs(v) for v in slope)
-    return all(v >= level - scale * mp.mpf("1e-35") for v in slope)
-
-
-def _slope(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> Vector:
-    length = require_mpmath().mp.sqrt(form(gramian, w))
-    return [a + rho * b / length for a, b in zip(q, apply(gramian, w), strict=True)]
-
-
 def imtl_g(question: Question) -> Vector:
     """Equal projections, weights adding up to 1; pseudo-inverse where the rank is not full."""
-    mp = require_mpmath().mp
     gramian, count = question.gramian, question.count
     n, cosine = lengths(gramian), cosines(gramian)
     if count == 1:
@@ -190,57 +50,73 @@ def imtl_g(question: Question) -> Vector:
         opposite = 1 + cosine[0][1] <= number(OPPOSITE)
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
-    total = sum(v)
-    opposite = number(OPPOSITE)
-    if abs(total) <= opposite * mp.fsum(abs(x) for x in v):
-        return zeros(count)
-    if is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
+    total, largest = sum(v), max(abs(x) for x in v)
+    # The sum of the v is a pole, and treated as all sums that cancel are.
+    if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
 
 
 def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
-    mp = require_mpmath().mp
-    values, _ = mp.eigsy(mp.matrix(cosine))
-    rank = sum(1 for v in values if v > number(OPPOSITE) * max(values))
-    count = len(n)
+    rank, count = _rank(cosine), len(n)
     if rank == count:
         v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
             return [x / y for x, y in zip(v, n, strict=True)]
+    # Digits for eigenvalues 60 decades apart, which errors relative to the largest would swallow.
+    with require_mpmath().mp.workdps(WIDE):
+        return _shortest_solution(gramian, n, rank)
+
+
+def _rank(cosine: Matrix) -> int:
+    """Number of eigenvalues above 1e-12 of the largest."""
+    mp = require_mpmath().mp
+    rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
+    # float64 is right to 1e-14; that is enough far from the limit.
+    if rough.min() > FAR * rough.max():
+        return len(cosine)
+    values, _ = mp.eigsy(mp.matrix(cosine))
+    return sum(1 for v in values if v > number(OPPOSITE) * max(values))
+
+
+def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
+    mp, count = require_mpmath().mp, len(n)
     values, vectors = mp.eigsy(mp.matrix(gramian))
     largest = sorted(range(count), key=lambda i: values[i])[count - rank :]
     v = zeros(count)
     for i in largest:
-        column = [vectors[k, i] for k in range(count)]
-        factor = dot(column, n) / values[i]
-        v = [a + factor * b for a, b in zip(v, column, strict=True)]
+        terms = [vectors[k, i] * n[k] for k in range(count)]
+        # At right angles to the norms but for rounding: nothing, divided by whatever.
+        if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
+            factor = sum(terms) / values[i]
+            v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
     return v
 
 
 def nash(question: Question) -> Vector:
-    """C beta = 1 / beta by Newton's method in log beta, times the geometric mean of the norms."""
+    """C beta = 1 / beta by Newton's method, times the geometric mean of the norms."""
     mp = require_mpmath().mp
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     count = question.count
-    if count > 2 and _meets_zero(cosine):  # noqa: PLR2004
-        return zeros(count)
     if count == 2:  # noqa: PLR2004
         apart = 1 + cosine[0][1]
-        beta = [1 / mp.sqrt(apart)] * 2 if apart > 0 else [mp.mpf("1e40")] * 2
+        beta = [1 / mp.sqrt(apart)] * 2 if apart > 0 else None
     else:
         beta = _bargain(cosine)
-    if count > 1 and count <= 2 * number(OPPOSITE) * max(beta) ** 2:
+    if beta is None or (count > 1 and cancels(number(count), max(beta))):
         return zeros(count)
     mean = mp.exp(mp.fsum(mp.log(v) for v in n) / count)
     return [b * mean / v for b, v in zip(beta, n, strict=True)]
 
 
-def _bargain(cosine: Matrix) -> Vector:
+def _bargain(cosine: Matrix) -> Vector | None:
+    """The bargain's beta; None where it is proven to be so large that the result is zero."""
     mp = require_mpmath().mp
     count = len(cosine)
-    beta = [number(1)] * count
+    beta = _rough_bargain(cosine)
     for _ in range(2000):
+        if _is_hopeless(cosine, beta):
+            return None
         slope = [1 - b * v for b, v in zip(beta, apply(cosine, beta), strict=True)]
         hessian = [
             [beta[i] * cosine[i][j] * beta[j] + int(i == j) for j in range(count)]
@@ -249,12 +125,39 @@ def _bargain(cosine: Matrix) -> Vector:
         step = solve(hessian, range(count), slope)
         if step is None:
             raise UnprovenError
-        decrement = mp.sqrt(dot(slope, step))
+        decrement = mp.sqrt(abs(dot(slope, step)))
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        if decrement < mp.mpf("1e-40") or max(beta) > mp.mpf("1e12"):
+        # The step that was taken squares what is left.
+        if decrement < mp.mpf("1e-25"):
             return beta
     raise UnprovenError
+
+
+def _rough_bargain(cosine: Matrix) -> Vector:
+    """Damped Newton steps in float64, as far as they lead: a place to start from."""
+    matrix = np.array(cosine, dtype=np.float64)
+    beta = np.ones(len(cosine))
+    for _ in range(200):
+        hessian = beta[:, None] * matrix * beta + np.eye(len(beta))
+        slope = 1 - beta * (matrix @ beta)
+        step = np.linalg.solve(hessian, slope)
+        decrement = np.sqrt(abs(slope @ step))
+        longer = beta * (1 + step / (1 + decrement))
+        if not (longer.min() > 0 and longer.max() < LONG) or decrement < ROUGH:
+            break
+        beta = longer
+    return [number(b) for b in beta.tolist()]
+
+
+def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
+    """Whether the bargain is proven to be zero by the convex combination beta / sum beta.
+
+    With x that combination and u the bargain's sum, |u|^2 = K, sum x_k / beta_k = sum x_k e_k.u is
+    at most |sum x_k e_k| sqrt K, and so is 1 over the largest beta.
+    """
+    share = form(cosine, beta) / sum(beta) ** 2
+    return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))
 
 
 def aligned(question: Question) -> Vector:

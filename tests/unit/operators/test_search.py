@@ -1,6 +1,7 @@
 """The search for the worst gradients finds what it should, and finds it again."""
 
 import json
+from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -12,6 +13,7 @@ from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.errors import UserError
 from crossgrad_operators.stress.case import short
 from crossgrad_operators.stress.exact import exact_gramian
+from crossgrad_operators.stress.promises import PROMISES
 from crossgrad_operators.stress.reference import answer
 from crossgrad_operators.stress.search.batch import Batch, results, search_views
 from crossgrad_operators.stress.search.examine import examine
@@ -105,6 +107,18 @@ def test_the_right_operator_keeps_every_promise():
     assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
 
 
+@pytest.mark.parametrize("name", sorted(QUICK))
+def test_a_short_search_finds_nothing_outside_what_is_stated(name):
+    (tally, wide) = search([subject_of(name, made(name))], Extent(seed=1, rounds=16))
+    assert not tally.failures and not wide.failures
+
+
+def test_what_is_stated_is_what_the_page_says():
+    page = (Path(__file__).parents[3] / "docs" / "operators.md").read_text(encoding="utf-8")
+    for name, promise in PROMISES.items():
+        assert f"| {name} | " in page and f" | {promise.factor_words} |" in page
+
+
 def test_a_longer_search_begins_with_the_cases_of_a_shorter_one():
     once = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
     again = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
@@ -189,7 +203,23 @@ def test_rows_are_printed_so_that_they_are_read_again_exactly():
         assert np.array_equal(read_rows(text, dtype).exact_head, rows)
 
 
-@pytest.mark.parametrize("text", ["", "1", "[1,2]", "[[1,2],[3]]", "[[1,a]]", "[[]]"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "",
+            "1",
+            "[1,2]",
+            "[[1,2],[3]]",
+            "[[1,a]]",
+            "[[]]",
+            "[[NaN,1]]",
+            "[[1e999,1]]",
+            "[[1e39,1]]",
+        ),
+        *("[" * 5000, f"[[1{'0' * 400},1]]"),
+    ],
+)
 def test_rows_that_are_no_matrix_are_refused(text):
     with pytest.raises(UserError, match="no matrix"):
         read_rows(text, torch.float32)

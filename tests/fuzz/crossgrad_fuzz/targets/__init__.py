@@ -1,1 +1,20 @@
-"""The parsers under test."""
+"""The parsers under test, by name."""
+
+from crossgrad_fuzz.target import Target
+from crossgrad_fuzz.targets import (
+    checkpoints,
+    colmap,
+    lists,
+    photos,
+    ply,
+    records,
+    scenes,
+    settings,
+    tables,
+)
+
+TARGETS: dict[str, Target] = {
+    target.name: target
+    for module in (ply, colmap, scenes, photos, settings, checkpoints, lists, tables, records)
+    for target in module.TARGETS
+}

@@ -9,7 +9,7 @@ import numpy as np
 from support.scenes import write_tiny_scene
 
 from crossgrad_fuzz.case import Case, load
-from crossgrad_fuzz.mutate import at_offsets
+from crossgrad_fuzz.mutate import NUMBERS, at_offsets, matcher
 from crossgrad_fuzz.target import Target
 from crossgrad_plugins.readers import (
     _colmap_binary,
@@ -42,10 +42,9 @@ def files(*, text: bool, model: str = "PINHOLE", points: int = 6) -> dict[str, b
 
 
 def _parse(folder: Path) -> None:
-    if not has_model(folder):
-        assert count_images(folder) == 0
-        return
     assert count_images(folder) >= 0
+    if not has_model(folder):
+        return
     model = read_model(folder)
     count = len(model.points)
     assert model.points.shape == (count, 3)
@@ -57,7 +56,7 @@ def _parse(folder: Path) -> None:
         assert ((view.seen >= 0) & (view.seen < count)).all()
 
 
-def _fields(data: bytes) -> list[tuple[int, int, str]]:
+def fields(data: bytes) -> list[tuple[int, int, str]]:
     """Fields of any of the three files, by trying its layout; wrong ones do no harm."""
     return [(0, 8, "i"), *_camera_fields(data), *_image_fields(data), *_point_fields(data)]
 
@@ -94,11 +93,20 @@ def _point_fields(data: bytes) -> list[tuple[int, int, str]]:
 
 
 def _binary() -> Sequence[Case]:
-    return [*(files(text=False, model=model) for model in _MODELS), _without_points()]
+    models = [files(text=False, model=model) for model in _MODELS]
+    return [*models, _two_cameras(models[0]), files(text=False, points=0), _without_points()]
+
+
+def _two_cameras(case: Case) -> Case:
+    """A second camera, which no image has."""
+    first = case["cameras.bin"][8:]
+    second = struct.pack("<I", 7) + first[4:]
+    return {**case, "cameras.bin": struct.pack("<Q", 2) + first + second}
 
 
 def _text() -> Sequence[Case]:
-    return [*(files(text=True, model=model) for model in _MODELS), _without_text_points()]
+    models = [files(text=True, model=model) for model in _MODELS]
+    return [*models, files(text=False), _without_text_points()]
 
 
 def _without_points() -> Case:
@@ -130,13 +138,14 @@ BINARY = Target(
         colmap: _READER,
     },
     words=(b"\0", b"0000.png\0", b"0001.png\0", b"../x\0", struct.pack("<Q", 2**64 - 1)),
-    mutators=(at_offsets(_fields),),
+    mutators=(at_offsets(fields),),
 )
 TEXT = Target(
     name="colmap-text",
     seeds=_text,
     parse=_parse,
     parser={_colmap_model: (), _colmap_text: (), _colmap_types: (), colmap: _READER},
+    mutators=(matcher(rb"\n(\d+) ", (b"1", b"2", b"3")), matcher(rb" ([-\d.e]+)", NUMBERS)),
     words=_WORDS,
 )
 TARGETS = (BINARY, TEXT)

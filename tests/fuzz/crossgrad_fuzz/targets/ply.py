@@ -12,10 +12,11 @@ from crossgrad_core.ply import table as ply_table
 from crossgrad_core.ply.cloud import SplatCloud
 from crossgrad_core.ply.file import PROPERTIES, read_ply, sh_degree_of, write_ply
 from crossgrad_fuzz.case import Case
-from crossgrad_fuzz.mutate import NUMBERS, matcher
+from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
 _FILE = "model.ply"
+_ROTATIONS = (b"0 0 0 0", b"1e30 0 0 0", b"1e-30 0 0 0", b"1 0 0 0")
 _FAR = Similarity(np.array([355_142.5, 5_812_377.25, 81.0]), 1 / 60)
 
 
@@ -55,10 +56,19 @@ def _plain(form: str, extra: str = "") -> bytes:
     return text.encode() + np.array([7], f"{order}i4").tobytes() + table.tobytes()
 
 
+def _bare() -> bytes:
+    """One Gaussian in letters, and nothing that could be left out."""
+    names = [name for name in PROPERTIES if not name.startswith(("n", "f_rest"))]
+    head = ["ply", "format ascii 1.0", "element vertex 1"]
+    head += [f"property float {name}" for name in names]
+    return ("\n".join([*head, "end_header", " ".join(["0.5"] * len(names))]) + "\n").encode()
+
+
 def _seeds() -> Sequence[Case]:
     files = [
         *(_written(Similarity(np.zeros(3), 1.0)), _written(_FAR), _plain("ascii")),
         *(_plain("binary_big_endian"), _plain("binary_little_endian")),
+        *(_plain("ascii", "comment x"), _bare()),
     ]
     return [{_FILE: content} for content in files]
 
@@ -102,8 +112,13 @@ TARGET = Target(
         *(b"SplatRenderMode: mip", b"SplatRenderMode: 2dgs", b"vertex", b"element", b"property"),
     ),
     mutators=(
-        matcher(rb"element \w+ (\S+)", NUMBERS),
+        matcher(rb"element \w+ (\S+)", COUNTS),
+        matcher(rb"element (?:vertex|camera) (\S+)", COUNTS),
         matcher(rb"property (\w+) ", (b"float", b"double", b"uchar", b"list", b"int", b"bool")),
         matcher(rb"crossgrad_offset: (\S+)", NUMBERS),
+        matcher(rb"SplatRenderMode: (\w+)", (b"default", b"2dgs", b"mip")),
+        matcher(rb"\n((?:0\.5 ){3}0\.5) ", _ROTATIONS),
+        matcher(rb" ((?:0\.5 ){3}0\.5)\n", _ROTATIONS),
     ),
 )
+TARGETS = (TARGET,)

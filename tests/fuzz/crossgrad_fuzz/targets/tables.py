@@ -1,8 +1,10 @@
 """What a run wrote and reads again: metrics.csv, tables of diagnostics, summary.json."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from crossgrad_core.errors import UserError
 from crossgrad_core.run.results import metrics_csv, summary
 from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
 from crossgrad_core.run.results.summary import read_summary
@@ -28,6 +30,8 @@ def _metrics() -> bytes:
 
 def _parse_metrics(folder: Path) -> None:
     if not (folder / _METRICS).is_file():
+        with suppress(UserError):
+            read_metrics(folder)
         MetricsCsv.resume(folder, _REGIMES, 100)
         return
     rows = read_metrics(folder)
@@ -63,7 +67,7 @@ METRICS = Target(
     parse=_parse_metrics,
     parser={
         text_files: ("read_json",),
-        metrics_csv: ("metrics_row", "MetricsCsv.append", "regimes_of"),
+        metrics_csv: ("metrics_row", "MetricsCsv.append", "_append", "regimes_of"),
     },
     words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
