@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.gradients import ViewGradients
 from crossgrad_core.operator import Granularity, Operator, OperatorContext
 from crossgrad_core.state import PluginState
+
+#: Gradients whose unit roundoff is below this show the rounding of float64 weights.
+_NARROW: Final = 1e-12
 
 
 def aggregate_by_gramians(
@@ -32,7 +36,7 @@ def aggregate_by_gramians(
     present = gradients.present(granularity)
     given = operator_context(context, granularity, present)
     matrices, state = operator.transform(gramians, given, state, context.rng)
-    weights = np.where(present, _added_rows(matrices), 0.0)
+    weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
     # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
@@ -40,12 +44,20 @@ def aggregate_by_gramians(
     return Aggregated(gradients.combine(weights, granularity), counts), state
 
 
-def _added_rows(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[B, K] the sum over R of matrices [B, R, K]; row by row, as numpy is slow at short sums."""
+def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
+    """[B, K] the sum over R of matrices [B, R, K]; row by row, as numpy is slow at short sums.
+
+    Weights for gradients in float64 are compensated for what each addition loses (Neumaier 1974).
+    """
     total = np.zeros((matrices.shape[0], matrices.shape[2]))
+    lost = np.zeros_like(total)
     for row in range(matrices.shape[1]):
-        total += matrices[:, row]
-    return total
+        added = matrices[:, row]
+        before, total = total, total + added
+        if unit < _NARROW:
+            larger = np.abs(before) >= np.abs(added)
+            lost += np.where(larger, (before - total) + added, (added - total) + before)
+    return total + lost if unit < _NARROW else total
 
 
 def operator_context(

@@ -6,13 +6,14 @@ times 2^-104.
 """
 
 import numpy as np
-from numba import njit
+
+from crossgrad_core.jit import strict_device
 
 #: Splits a float64 number into two halves whose products are exact.
 _SPLITTER = 134217729.0
 
 
-@njit(cache=True, inline="always")
+@strict_device
 def two_sum(a: float, b: float) -> tuple[float, float]:
     """The sum and what rounding took from it."""
     total = a + b
@@ -20,14 +21,14 @@ def two_sum(a: float, b: float) -> tuple[float, float]:
     return total, (a - (total - part)) + (b - part)
 
 
-@njit(cache=True, inline="always")
+@strict_device
 def quick_two_sum(a: float, b: float) -> tuple[float, float]:
     """The same where |a| >= |b|."""
     total = a + b
     return total, b - (total - a)
 
 
-@njit(cache=True, inline="always")
+@strict_device
 def two_product(a: float, b: float) -> tuple[float, float]:
     """The product and what rounding took from it; magnitudes below 1e150."""
     product = a * b
@@ -41,7 +42,7 @@ def two_product(a: float, b: float) -> tuple[float, float]:
     return product, error
 
 
-@njit(cache=True)
+@strict_device
 def add(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
     """(a + a_low) + (b + b_low)."""
     high, low = two_sum(a, b)
@@ -50,14 +51,14 @@ def add(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
     return quick_two_sum(high, low + less)
 
 
-@njit(cache=True)
+@strict_device
 def multiply(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
     """(a + a_low) (b + b_low)."""
     high, low = two_product(a, b)
     return quick_two_sum(high, low + (a * b_low + a_low * b))
 
 
-@njit(cache=True)
+@strict_device
 def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
     """(a + a_low) / (b + b_low)."""
     first = a / b
@@ -70,7 +71,7 @@ def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float
     return add(high, low, rest / b, 0.0)
 
 
-@njit(cache=True)
+@strict_device
 def square_root(a: float, a_low: float) -> tuple[float, float]:
     """The root of a + a_low >= 0."""
     if a <= 0.0:

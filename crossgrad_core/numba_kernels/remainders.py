@@ -5,15 +5,15 @@ Rump and Oishi 2005): as exact as 106-bit arithmetic, ten times as slow as plain
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from crossgrad_core.jit import strict_kernel
 from crossgrad_core.numba_kernels.double_double import two_product, two_sum
 
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True)
+@strict_kernel
 def add_products(rows: Floats, high: Floats, low: Floats) -> None:
     """Adds the Gramian of `rows` [K, P] to the upper triangle of high + low, [K, K] each."""
     views, size = rows.shape
@@ -27,14 +27,14 @@ def add_products(rows: Floats, high: Floats, low: Floats) -> None:
             high[i, j], low[i, j] = total, lost
 
 
-@njit(cache=True)
+@strict_kernel
 def add_row_products(rows: Floats, high: Floats, low: Floats) -> None:
     """Adds the Gramians of `rows` [K, N, d], primitive by primitive, to high + low [N, K, K]."""
     for n in range(rows.shape[1]):
         add_products(rows[:, n], high[n], low[n])
 
 
-@njit(cache=True)
+@strict_kernel
 def left_over(high: Floats, low: Floats, gramians: Floats) -> Floats:
     """[B, K, K] high + low - gramians from the upper triangles of the first two.
 

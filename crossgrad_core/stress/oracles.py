@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from crossgrad_core.stress.algebra import Vector, apply, form
+from crossgrad_core.stress.algebra import Vector, dot, form
 from crossgrad_core.stress.exact import Matrix, Number, require_mpmath
 
 #: 1 + cos up to which two directions are exactly opposite.
 OPPOSITE = "1e-12"
+#: |cos| up to which two directions have no product: sums that cancel round to about that.
+UNRELATED = "1e-14"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +74,12 @@ def cosines(gramian: Matrix) -> Matrix:
 
 def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
     """Whether sum x_k e_k is what exactly opposite directions leave."""
-    largest = max(abs(v) for v in x)
-    return bool(form(cosine, x) <= 2 * number(OPPOSITE) * largest**2)
+    return cancels(form(cosine, x), max(abs(v) for v in x))
+
+
+def cancels(square: Number, largest: Number) -> bool:
+    """Whether a sum of this square, with a longest summand of this length, counts as zero."""
+    return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
 
 def zeros(count: int) -> Vector:
@@ -125,6 +131,35 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
     ]
 
 
+class _Combination:
+    """A sum of v_k g_k that grows by one term at a time, with its products with all gradients.
+
+    Args:
+        gramian: [n][n].
+        norms: [n].
+        i: The gradient that it begins with.
+    """
+
+    def __init__(self, gramian: Matrix, norms: Vector, i: int) -> None:
+        self._gramian = gramian
+        self._norms = norms
+        self.v = zeros(len(gramian))
+        self.products = zeros(len(gramian))
+        self.add(i, number(1))
+
+    def add(self, j: int, x: Number) -> None:
+        """Adds x g_j."""
+        self.v[j] += x
+        self.products = [p + x * g for p, g in zip(self.products, self._gramian[j], strict=True)]
+
+    @property
+    def length(self) -> Number:
+        """Its norm; exactly zero where less than 1.4e-6 of its longest summand is left."""
+        square = dot(self.v, self.products)
+        longest = max(abs(x) * n for x, n in zip(self.v, self._norms, strict=True))
+        return number(0) if cancels(square, longest) else require_mpmath().mp.sqrt(square)
+
+
 def _projected_row(
     question: Question,
     i: int,
@@ -132,22 +167,23 @@ def _projected_row(
     gate: Callable[[int, int], bool],
     rule: tuple[Number, Number],
 ) -> Vector:
-    mp = require_mpmath().mp
     threshold, strength = rule
-    gramian = question.gramian
-    v = [number(int(k == i)) for k in range(question.count)]
+    # A conflict at the threshold itself, where the rule jumps, is none.
+    least = threshold + (number(OPPOSITE) if threshold else 0)
+    norms = lengths(question.gramian)
+    row = _Combination(question.gramian, norms, i)
+    length = row.length
     for j in partners:
-        length = mp.sqrt(form(gramian, v))
-        if not length or not gate(i, j):
-            continue
-        along = apply(gramian, v)[j]
-        cosine = along / length / mp.sqrt(gramian[j][j])
-        if not (cosine < 0 and cosine < -threshold):
+        cosine = row.products[j] / length / norms[j]
+        if not gate(i, j) or not (cosine < 0 and cosine < -least):
             continue
         if strength == 1 and 1 + cosine <= number(OPPOSITE):
             return zeros(question.count)
-        v[j] -= strength * along / gramian[j][j]
-    return v
+        row.add(j, -strength * row.products[j] / norms[j] ** 2)
+        length = row.length
+        if not length:
+            return zeros(question.count)
+    return row.v
 
 
 def column_sums(rows: Matrix) -> Vector:
@@ -182,7 +218,7 @@ def confgate(question: Question) -> Vector:
     cosine = cosines(question.gramian)
     confident = {
         (i, j): i != j
-        and question.gramian[i][j] != 0
+        and abs(cosine[i][j]) > number(UNRELATED)
         and _believed(question, (question.places[i], question.places[j]), cosine[i][j])
         for i in range(question.count)
         for j in range(question.count)
@@ -217,24 +253,25 @@ def gradvac(question: Question) -> Vector:
 
 
 def _vaccinated(question: Question, i: int, partners: Sequence[int]) -> Vector:
-    mp = require_mpmath().mp
-    gramian, beta = question.gramian, number(question.options["beta"])
-    v = [number(int(k == i)) for k in range(question.count)]
+    mp, beta, limit = require_mpmath().mp, number(question.options["beta"]), number("0.999")
+    norms = lengths(question.gramian)
+    row = _Combination(question.gramian, norms, i)
+    length = row.length
     for j in partners:
-        length, other = mp.sqrt(form(gramian, v)), mp.sqrt(gramian[j][j])
-        if not length:
-            break
         key = (question.places[i], question.places[j])
         t: Number = question.memory.get(key, number(0))
-        phi = apply(gramian, v)[j] / length / other
-        if phi < t and 1 + phi <= number(OPPOSITE):
-            v = zeros(question.count)
-        elif phi < t:
-            root = mp.sqrt(1 - t * t)
-            v[j] += length * (t * mp.sqrt(1 - phi**2) - phi * root) / (other * root)
-        limit = number("0.999")
+        phi = min(max(row.products[j] / length / norms[j], -1), 1)
         question.memory[key] = min(max((1 - beta) * t + beta * phi, -limit), limit)
-    return v
+        if phi >= t:
+            continue
+        if 1 + phi <= number(OPPOSITE):
+            return zeros(question.count)
+        root = mp.sqrt(1 - t * t)
+        row.add(j, length * (t * mp.sqrt(1 - phi**2) - phi * root) / (norms[j] * root))
+        length = row.length
+        if not length:
+            return zeros(question.count)
+    return row.v
 
 
 def gradnorm(question: Question) -> Vector:
@@ -242,10 +279,11 @@ def gradnorm(question: Question) -> Vector:
     mp = require_mpmath().mp
     groups = list(dict.fromkeys(question.labels))
     members = {g: [i for i, label in enumerate(question.labels) if label == g] for g in groups}
-    norms = {}
+    n, norms = lengths(question.gramian), {}
     for group, inside in members.items():
         indicator = [number(int(k in inside)) for k in range(question.count)]
-        norms[group] = mp.sqrt(max(form(question.gramian, indicator), number(0)))
+        square, longest = form(question.gramian, indicator), max(n[k] for k in inside)
+        norms[group] = number(0) if cancels(square, longest) else mp.sqrt(square)
     groups = [g for g in groups if norms[g] > 0]
     logs = {g: question.memory.get(g, number(0)) for g in groups}
     weights = _adding_up(logs)

@@ -5,6 +5,9 @@ solved as complementarity problems, and checked.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
 
 from crossgrad_core.stress.algebra import (
     ENUMERATED,
@@ -21,6 +24,7 @@ from crossgrad_core.stress.exact import Matrix, Number, require_mpmath
 from crossgrad_core.stress.oracles import (
     OPPOSITE,
     Question,
+    cancels,
     column_sums,
     cosines,
     is_noise,
@@ -28,6 +32,14 @@ from crossgrad_core.stress.oracles import (
     number,
     zeros,
 )
+
+#: Digits for matrices whose eigenvalues are 60 decades apart.
+WIDE: Final = 150
+#: Newton decrement down to which, and beta up to which, float64 is good enough to start from.
+ROUGH: Final = 1e-3
+LONG: Final = 1e7
+#: Ratio of eigenvalues at which float64 is no doubt right about the rank.
+FAR: Final = 1e-10
 
 
 class UnprovenError(RuntimeError):
@@ -180,7 +192,6 @@ def _slope(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> Vector:
 
 def imtl_g(question: Question) -> Vector:
     """Equal projections, weights adding up to 1; pseudo-inverse where the rank is not full."""
-    mp = require_mpmath().mp
     gramian, count = question.gramian, question.count
     n, cosine = lengths(gramian), cosines(gramian)
     if count == 1:
@@ -190,57 +201,73 @@ def imtl_g(question: Question) -> Vector:
         opposite = 1 + cosine[0][1] <= number(OPPOSITE)
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
-    total = sum(v)
-    opposite = number(OPPOSITE)
-    if abs(total) <= opposite * mp.fsum(abs(x) for x in v):
-        return zeros(count)
-    if is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
+    total, largest = sum(v), max(abs(x) for x in v)
+    # The sum of the v is a pole, and treated as all sums that cancel are.
+    if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
 
 
 def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
-    mp = require_mpmath().mp
-    values, _ = mp.eigsy(mp.matrix(cosine))
-    rank = sum(1 for v in values if v > number(OPPOSITE) * max(values))
-    count = len(n)
+    rank, count = _rank(cosine), len(n)
     if rank == count:
         v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
             return [x / y for x, y in zip(v, n, strict=True)]
+    # Digits for eigenvalues 60 decades apart, which errors relative to the largest would swallow.
+    with require_mpmath().mp.workdps(WIDE):
+        return _shortest_solution(gramian, n, rank)
+
+
+def _rank(cosine: Matrix) -> int:
+    """Number of eigenvalues above 1e-12 of the largest."""
+    mp = require_mpmath().mp
+    rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
+    # float64 is right to 1e-14; that is enough far from the limit.
+    if rough.min() > FAR * rough.max():
+        return len(cosine)
+    values, _ = mp.eigsy(mp.matrix(cosine))
+    return sum(1 for v in values if v > number(OPPOSITE) * max(values))
+
+
+def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
+    mp, count = require_mpmath().mp, len(n)
     values, vectors = mp.eigsy(mp.matrix(gramian))
     largest = sorted(range(count), key=lambda i: values[i])[count - rank :]
     v = zeros(count)
     for i in largest:
-        column = [vectors[k, i] for k in range(count)]
-        factor = dot(column, n) / values[i]
-        v = [a + factor * b for a, b in zip(v, column, strict=True)]
+        terms = [vectors[k, i] * n[k] for k in range(count)]
+        # At right angles to the norms but for rounding: nothing, divided by whatever.
+        if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
+            factor = sum(terms) / values[i]
+            v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
     return v
 
 
 def nash(question: Question) -> Vector:
-    """C beta = 1 / beta by Newton's method in log beta, times the geometric mean of the norms."""
+    """C beta = 1 / beta by Newton's method, times the geometric mean of the norms."""
     mp = require_mpmath().mp
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     count = question.count
-    if count > 2 and _meets_zero(cosine):  # noqa: PLR2004
-        return zeros(count)
     if count == 2:  # noqa: PLR2004
         apart = 1 + cosine[0][1]
-        beta = [1 / mp.sqrt(apart)] * 2 if apart > 0 else [mp.mpf("1e40")] * 2
+        beta = [1 / mp.sqrt(apart)] * 2 if apart > 0 else None
     else:
         beta = _bargain(cosine)
-    if count > 1 and count <= 2 * number(OPPOSITE) * max(beta) ** 2:
+    if beta is None or (count > 1 and cancels(number(count), max(beta))):
         return zeros(count)
     mean = mp.exp(mp.fsum(mp.log(v) for v in n) / count)
     return [b * mean / v for b, v in zip(beta, n, strict=True)]
 
 
-def _bargain(cosine: Matrix) -> Vector:
+def _bargain(cosine: Matrix) -> Vector | None:
+    """The bargain's beta; None where it is proven to be so large that the result is zero."""
     mp = require_mpmath().mp
     count = len(cosine)
-    beta = [number(1)] * count
+    beta = _rough_bargain(cosine)
     for _ in range(2000):
+        if _is_hopeless(cosine, beta):
+            return None
         slope = [1 - b * v for b, v in zip(beta, apply(cosine, beta), strict=True)]
         hessian = [
             [beta[i] * cosine[i][j] * beta[j] + int(i == j) for j in range(count)]
@@ -249,12 +276,38 @@ def _bargain(cosine: Matrix) -> Vector:
         step = solve(hessian, range(count), slope)
         if step is None:
             raise UnprovenError
-        decrement = mp.sqrt(dot(slope, step))
+        decrement = mp.sqrt(abs(dot(slope, step)))
+        if decrement < mp.mpf("1e-25"):
+            return beta
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        if decrement < mp.mpf("1e-40") or max(beta) > mp.mpf("1e12"):
-            return beta
     raise UnprovenError
+
+
+def _rough_bargain(cosine: Matrix) -> Vector:
+    """Damped Newton steps in float64, as far as they lead: a place to start from."""
+    matrix = np.array(cosine, dtype=np.float64)
+    beta = np.ones(len(cosine))
+    for _ in range(200):
+        hessian = beta[:, None] * matrix * beta + np.eye(len(beta))
+        slope = 1 - beta * (matrix @ beta)
+        step = np.linalg.solve(hessian, slope)
+        decrement = np.sqrt(abs(slope @ step))
+        longer = beta * (1 + step / (1 + decrement))
+        if not (longer.min() > 0 and longer.max() < LONG) or decrement < ROUGH:
+            break
+        beta = longer
+    return [number(b) for b in beta.tolist()]
+
+
+def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
+    """Whether the bargain is proven to be zero by the convex combination beta / sum beta.
+
+    With x that combination and u the bargain's sum, |u|^2 = K, sum x_k / beta_k = sum x_k e_k.u is
+    at most |sum x_k e_k| sqrt K, and so is 1 over the largest beta.
+    """
+    share = form(cosine, beta) / sum(beta) ** 2
+    return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))
 
 
 def aligned(question: Question) -> Vector:

@@ -5,6 +5,9 @@ from numpy.typing import NDArray
 
 from crossgrad_core.operator import OperatorContext
 
+#: Gradients whose unit roundoff is below this have Gramians that are no closer than they are.
+NARROW = 1e-12
+
 
 def slot_order(views: int) -> NDArray[np.int64]:
     """[K, K] partners of each view in the order of their slots."""
@@ -36,8 +39,15 @@ def project(
         threshold: Only cosines below minus this count as a conflict.
         strength: The share of the conflicting component that is taken away.
     """
+    from crossgrad_operators.numba_kernels.exact_projection import exact_projected
     from crossgrad_operators.numba_kernels.projection import projected
 
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
+    # Two views take one step each, whose errors are those of the cosine. More of them add up, to
+    # nothing that float32 gradients would show.
+    many = gramians.shape[1] > 2  # noqa: PLR2004
+    if context.unit < NARROW and many and context.remainders is not None:
+        rule = (float(threshold), float(strength))
+        return exact_projected(gramians, context.remainders(), context.present, order, gates, rule)
     return projected(gramians, context.present, order, gates, threshold, strength)

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import sharpened, weighting
 
 
 class Aligned(Operator):
@@ -30,5 +30,7 @@ class Aligned(Operator):
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.balance import aligned
+        from crossgrad_operators.numba_kernels.exact_balance import exact_aligned
 
-        return weighting(aligned(gramians, context.present)), state
+        weights, doubtful = aligned(gramians, context.present, context.unit)
+        return weighting(sharpened(weights, doubtful, gramians, context, exact_aligned)), state

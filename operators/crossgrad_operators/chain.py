@@ -1,6 +1,6 @@
 """Operators one after the other: `a+b` on the command line."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -73,8 +73,8 @@ class Chain(Operator):
             empty = _noise(seen, product, gramians)
             product = np.where(empty[:, :, None], 0.0, product)
             seen = np.where(empty[:, :, None] | empty[:, None, :], 0.0, seen)
-            # Products of rounded matrices are rounded themselves.
-            seen_context = replace(context, present=~empty, remainders=None)
+            remainders = _remainders(product, gramians, context, seen)
+            seen_context = replace(context, present=~empty, remainders=remainders)
         return product, outer_state(states)
 
     @hookimpl
@@ -92,6 +92,25 @@ def _noise(
     terms = np.abs(product) @ norms[:, :, None]
     empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2
     return empty
+
+
+def _remainders(
+    product: NDArray[np.float64],
+    gramians: NDArray[np.float64],
+    context: OperatorContext,
+    seen: NDArray[np.float64],
+) -> Callable[[], NDArray[np.float64]] | None:
+    """What rounding took from M Gram M^T, for links that ask for it."""
+    whole = context.remainders
+    if whole is None:
+        return None
+
+    def work_out() -> NDArray[np.float64]:
+        from crossgrad_operators.numba_kernels.exact_linear import lost_between
+
+        return lost_between(product, gramians, whole(), seen)
+
+    return work_out
 
 
 def _reshaped(link: Operator, rows: int, views: int) -> UserError:

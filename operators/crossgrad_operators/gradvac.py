@@ -11,6 +11,7 @@ from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._pairs import random_order
+from crossgrad_operators._weights import Floats, sharpened
 
 
 class GradVac(Operator):
@@ -32,10 +33,21 @@ class GradVac(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
+        from crossgrad_operators.numba_kernels.exact_projection import exact_aligned_to_targets
         from crossgrad_operators.numba_kernels.projection import aligned_to_targets
 
         views = gramians.shape[1]
         targets = recall(state, context, "target", (views, views))
-        order = random_order(views, rng)
-        matrices = aligned_to_targets(gramians, context.present, order, targets, self.beta)
+        before, order = targets.copy(), random_order(views, rng)
+        matrices, doubtful = aligned_to_targets(
+            gramians, context.present, order, targets, self.beta, context.unit
+        )
+
+        def exact(gramians: Floats, remainders: Floats, present: NDArray[np.bool_]) -> Floats:
+            again = before[doubtful]
+            rows = exact_aligned_to_targets(gramians, remainders, present, order, again, self.beta)
+            targets[doubtful] = again
+            return rows
+
+        sharpened(matrices, doubtful, gramians, context, exact)
         return matrices, remember(state, context, "target", targets)

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import sharpened, weighting
 
 
 class IMTLG(Operator):
@@ -30,5 +30,7 @@ class IMTLG(Operator):
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.balance import imtl_g
+        from crossgrad_operators.numba_kernels.exact_balance import exact_imtl_g
 
-        return weighting(imtl_g(gramians, context.present)), state
+        weights, doubtful = imtl_g(gramians, context.present, context.unit)
+        return weighting(sharpened(weights, doubtful, gramians, context, exact_imtl_g)), state

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import sharpened, weighting
 
 
 class Nash(Operator):
@@ -30,5 +30,7 @@ class Nash(Operator):
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.balance import nash
+        from crossgrad_operators.numba_kernels.exact_balance import exact_nash
 
-        return weighting(nash(gramians, context.present)), state
+        weights, doubtful = nash(gramians, context.present, context.unit)
+        return weighting(sharpened(weights, doubtful, gramians, context, exact_nash)), state

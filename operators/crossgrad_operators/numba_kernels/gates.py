@@ -1,15 +1,22 @@
 """Running statistics of operators that remember earlier steps."""
 
 import numpy as np
-from numba import njit
 
-from crossgrad_operators.numba_kernels.normal import Flags, Floats, Indices, normalised
+from crossgrad_core.jit import strict_device, strict_kernel
+from crossgrad_operators.numba_kernels.normal import (
+    CANCELLED,
+    UNRELATED,
+    Flags,
+    Floats,
+    Indices,
+    normalised,
+)
 
 #: A norm this close to its target, relative to the mean norm, has met it.
 MET = 1e-9
 
 
-@njit(cache=True)
+@strict_kernel
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
@@ -32,7 +39,7 @@ def confident(
         normalised(gramians[b], present[b], norms, cosines)
         for i in range(views):
             for j in range(views):
-                if i == j or gramians[b, i, j] == 0.0:
+                if i == j or abs(cosines[i, j]) <= UNRELATED:
                     continue
                 c = cosines[i, j]
                 moments[b, 0, i, j] = beta * moments[b, 0, i, j] + (1.0 - beta) * c
@@ -46,7 +53,7 @@ def confident(
     return gates
 
 
-@njit(cache=True)
+@strict_device
 def _scale(logs: Floats, active: Flags) -> None:
     """Shifts log weights so that the active weights add up to their number."""
     largest = -np.inf
@@ -65,7 +72,22 @@ def _scale(logs: Floats, active: Flags) -> None:
     logs -= largest + np.log(total / count)
 
 
-@njit(cache=True)
+@strict_device
+def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
+    """Lengths [S] of the sums over each group; zero where the sum is no more than rounding."""
+    views = group.size
+    longest = np.zeros(lengths.size)
+    lengths[:] = 0.0
+    for i in range(views):
+        longest[group[i]] = max(longest[group[i]], gramian[i, i])
+        for j in range(views):
+            if group[i] == group[j]:
+                lengths[group[i]] += gramian[i, j]
+    for s in range(lengths.size):
+        lengths[s] = np.sqrt(lengths[s]) if lengths[s] > CANCELLED * longest[s] else 0.0
+
+
+@strict_kernel
 def follow_losses(
     logs: Floats, gramians: Floats, group: Indices, rates: Floats, alpha: float, lr: float
 ) -> Floats:
@@ -85,15 +107,10 @@ def follow_losses(
     lengths = np.empty(groups)
     active = np.empty(groups, np.bool_)
     for b in range(blocks):
-        squares = np.zeros(groups)
-        for i in range(views):
-            for j in range(views):
-                if group[i] == group[j]:
-                    squares[group[i]] += gramians[b, i, j]
+        _group_lengths(gramians[b], group, lengths)
         count = 0
         rate = 0.0
         for s in range(groups):
-            lengths[s] = np.sqrt(max(squares[s], 0.0))
             active[s] = lengths[s] > 0.0
             if active[s]:
                 count += 1

@@ -50,6 +50,67 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
 
 
 @njit(cache=True)
+def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
+    """Solves (1 + M) x = r for positive semi-definite M by Cholesky.
+
+    The pivots of 1 + M are at least 1; where rounding says otherwise, M is too large for the 1 to
+    count, and x is still finite and, as the factor is regular, not uphill.
+
+    Args:
+        matrix: [n, n] M.
+        right: [n] right-hand side.
+        out: [n] solution.
+    """
+    n = right.size
+    lower = np.zeros((n, n))
+    for i in range(n):
+        total = right[i]
+        for j in range(i):
+            entry = matrix[i, j]
+            for k in range(j):
+                entry -= lower[i, k] * lower[j, k]
+            lower[i, j] = entry / lower[j, j]
+            total -= lower[i, j] * out[j]
+        pivot = 1.0 + matrix[i, i]
+        for k in range(i):
+            pivot -= lower[i, k] * lower[i, k]
+        lower[i, i] = np.sqrt(max(pivot, 1.0))
+        out[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = out[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * out[k]
+        out[i] = total / lower[i, i]
+
+
+@njit(cache=True)
+def smallest_pivot(cosines: Floats, count: int) -> float:
+    """The last pivot of Cholesky's factor with the largest pivot first; at least 0.
+
+    It is above the smallest eigenvalue of the first `count` rows, and seldom more than `count`
+    times.
+    """
+    rest = cosines[:count, :count].copy()
+    pivot = 1.0
+    for step in range(count):
+        best = step
+        for i in range(step + 1, count):
+            if rest[i, i] > rest[best, best]:
+                best = i
+        for i in range(count):
+            rest[step, i], rest[best, i] = rest[best, i], rest[step, i]
+        for i in range(count):
+            rest[i, step], rest[i, best] = rest[i, best], rest[i, step]
+        pivot = max(rest[step, step], 0.0)
+        if pivot == 0.0:
+            return 0.0
+        for i in range(step + 1, count):
+            for j in range(step + 1, count):
+                rest[i, j] -= rest[i, step] * rest[step, j] / pivot
+    return pivot
+
+
+@njit(cache=True)
 def eigen(matrix: Floats, vectors: Floats) -> Floats:
     """Eigenvalues [n] of a positive semi-definite matrix (destroyed), vectors [n, n] as columns.
 

@@ -8,6 +8,7 @@ import torch
 
 from crossgrad_core.blocks import Block, LearningRate
 from crossgrad_core.dense_gradients import DenseViewGradients
+from crossgrad_core.jit import strict_kernel
 from crossgrad_core.numba_kernels import double_double
 
 RATE = LearningRate(1.0)
@@ -107,32 +108,30 @@ def test_the_unit_is_that_of_the_narrowest_rounding():
     assert DenseViewGradients([{}], BLOCKS).unit == 2.0**-24
 
 
-@pytest.mark.parametrize(
-    ("name", "operation"),
-    [
-        ("add", lambda a, b: a + b),
-        ("multiply", lambda a, b: a * b),
-        ("divide", lambda a, b: a / b),
-    ],
-)
-def test_double_double_arithmetic(name, operation):
+@strict_kernel
+def operated(a, a_low, b, b_low):
+    """Sum, product, quotient, and root of the first."""
+    return (
+        double_double.add(a, a_low, b, b_low),
+        double_double.multiply(a, a_low, b, b_low),
+        double_double.divide(a, a_low, b, b_low),
+        double_double.square_root(a, a_low),
+    )
+
+
+def test_double_double_arithmetic():
     rng = np.random.default_rng(2)
-    compiled = getattr(double_double, name)
+    tolerance = Fraction(2) ** -100
     for _ in range(300):
         a, b = rng.standard_normal(2) * 10.0 ** rng.uniform(-20, 20, 2)
-        numbers = (a, a * rng.uniform(-1, 1) * 2.0**-53, b, b * rng.uniform(-1, 1) * 2.0**-53)
-        exact = operation(*(Fraction(h) + Fraction(low) for h, low in (numbers[:2], numbers[2:])))
-        high, low = compiled(*numbers)
-        assert high == high + low
-        assert abs(Fraction(high) + Fraction(low) - exact) <= abs(exact) * Fraction(2) ** -100
-
-
-def test_double_double_roots():
-    rng = np.random.default_rng(3)
-    for _ in range(300):
-        a = 10.0 ** rng.uniform(-20, 20)
-        low = a * rng.uniform(-1, 1) * 2.0**-53
-        high, rest = double_double.square_root(a, low)
-        exact = Fraction(a) + Fraction(low)
-        assert abs((Fraction(high) + Fraction(rest)) ** 2 - exact) <= exact * Fraction(2) ** -100
-    assert double_double.square_root(0.0, 0.0) == (0.0, 0.0)
+        a = abs(a)
+        pairs = [(x, x * rng.uniform(-1, 1) * 2.0**-53) for x in (a, b)]
+        one, other = (Fraction(high) + Fraction(low) for high, low in pairs)
+        found = operated(*pairs[0], *pairs[1])
+        total, product, quotient, root = (Fraction(high) + Fraction(low) for high, low in found)
+        assert all(high == high + low for high, low in found)
+        assert abs(total - (one + other)) <= tolerance * abs(one + other)
+        assert abs(product / (one * other) - 1) <= tolerance
+        assert abs(quotient * other / one - 1) <= tolerance
+        assert abs(root * root / one - 1) <= tolerance
+    assert operated(0.0, 0.0, 1.0, 0.0)[3] == (0.0, 0.0)
