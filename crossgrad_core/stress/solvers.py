@@ -277,10 +277,11 @@ def _bargain(cosine: Matrix) -> Vector | None:
         if step is None:
             raise UnprovenError
         decrement = mp.sqrt(abs(dot(slope, step)))
-        if decrement < mp.mpf("1e-25"):
-            return beta
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
+        # The step that was taken squares what is left.
+        if decrement < mp.mpf("1e-25"):
+            return beta
     raise UnprovenError
 
 

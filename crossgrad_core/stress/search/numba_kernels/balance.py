@@ -132,13 +132,12 @@ def imtl_g(norms_of: Floats, cosines_of: Floats, present: Flags) -> Solved:
             trust[block] = solve(cosines, members, members.size, ones, v)
             if trust[block] <= OPPOSITE * members.size:
                 trust[block] = -1.0
-        total, size = (0.0, 0.0), 0.0
+        total = (0.0, 0.0)
         for k in members:
             value = divide(multiply(at(v, k), (longest, 0.0)), at(norms, k))
             v[k, 0], v[k, 1] = value
             total = add(total, value)
-            size += abs(value[0])
-        if abs(total[0]) <= OPPOSITE * size:
+        if total[0] ** 2 <= NOISE * largest(v) ** 2:
             continue
         for k in members:
             weights[block, k, 0], weights[block, k, 1] = divide(at(v, k), total)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from crossgrad_core.jit import strict_kernel
-from crossgrad_core.stress.search.numba_kernels.convex import Solved
+from crossgrad_core.stress.search.numba_kernels.convex import NOISE, Solved
 from crossgrad_core.stress.search.numba_kernels.doubled import (
     Flags,
     Floats,
@@ -16,7 +16,7 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     multiply,
     root,
 )
-from crossgrad_core.stress.search.numba_kernels.linear import dot, form
+from crossgrad_core.stress.search.numba_kernels.linear import dot, form, largest
 
 #: 1 + cos up to which two directions are exactly opposite.
 OPPOSITE = 1e-12
@@ -72,20 +72,26 @@ def _one(
     v: Floats,
 ) -> None:
     limit, threshold, strength = rule
+    margin = 0.0 if threshold == 0.0 else OPPOSITE
     v[:] = 0.0
     v[i, 0] = 1.0
     for j in order:
         if j == i or not present[j] or cosines[i, j, 0] > limit:
             continue
-        size = root(form(cosines, v))
-        if size[0] == 0.0:
+        square = form(cosines, v)
+        if square[0] <= NOISE * largest(v) ** 2:
+            v[:] = 0.0
             return
+        size = root(square)
         along = dot(cosines[j], v)
         cosine = divide(along, size)
-        if not (cosine[0] < 0.0 and cosine[0] < -threshold):
+        # A conflict at the threshold itself, where the rule jumps, is none.
+        if not (cosine[0] < 0.0 and add(cosine, (threshold, 0.0))[0] < -margin):
             continue
         if strength == 1.0 and add((1.0, 0.0), cosine)[0] <= OPPOSITE:
             v[:] = 0.0
             return
         removed = multiply((strength, 0.0), along)
         v[j, 0], v[j, 1] = add(at(v, j), minus(removed))
+    if form(cosines, v)[0] <= NOISE * largest(v) ** 2:
+        v[:] = 0.0
