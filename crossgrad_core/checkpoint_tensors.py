@@ -69,7 +69,7 @@ def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
                 tensors.exp_avg[name] = tensor
             case ["exp_avg_sq", name]:
                 tensors.exp_avg_sq[name] = tensor
-            case ["plugin", plugin, kind, name]:
+            case ["plugin", plugin, ("tensors" | "per_primitive") as kind, name]:
                 tensors.plugins.setdefault(plugin, {}).setdefault(kind, {})[name] = tensor
             case _:
                 message = f"unknown tensor {key!r}"

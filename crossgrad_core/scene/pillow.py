@@ -1,10 +1,14 @@
 """Photo files through Pillow: which formats, how many pixels, and every fault as one error."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader, FileIO
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, BinaryIO, Final
+
+from typing_extensions import override
 
 from crossgrad_core.errors import UserError
 
@@ -33,7 +37,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
     from PIL import UnidentifiedImageError
 
     try:
-        with path.open("rb") as file, _identified(file) as image:
+        with _Bounded(path) as file, _identified(file) as image:
             _check_pixels(image, path)
             yield image
     except (UserError, MemoryError):
@@ -51,6 +55,26 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
             found=str(error) or type(error).__name__,
             todo="copy or download it again, or remove it",
         ) from error
+
+
+class _Bounded(BufferedReader):
+    """A file of which no more is read than there is.
+
+    A chunk may claim any length, for which `read` would set memory aside at once.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    @override
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes; all that are left where no number is given."""
+        left = max(0, self._size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def _check_pixels(image: "Image", path: Path) -> None:

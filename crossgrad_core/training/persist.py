@@ -5,11 +5,13 @@ from typing import Any, cast
 
 from crossgrad_core.checkpoint import Checkpoint
 from crossgrad_core.contexts import StepRecord
+from crossgrad_core.errors import UserError
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.state import Json
 from crossgrad_core.training.rngs import restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Clock, Counters, TrainState
+from crossgrad_core.wording import in_one_line, listed
 
 
 def to_checkpoint(state: TrainState) -> Checkpoint:
@@ -33,7 +35,19 @@ def to_checkpoint(state: TrainState) -> Checkpoint:
 
 
 def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
-    """The state that continues bit for bit where the checkpoint was written."""
+    """The state that continues bit for bit where the checkpoint was written.
+
+    Raises:
+        UserError: It is not a state of this run: of another backbone, or damaged.
+    """
+    _check_tensors(setup, checkpoint)
+    try:
+        return _restored(setup, checkpoint)
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise _misfit(checkpoint, "the state of a run", in_one_line(error)) from error
+
+
+def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     scalars = cast("dict[str, Any]", checkpoint.scalars)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     device = setup.device
@@ -51,9 +65,52 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
         states={name: state.to(device) for name, state in checkpoint.plugins.items()},
         step=checkpoint.step,
         last=_record(scalars["last"]),
-        counters=Counters(**scalars["counters"]),
-        clock=Clock(**scalars["clock"]),
+        counters=Counters(**_figures(scalars["counters"])),
+        clock=Clock(**_figures(scalars["clock"])),
         rewinds=scalars["rewinds"],
+    )
+
+
+def _figures(plain: dict[str, Any]) -> dict[str, Any]:
+    wrong = [name for name, value in plain.items() if not isinstance(value, int | float)]
+    if wrong:
+        raise TypeError(f"{listed(wrong)} is not a number")
+    return plain
+
+
+def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
+    parameters = checkpoint.parameters
+    wanted = [name for block in setup.blocks for name in block.tensors]
+    missing = [name for name in wanted if name not in parameters]
+    if missing:
+        raise _misfit(checkpoint, f"parameters {listed(wanted)}", f"no {listed(missing)}")
+    # Frozen ones may be whole numbers, such as the levels of an octree.
+    trained = [name for block in setup.trained_blocks for name in block.tensors]
+    whole = [name for name in trained if not parameters[name].is_floating_point()]
+    if whole:
+        raise _misfit(checkpoint, "floating-point numbers to train", listed(whole))
+    rows = {
+        parameters[name].shape[:1]
+        for block in setup.blocks
+        if block.per_primitive
+        for name in block.tensors
+    }
+    if len(rows) > 1:
+        raise _misfit(checkpoint, "as many rows of one parameter as of another", str(sorted(rows)))
+    for moments in (checkpoint.exp_avg, checkpoint.exp_avg_sq):
+        for name, tensor in moments.items():
+            if name not in parameters or tensor.shape != parameters[name].shape:
+                raise _misfit(checkpoint, "moments in the shapes of the parameters", name)
+
+
+def _misfit(checkpoint: Checkpoint, expected: str, found: str) -> UserError:
+    return UserError(
+        "the checkpoint does not fit the run",
+        where=f"the checkpoint of step {checkpoint.step}",
+        expected=expected,
+        found=found,
+        todo="restore the config.yaml that the run wrote, continue from an earlier checkpoint, or "
+        "start the run again",
     )
 
 

@@ -23,7 +23,16 @@ def stream_states(streams: Mapping[str, np.random.Generator]) -> dict[str, dict[
 
 
 def restored_streams(states: Mapping[str, Mapping[str, Any]]) -> dict[str, np.random.Generator]:
-    """Generators that continue from `states`."""
+    """Generators that continue from `states`.
+
+    Raises:
+        KeyError: A stream is missing.
+        TypeError: A state is none of NumPy's.
+        ValueError: Likewise.
+    """
+    absent = [name for name in STREAMS if name not in states]
+    if absent:
+        raise KeyError(*absent)
     streams = {}
     for name, state in states.items():
         rng = np.random.default_rng(0)

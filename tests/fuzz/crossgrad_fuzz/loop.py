@@ -90,6 +90,7 @@ def search(
         with bench_for(target) as made:
             return search(target, budget, seed, known=known, beat=beat, bench=made)
     state, rng, guide = Search(), random.Random(seed), Guide(target.parser)
+    bench.warm_up(target.seeds())
     started = time.monotonic()
     inputs = _inputs(target, state, rng, [*target.seeds(), *known])
     with guide.watching():

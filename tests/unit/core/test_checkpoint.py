@@ -14,6 +14,7 @@ from torch import Tensor
 from crossgrad_core import checkpoint, checkpoint_tensors
 from crossgrad_core.checkpoint import Checkpoint, drop_later, latest, load, load_latest, save
 from crossgrad_core.checkpoint_folders import Keep
+from crossgrad_core.checkpoint_state import digest
 from crossgrad_core.errors import UserError
 from crossgrad_core.state import PluginState
 
@@ -282,9 +283,22 @@ def cut(folder: Path) -> None:
 
 
 def change_state(**changes: object):
+    """Another state with a digest that is right."""
+
     def damage(folder: Path) -> None:
         path = folder / "state.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+        state = {**json.loads(path.read_text()), **changes}
+        path.write_text(json.dumps({**state, "state_sha256": digest(state)}))
+
+    return damage
+
+
+def replace_in_state(old: str, new: str):
+    def damage(folder: Path) -> None:
+        path = folder / "state.json"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
 
     return damage
 
@@ -297,7 +311,18 @@ DAMAGES = {
     "half a state": (lambda folder: (folder / "state.json").write_text('{"format'), "not JSON"),
     "other JSON": (lambda folder: (folder / "state.json").write_text("[1]"), "not the state"),
     "missing tensor": (change_state(tensors=["parameters/gone"]), "gone"),
-    "unknown plugins": (change_state(plugins=3), "AttributeError"),
+    "unknown plugins": (change_state(plugins=3), "valid plugins"),
+    "no step": (change_state(step=None), "valid step"),
+    "negative step": (change_state(step=-1), "valid step"),
+    "true steps": (change_state(adam_steps={"means": True}), "valid adam_steps"),
+    "tensors by number": (change_state(tensors=[3]), "valid tensors"),
+    "unknown kind": (change_state(tensors=["plugin/a/b/c"]), "plugin/a/b/c"),
+    "endless JSON": (
+        lambda folder: (folder / "state.json").write_text("[" * 100_000),
+        "within each other",
+    ),
+    "another number": (replace_in_state('"views": 1400', '"views": 1401'), "SHA-256 differs"),
+    "another random number": (replace_in_state('"inc": 8', '"inc": 7'), "SHA-256 differs"),
 }
 
 
@@ -310,6 +335,15 @@ def test_damage_is_found_and_the_earlier_checkpoint_named(tmp_path: Path, name: 
     with pytest.raises(UserError, match=message) as told:
         load(newer)
     assert f"remove it; the run then goes on from {older.name}" in str(told.value)
+
+
+def test_checkpoints_of_before_the_state_had_a_digest_are_read(tmp_path: Path):
+    folder = save(tmp_path, make_checkpoint())
+    path = folder / "state.json"
+    state = json.loads(path.read_text())
+    del state["state_sha256"]
+    path.write_text(json.dumps(state))
+    assert load(folder).step == 700
 
 
 def test_another_format_version_is_refused(tmp_path: Path):

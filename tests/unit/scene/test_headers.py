@@ -1,5 +1,7 @@
+import contextlib
 import io
 import struct
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from PIL import Image
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.decode import decode_photo
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
@@ -136,6 +139,20 @@ def test_whatever_a_decoder_raises_is_one_error(error, tmp_path, monkeypatch):
     for read in (read_header, read_quarter_turn):
         with pytest.raises(UserError, match=r"cannot be read(?s:.*)a\.jpg(?s:.*)to do"):
             read(path)
+
+
+def test_memory_is_not_set_aside_for_what_a_chunk_claims(tmp_path):
+    path = save(tmp_path / "a.png")
+    data = path.read_bytes()
+    at = data.index(b"IDAT") - 4
+    path.write_bytes(data[:at] + b"\x7f\xff\xff\xff" + data[at + 4 :])
+    tracemalloc.start()
+    try:
+        with contextlib.suppress(UserError):
+            decode_photo(path)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_only_formats_of_photos_are_opened(tmp_path):

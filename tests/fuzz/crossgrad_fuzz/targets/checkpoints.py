@@ -1,0 +1,159 @@
+"""Checkpoints: tensors, state and what a run continues from."""
+
+import hashlib
+import json
+import random
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+
+from crossgrad_core import (
+    checkpoint,
+    checkpoint_folders,
+    checkpoint_state,
+    checkpoint_tensors,
+    text_files,
+)
+from crossgrad_core.blocks import Block, LearningRate
+from crossgrad_core.checkpoint import Checkpoint, latest, load, save
+from crossgrad_core.checkpoint_folders import STATE, TENSORS
+from crossgrad_core.checkpoint_state import digest
+from crossgrad_core.contexts import StepRecord
+from crossgrad_core.optimizer import AdamState
+from crossgrad_core.state import PluginState
+from crossgrad_core.training import persist, rngs
+from crossgrad_core.training.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.state import TrainState
+from crossgrad_fuzz.case import Case
+from crossgrad_fuzz.case import load as load_case
+from crossgrad_fuzz.mutate import NUMBERS, matcher
+from crossgrad_fuzz.target import Target
+
+_FOLDER = "checkpoints/step-000007"
+_STATE, _TENSORS = f"{_FOLDER}/{STATE}", f"{_FOLDER}/{TENSORS}"
+_BLOCKS = (
+    Block("means", ("means",), True, "geometry", LearningRate(0.1)),
+    Block("scales", ("scales",), True, "geometry", LearningRate(0.1)),
+)
+#: As much of a run as a checkpoint is held against.
+_SETUP = cast(
+    "Any",
+    SimpleNamespace(blocks=_BLOCKS, trained_blocks=_BLOCKS[:1], device=torch.device("cpu")),
+)
+
+
+def _state(*, full: bool) -> TrainState:
+    parameters = {"means": torch.ones(2, 3), "scales": torch.zeros(2, 1)}
+    moments = {"means": torch.full((2, 3), 0.5)} if full else {}
+    record = StepRecord(
+        step=7,
+        views=(0, 1),
+        names=("a", "b"),
+        losses=(0.5, 0.25),
+        labels=("near", "far"),
+        primitives=2,
+        counts={},
+        train_seconds=1.5,
+    )
+    plugin = PluginState({"queue": [1, 2]}, {"order": torch.arange(3)}, {"seen": torch.ones(2)})
+    return TrainState(
+        parameters=parameters,
+        adam=AdamState(dict(moments), dict(moments), dict.fromkeys(moments, 7)),
+        rngs=make_streams(0),
+        states={"near-far/x": plugin} if full else {},
+        step=7,
+        last=record if full else None,
+    )
+
+
+@cache
+def _seeds() -> Sequence[Case]:
+    cases = []
+    for full in (True, False):
+        with tempfile.TemporaryDirectory() as place:
+            save(Path(place), to_checkpoint(_state(full=full)))
+            cases.append(load_case(Path(place)))
+    older = json.loads(cases[0][_STATE])
+    del older["state_sha256"]
+    return [*cases, {**cases[0], _STATE: json.dumps(older).encode()}]
+
+
+def _parse(folder: Path) -> None:
+    found: Checkpoint = load(latest(folder))
+    for tensors in (found.parameters, found.exp_avg, found.exp_avg_sq):
+        assert all(isinstance(tensor, torch.Tensor) for tensor in tensors.values())
+    state = from_checkpoint(_SETUP, found)
+    assert state.step == found.step >= 0
+    assert state.parameters["means"].shape[0] == state.parameters["scales"].shape[0]
+    assert all(isinstance(value, int | float) for value in vars(state.clock).values())
+    assert all(0 <= rng.random() < 1 for rng in state.rngs.values())
+
+
+def _repair(case: dict[str, bytes], rng: random.Random) -> dict[str, bytes]:
+    """Makes the digests right again, most of the time."""
+    if rng.random() < 0.3:
+        return case
+    try:
+        state = json.loads(case.get(_STATE, b""))
+        if rng.random() < 0.9:
+            state["sha256"] = hashlib.sha256(case.get(_TENSORS, b"")).hexdigest()
+        if "state_sha256" in state:
+            state["state_sha256"] = digest(state)
+        return {**case, _STATE: json.dumps(state, indent=1).encode()}
+    except (ValueError, TypeError, RecursionError):
+        return case
+
+
+def _header(data: bytes, rng: random.Random) -> bytes:
+    """Another number or word in the header of the tensors, whose length stays right."""
+    length = int.from_bytes(data[:8], "little")
+    header = data[8 : 8 + length]
+    if len(header) != length or not header.startswith(b"{"):
+        return data
+    change = rng.choice(
+        (
+            matcher(rb"(\d+)", (*NUMBERS[:40], b"2", b"3", b"[]")),
+            matcher(rb'"dtype":"(\w+)"', (b"F64", b"F16", b"I64", b"BOOL", b"U8", b"F8_E4M3")),
+            matcher(rb'"([\w/%-]+)":\{', (b"parameters/means", b"plugin/a/tensors/b", b"x", b"")),
+            matcher(rb'"shape":(\[[\d,]*\])', (b"[]", b"[0]", b"[2,3]", b"[1,2,3]", b"[-1]")),
+        )
+    )
+    changed = change(header, rng)
+    return len(changed).to_bytes(8, "little") + changed + data[8 + length :]
+
+
+TARGET = Target(
+    name="checkpoint",
+    seeds=_seeds,
+    parse=_parse,
+    parser={
+        checkpoint: ("save", "_write", "_drop", "drop_later", "load_latest", "_plain_state"),
+        checkpoint_folders: ("Keep", "scratch_folder", "discard", "_take_name", "_clear"),
+        checkpoint_state: ("state_text", "check_json", "_not_json"),
+        checkpoint_tensors: ("pack", "packed_bytes", "write_tensors", "_all"),
+        persist: ("to_checkpoint",),
+        rngs: ("make_streams", "stream_states"),
+        text_files: ("read_rows", "parse_number"),
+    },
+    words=(
+        *(b'"step": ', b'"plugins": {}', b'"tensors": []', b"null", b"true", b"[]", b"{}", b"NaN"),
+        *(b"parameters/means", b"parameters/scales", b"exp_avg/means", b"plugin/a/tensors/b"),
+        *(b'"generators"', b'"scalars"', b'"last"', b'"clock"', b'"counters"', b"[" * 3000),
+    ),
+    mutators=(
+        _header,
+        matcher(rb": *(-?[\d.]+)", NUMBERS),
+        matcher(rb'("[\w ]+"): ', (b'"x"', b'"step"', b'"means"', b"3")),
+        matcher(rb': *("[^"]*")', (b'"x"', b"3", b"null", b"[]", b"{}")),
+        matcher(rb"(\[[^\[\]]*\])", (b"[]", b"{}", b"null", b"3")),
+        matcher(rb"(\{[^{}]*\})", (b"{}", b"[]", b"null", b"3")),
+    ),
+    repair=_repair,
+)
+TARGETS = (TARGET,)
