@@ -1,14 +1,12 @@
 """The one error type that users see, and how it is worded."""
 
-import re
 from typing import Final
+
+from crossgrad_core.wording import showable
 
 #: Longest part of a message, and longest place; the middle of what is longer is left out.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
-# Control characters could move the cursor or recolour the terminal; lone surrogates stand for bytes
-# that are not UTF-8, and cannot be written to a file.
-_UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class UserError(Exception):
@@ -41,18 +39,13 @@ class UserError(Exception):
             ("to do", _shortened(self.todo)),
         )
         lines = [f"  {label + ':':<10}{text}" for label, text in rows if text]
-        return _showable("\n".join([_shortened(self.what), *lines]))
+        return showable("\n".join([_shortened(self.what), *lines]))
 
 
 def _shortened(text: str, longest: int = LONGEST) -> str:
     if len(text) <= longest:
         return text
     return f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
-
-
-def _showable(text: str) -> str:
-    """Text from anybody's file as a terminal can show it."""
-    return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
 class IncompatibleSelectionError(UserError):

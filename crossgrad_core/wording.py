@@ -1,6 +1,16 @@
 """Small pieces of error messages. Imports nothing heavy."""
 
+import re
 from collections.abc import Iterable
+
+# Control characters could move the cursor or recolour the terminal; lone surrogates stand for bytes
+# that are not UTF-8, and cannot be written to a file.
+_UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def showable(text: str) -> str:
+    """Text from anybody's file as a terminal can show it."""
+    return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
 def singular(slot: str) -> str:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache
 from crossgrad_core.scene.raw import RawScene, RawView
-from crossgrad_core.scene.raw_checks import check_points, check_views
+from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
 from crossgrad_core.scene.split import split_views
 from crossgrad_core.scene.types import Camera, Scene, View
@@ -38,6 +39,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     train = _positions(used, split.train)
     poses = np.stack([used[i].world_to_camera for i in train])
     frame = make_frame(camera_centers(poses), points.xyz)
+    kept = replace(raw, views=tuple(used))
+    points, far_notes = check_distances(kept, options, points, frame)
     local = frame.points(points.xyz)
     cameras = [_localize(view, photos, frame) for view in used]
     seen = [points.rows(view.seen) for view in used]
@@ -58,6 +61,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         notes=(
             *raw.notes,
             *point_notes,
+            *far_notes,
             *photos.notes,
             *split.notes,
             frame.note,

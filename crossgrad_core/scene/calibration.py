@@ -1,6 +1,5 @@
 """Camera calibrations in COLMAP's terms, and their undistortion through pycolmap."""
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -20,6 +19,9 @@ _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
 _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+# Beyond these nothing can be computed with a camera in single precision.
+_LONGEST_SIDE = 10_000_000  # pixels
+_LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _AGAIN = "repair the camera, or export the model again"
 
 
@@ -63,10 +65,11 @@ class Calibration:
             UserError: Unknown model, wrong number of parameters, empty size, a focal length that is
                 not positive, or anything that is not finite. Names `where`.
         """
-        if self.width < 1 or self.height < 1:
+        if min(self.width, self.height) < 1 or max(self.width, self.height) > _LONGEST_SIDE:
             raise UserError(
-                "a camera has no pixels",
+                "a camera has no pixels, or more than any photo",
                 where=where,
+                expected=f"sides of 1 to {_LONGEST_SIDE:,} pixels",
                 found=f"{self.width} x {self.height}",
                 todo=_AGAIN,
             )
@@ -89,19 +92,20 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        if not all(map(math.isfinite, self.params)):
+        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # NaN is not
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,
+                expected=f"numbers from -{_LARGEST_PARAMETER:g} to {_LARGEST_PARAMETER:g}",
                 found=f"{self.model} {list(self.params)}",
                 todo=_AGAIN,
             )
         focal = [self.params[i] for i in camera.focal_length_idxs()]
-        if min(focal, default=1.0) <= 0:
+        if min(focal, default=1.0) < _SHORTEST_FOCAL:
             raise UserError(
                 "a focal length is not positive",
                 where=where,
-                expected="pixels > 0",
+                expected=f"at least {_SHORTEST_FOCAL:g} pixels",
                 found=f"{min(focal):g}",
                 todo=_AGAIN,
             )

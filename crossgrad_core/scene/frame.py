@@ -13,6 +13,9 @@ _MARGIN = 1.1
 # Cameras that stand closer together than this share of their distance to the scene give no unit.
 _SAME_PLACE = 1e-6
 
+# And what is smaller than this, in units of the input, is no size: its inverse must be a number.
+_SMALLEST = 1e-30
+
 # Local coordinates are rounded to multiples of this, 1e-9 of the extent. One scene given in other
 # units or with another origin differs by a few units in the last place of float64; that is a
 # thousand to ten million times less than the grid, so nearly every coordinate comes out with the
@@ -65,13 +68,13 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
     origin = centers[0] + (centers - centers[0]).mean(0)
     extent = float(_MARGIN * np.linalg.norm(centers - origin, axis=1).max())
     depth = float(np.median(np.linalg.norm(points - origin, axis=1))) if len(points) else 0.0
-    if extent > _SAME_PLACE * depth and extent > 0:
+    if extent > max(_SAME_PLACE * depth, _SMALLEST):
         return Frame(
             Similarity(origin, 1 / extent),
             f"local frame: 1 unit = {extent:.6g} input units, the extent of the training cameras "
             "(1.1 x largest distance from their mean)",
         )
-    if depth > 0:
+    if depth > _SMALLEST:
         return Frame(
             Similarity(origin, 1 / depth),
             f"local frame: 1 unit = {depth:.6g} input units, the median distance to the SfM "

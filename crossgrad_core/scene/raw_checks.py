@@ -1,17 +1,26 @@
 """Checks on what a reader found, before anything is built from it."""
 
+import os
+import unicodedata
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.frame import Frame, camera_centers
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count, name_some
 
+#: Coordinates beyond this, in units of the input, are none: their squares must stay within float64.
+FARTHEST = 1e30
+#: And beyond this in local units: their squares must stay within float32.
+FARTHEST_LOCAL = 1e15
+_LONGEST_NAME = 255  # bytes of a folder or file, on every usual file system
+_NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
 # Rotations written with six digits pass; a pose with a scale in it does not.
 _RIGID = 1e-4
 
@@ -35,6 +44,11 @@ class CheckedPoints:
         kept = np.unique(self.new_row[rows])
         return kept[kept >= 0]
 
+    def selected(self, chosen: NDArray[np.bool_]) -> "CheckedPoints":
+        """Those that are marked in `chosen` [P]."""
+        numbers = np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)
+        return CheckedPoints(self.xyz[chosen], self.colors[chosen], numbers[self.new_row])
+
 
 def check_views(raw: RawScene) -> None:
     """Refuses scenes with no view, and views that cannot be told apart or placed.
@@ -48,7 +62,9 @@ def check_views(raw: RawScene) -> None:
             where=raw.root,
             todo="check that the poses were estimated: at least one image must be registered",
         )
-    names = Counter(view.name for view in raw.views)
+    for view in raw.views:
+        _check_name(raw, view.name)
+    names = Counter(str(PurePosixPath(view.name)) for view in raw.views)
     twice = [name for name, number in names.items() if number > 1]
     if twice:
         raise UserError(
@@ -67,34 +83,80 @@ def check_points(raw: RawScene, options: SceneOptions) -> tuple[CheckedPoints, l
     Raises:
         UserError: No point is left and training is to start from the points.
     """
-    finite = np.isfinite(raw.points).all(1)
+    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
     broken = int((~finite).sum())
     notes = [f"points: {count(broken, 'point')} left out: not finite"] if broken else []
-    if not finite.any() and options.init == "points":
-        raise UserError(
-            "the scene has no SfM points to start from",
-            where=raw.root,
-            todo="start from random ones (--init random), or from those of a file (--init "
-            "FILE.ply)",
-        )
+    _require_points(finite, raw.root, options)
     new_row = np.where(finite, np.cumsum(finite) - 1, -1)
     return CheckedPoints(raw.points[finite], raw.point_colors[finite], new_row), notes
 
 
-def _check_view(raw: RawScene, view: RawView) -> None:
-    where = f"{raw.root}: image {view.name}"
-    path = PurePosixPath(view.name)
-    if not view.name or path.is_absolute() or ".." in path.parts:
+def check_distances(
+    raw: RawScene, options: SceneOptions, points: CheckedPoints, frame: Frame
+) -> tuple[CheckedPoints, list[str]]:
+    """Leaves out points too far from the training cameras for single precision, and says so.
+
+    Raises:
+        UserError: A camera is too far away, or no point is left to start from.
+    """
+    poses = np.stack([view.world_to_camera for view in raw.views])
+    centers = np.abs(frame.similarity.to_local(camera_centers(poses))).max(1)
+    if centers.max() > FARTHEST_LOCAL:
+        raise UserError(
+            "a camera is too far from the training cameras",
+            where=f"{raw.root}: image {raw.views[int(centers.argmax())].name}",
+            expected=f"at most {FARTHEST_LOCAL:g} times their extent",
+            found=f"{centers.max():.3g} times",
+            todo="remove or re-estimate the image",
+        )
+    near = np.abs(frame.similarity.to_local(points.xyz)).max(1, initial=0.0) <= FARTHEST_LOCAL
+    far = int((~near).sum())
+    if not far:
+        return points, []
+    _require_points(near, raw.root, options)
+    return points.selected(near), [
+        f"points: {count(far, 'point')} left out: farther than {FARTHEST_LOCAL:g} times the extent "
+        "of the training cameras"
+    ]
+
+
+def _require_points(usable: NDArray[np.bool_], root: Path, options: SceneOptions) -> None:
+    if not usable.any() and options.init == "points":
+        raise UserError(
+            "the scene has no SfM points to start from",
+            where=root,
+            todo="start from random ones (--init random), or from those of a file (--init "
+            "FILE.ply)",
+        )
+
+
+def _check_name(raw: RawScene, name: str) -> None:
+    path = PurePosixPath(name)
+    if not path.name or path.is_absolute() or ".." in path.parts:
         raise UserError(
             "an image name leads out of the image folder",
             where=raw.root,
             expected="a path below the image folder",
-            found=repr(view.name),
-            todo="rename the image in the model, or export the model again",
+            found=repr(name),
+            todo="rename the image in the model and its photo below the image folder",
         )
+    longest = max(len(os.fsencode(part)) for part in path.parts)
+    if longest > _LONGEST_NAME or any(unicodedata.category(sign) in _NO_SIGNS for sign in name):
+        raise UserError(
+            "an image name that no photo can be found or listed by",
+            where=raw.root,
+            expected=f"UTF-8 without control characters, at most {_LONGEST_NAME} bytes for a file "
+            "or folder",
+            found=ascii(name),
+            todo="rename the image in the model, and its photo",
+        )
+
+
+def _check_view(raw: RawScene, view: RawView) -> None:
+    where = f"{raw.root}: image {view.name}"
     view.calibration.check(where)
     pose = view.world_to_camera
-    if not np.isfinite(pose).all():
+    if not (np.abs(pose) <= FARTHEST).all():  # False for NaN
         raise UserError("a pose is not finite", where=where, todo="remove or re-estimate the image")
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 
+from crossgrad_core.wording import showable
+
 _SHOWN = 3
 
 
 def name_some(names: Sequence[str]) -> str:
     """The first few of many names, and how many more there are."""
-    shown = ", ".join(names[:_SHOWN])
+    shown = showable(", ".join(names[:_SHOWN]).replace("\n", r"\n"))
     return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 
 

@@ -22,6 +22,9 @@ from crossgrad_plugins.readers._colmap_folder import (
 from crossgrad_plugins.readers._colmap_model import read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
 
+#: A rotation shorter than this, or longer than its inverse, has no length that can be squared.
+_SHORTEST = 1e-100
+
 
 class ColmapReader(Reader):
     """COLMAP scenes (https://colmap.github.io/format.html), with any perspective camera model.
@@ -104,15 +107,15 @@ def _find_rows(
 
 def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
     """[4, 4] world to camera."""
-    length = float(np.linalg.norm(image.quaternion))
-    if not np.isfinite(length) or length == 0 or not np.isfinite(image.translation).all():
+    largest = np.abs(image.quaternion).max()
+    if not (_SHORTEST < largest < 1 / _SHORTEST) or not np.isfinite(image.translation).all():
         raise UserError(
             "a pose is not finite",
             where=f"{folder}: image {image.name}",
             found=f"quaternion {image.quaternion.tolist()}, shift {image.translation.tolist()}",
             todo="remove the image from the model, or estimate the poses again",
         )
-    w, x, y, z = image.quaternion / length
+    w, x, y, z = image.quaternion / np.linalg.norm(image.quaternion)
     pose = np.eye(4)
     pose[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -57,7 +57,7 @@ def _parse(folder: Path) -> None:
         assert ((view.seen >= 0) & (view.seen < count)).all()
 
 
-def _fields(data: bytes) -> list[tuple[int, int, str]]:
+def fields(data: bytes) -> list[tuple[int, int, str]]:
     """Fields of any of the three files, by trying its layout; wrong ones do no harm."""
     return [(0, 8, "i"), *_camera_fields(data), *_image_fields(data), *_point_fields(data)]
 
@@ -130,7 +130,7 @@ BINARY = Target(
         colmap: _READER,
     },
     words=(b"\0", b"0000.png\0", b"0001.png\0", b"../x\0", struct.pack("<Q", 2**64 - 1)),
-    mutators=(at_offsets(_fields),),
+    mutators=(at_offsets(fields),),
 )
 TEXT = Target(
     name="colmap-text",
