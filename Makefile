@@ -4,10 +4,14 @@ VENV ?= .venv
 TEST_VENV ?= .venv-test
 # How many faults of each kind `make faults` tries.
 FAULTS ?= 100
+# How long `make fuzz` searches each parser, at least, and with which random numbers.
+FUZZ_SECONDS ?= 600
+FUZZ_EXECUTIONS ?= 100000
+FUZZ_SEED ?= 0
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test matrix compat faults lint bench clean
+.PHONY: demo install test matrix compat faults fuzz lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -31,6 +35,12 @@ compat:  ## The tests on Python 3.12, 3.13 and the lowest versions of packages, 
 faults:  ## Kill, starve and interrupt runs, a hundred times each, and look at what is left
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" FAULTS="$(FAULTS)" sh tests/run.sh -m faults
 
+fuzz: install  ## Ten minutes of mutated files for each parser; findings go to fuzz-findings/
+	$(BIN)/pip install $(PIP_FLAGS) --editable ".[test]"
+	PYTHONPATH=tests/fuzz $(BIN)/python -m crossgrad_fuzz defects
+	PYTHONPATH=tests/fuzz $(BIN)/python -m crossgrad_fuzz run --seconds $(FUZZ_SECONDS) \
+	    --executions $(FUZZ_EXECUTIONS) --seed $(FUZZ_SEED) --least 0.95
+
 lint: install  ## ruff and mypy
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[lint]"
 	$(BIN)/ruff check .
@@ -43,4 +53,4 @@ bench: install  ## Loss, optimizer and operators of docs/benchmarks.md, which na
 	$(BIN)/python benchmarks/operators.py
 
 clean:  ## Remove environments and caches; keeps runs/
-	rm -rf $(VENV) $(TEST_VENV) .venv-compat build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TEST_VENV) .venv-compat build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis fuzz-findings

@@ -117,8 +117,7 @@ def read_ply(path: Path) -> SplatCloud:
     missing = [name for name in wanted if name not in vertices.columns]
     if missing:
         raise _no_gaussians(path, vertices.columns, missing)
-    if not len(vertices.columns["x"]):
-        raise _empty(path)
+    _require_gaussians(len(vertices.columns["x"]), path)
     for name in (*wanted, *rest):
         top = _LARGEST_LOG_SCALE if name.startswith("scale_") else _LARGEST
         _check_finite(vertices.columns[name], name, path, top)
@@ -204,14 +203,15 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
     return names
 
 
-def _empty(path: Path) -> UserError:
-    return UserError(
-        "PLY file without Gaussians",
-        where=path,
-        expected="at least one vertex",
-        found="0 vertices",
-        todo="export the Gaussians again, or start from the SfM points (--init points)",
-    )
+def _require_gaussians(count: int, path: Path) -> None:
+    if count == 0:
+        raise UserError(
+            "PLY file without Gaussians",
+            where=path,
+            expected="at least one vertex",
+            found="0 vertices",
+            todo="export the Gaussians again, or start from the SfM points (--init points)",
+        )
 
 
 def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:

@@ -3,21 +3,20 @@
 import random
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from crossgrad_fuzz.case import MOST_BYTES, Case, digest
-from crossgrad_fuzz.guide import Guide, Reach
+from crossgrad_fuzz.case import MOST_BYTES, Case
+from crossgrad_fuzz.guide import Guide
 from crossgrad_fuzz.law import Bench, Finding
 from crossgrad_fuzz.mutate import BLIND, exchanger, inserter
 from crossgrad_fuzz.target import Mutator, Target
 
-_MEMORY = Path("/dev/shm")
+MEMORY = Path("/dev/shm")
 #: Share of mutations that know the format, where there are any.
 _KNOWING = 0.6
-_SHRINKING = 400
 
 
 @dataclass
@@ -25,18 +24,18 @@ class Search:
     """What a search has found.
 
     Attributes:
+        guide: Knows what was reached of the parser.
         executions: Inputs parsed.
         seconds: Wall-clock seconds.
         corpus: The inputs that reached something new, valid ones first.
         findings: Kind -> what was wrong, and the input.
-        reach: What was reached of the parser; None while the search goes on.
     """
 
+    guide: Guide
     executions: int = 0
     seconds: float = 0.0
     corpus: list[Case] = field(default_factory=list)
     findings: dict[str, tuple[Finding, Case]] = field(default_factory=dict)
-    reach: Reach | None = None
 
 
 @dataclass(frozen=True)
@@ -47,11 +46,13 @@ class Budget:
         seconds: Least wall-clock seconds.
         executions: Least number of executions.
         findings: Enough findings.
+        shrinking: Executions spent on making a finding smaller.
     """
 
     seconds: float = 0.0
     executions: int = 0
     findings: int = 20
+    shrinking: int = 400
 
     def left(self, search: Search) -> bool:
         """Whether the search goes on."""
@@ -62,50 +63,61 @@ class Budget:
 @contextmanager
 def bench_for(target: Target) -> Iterator[Bench]:
     """A bench in a temporary folder, in memory where the system allows it."""
-    place = _MEMORY if _MEMORY.is_dir() else None
+    place = MEMORY if MEMORY.is_dir() else None
     with tempfile.TemporaryDirectory(prefix="crossgrad-fuzz-", dir=place) as folder:
         yield Bench(target, Path(folder))
 
 
+@dataclass(frozen=True)
+class Watcher:
+    """Who is told what a search does.
+
+    Attributes:
+        begin: Called before each execution.
+        find: Called with each finding and the shrunk input.
+    """
+
+    begin: Callable[[Search], None] = lambda search: None
+    find: Callable[[Finding, Case], None] = lambda finding, case: None
+
+
 def search(
     target: Target,
+    bench: Bench,
     budget: Budget,
     seed: int,
-    *,
     known: Iterable[Case] = (),
-    beat: Callable[[Search], None] = lambda search: None,
-    bench: Bench | None = None,
+    watcher: Watcher = Watcher(),
 ) -> Search:
     """Looks for inputs on which a parser breaks the law.
 
     Args:
         target: The parser.
+        bench: Where to parse.
         budget: How long.
         seed: Of the mutations; the same seed and number of executions give the same inputs.
         known: Inputs to begin with besides the valid ones.
-        beat: Called before each execution.
-        bench: Where to parse; a new one where none is given.
+        watcher: Who is told.
     """
-    if bench is None:
-        with bench_for(target) as made:
-            return search(target, budget, seed, known=known, beat=beat, bench=made)
-    state, rng, guide = Search(), random.Random(seed), Guide(target.parser)
-    bench.warm_up(target.seeds())
+    state = Search(guide=Guide(target.parser))
+    valid = list(target.seeds())
+    bench.warm_up(valid)
+    inputs = _inputs(target, state, random.Random(seed), [*valid, *known])
     started = time.monotonic()
-    inputs = _inputs(target, state, rng, [*target.seeds(), *known])
-    with guide.watching():
+    with state.guide.watching():
         for case, given in inputs:
-            beat(state)
+            watcher.begin(state)
             finding = bench.execute(case)
             state.executions += 1
-            state.seconds = time.monotonic() - started
-            if guide.news() or given:
+            if state.guide.news() or given:
                 state.corpus.append(case)
             if finding is not None and finding.kind not in state.findings:
-                state.findings[finding.kind] = (finding, shrunk(bench, case, finding))
+                small = shrunk(bench, case, finding, budget.shrinking)
+                state.findings[finding.kind] = (finding, small)
+                watcher.find(finding, small)
+            state.seconds = time.monotonic() - started
             if not given and not budget.left(state):
                 break
-    state.reach = guide.reach()
     return state
 
 
@@ -165,10 +177,11 @@ def _exchange(case: dict[str, bytes], rng: random.Random) -> None:
         case[a] = case[b]
 
 
-def shrunk(bench: Bench, case: Case, finding: Finding) -> Case:
-    """A smaller input with the same finding, as far as a few hundred executions lead."""
+def shrunk(bench: Bench, case: Case, finding: Finding, attempts: int) -> Case:
+    """A smaller input with the same finding, as far as so many executions lead."""
     small = dict(case)
-    attempts = _SHRINKING if finding.kind != "slow" else 0
+    if finding.kind == "slow":
+        return small
     for name in sorted(small):
         size = max(1, len(small[name]) // 2)
         at = 0
@@ -188,8 +201,3 @@ def shrunk(bench: Bench, case: Case, finding: Finding) -> Case:
 def _still(bench: Bench, case: Case, finding: Finding) -> bool:
     found = bench.execute(case)
     return found is not None and found.kind == finding.kind
-
-
-def unique(cases: Iterable[Case]) -> Mapping[str, Case]:
-    """Digest -> case."""
-    return {digest(case): case for case in cases}

@@ -24,6 +24,12 @@ NUMBERS = (
     *(b"1_000", b"+5", b"-0", b"00", b"0x10", b"1.5", b".", b"-", b"1e", b"", b" ", b"true"),
     *("²".encode(), "٣".encode(), "①".encode(), "१२".encode(), "½".encode()),
 )  # fmt: skip
+#: The same where a number of records is meant.
+COUNTS = (
+    *(b"0", b"1", b"2", b"3", b"7", b"2147483648", b"4294967295", b"9007199254740993"),
+    *(b"9223372036854775807", b"9223372036854775808", b"18446744073709551615", b"9" * 30),
+    *(b"9" * 5000, b"-1", b"+2", b"1_0", b"2.0", b"1e1", b"", "²".encode(), "٢".encode()),
+)  # fmt: skip
 _WORDS = (b"\0", b"\n", b"\r\n", b"\r", b" ", b"\t", b"\xff", b"\xef\xbb\xbf", b"\xff\xfe", b"\\",
           b"/", b"..", b"../", b"//", b".", b'"', b"'", b",", b":", b"#", b"\x1b[31m",
           "é".encode(), "\u2028".encode(), "\u202e".encode())  # fmt: skip

@@ -1,1 +1,19 @@
-"""The parsers under test."""
+"""The parsers under test, by name."""
+
+from crossgrad_fuzz.target import Target
+from crossgrad_fuzz.targets import (
+    checkpoints,
+    colmap,
+    lists,
+    photos,
+    ply,
+    scenes,
+    settings,
+    tables,
+)
+
+TARGETS: dict[str, Target] = {
+    target.name: target
+    for module in (ply, colmap, scenes, photos, settings, checkpoints, lists, tables)
+    for target in module.TARGETS
+}

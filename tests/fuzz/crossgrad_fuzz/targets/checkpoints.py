@@ -40,6 +40,7 @@ _STATE, _TENSORS = f"{_FOLDER}/{STATE}", f"{_FOLDER}/{TENSORS}"
 _BLOCKS = (
     Block("means", ("means",), True, "geometry", LearningRate(0.1)),
     Block("scales", ("scales",), True, "geometry", LearningRate(0.1)),
+    Block("levels", ("levels",), True, "geometry", LearningRate(0.0)),
 )
 #: As much of a run as a checkpoint is held against.
 _SETUP = cast(
@@ -50,6 +51,7 @@ _SETUP = cast(
 
 def _state(*, full: bool) -> TrainState:
     parameters = {"means": torch.ones(2, 3), "scales": torch.zeros(2, 1)}
+    parameters["levels"] = torch.arange(2)  # frozen, and whole numbers
     moments = {"means": torch.full((2, 3), 0.5)} if full else {}
     record = StepRecord(
         step=7,

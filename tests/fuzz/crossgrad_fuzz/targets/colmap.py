@@ -42,10 +42,9 @@ def files(*, text: bool, model: str = "PINHOLE", points: int = 6) -> dict[str, b
 
 
 def _parse(folder: Path) -> None:
-    if not has_model(folder):
-        assert count_images(folder) == 0
-        return
     assert count_images(folder) >= 0
+    if not has_model(folder):
+        return
     model = read_model(folder)
     count = len(model.points)
     assert model.points.shape == (count, 3)

@@ -11,7 +11,7 @@ from crossgrad_core.ply import PROPERTIES, read_ply, sh_degree_of, write_ply
 from crossgrad_core.scene.types import Similarity
 from crossgrad_core.splat_cloud import SplatCloud
 from crossgrad_fuzz.case import Case
-from crossgrad_fuzz.mutate import NUMBERS, matcher
+from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
 _FILE = "model.ply"
@@ -54,10 +54,19 @@ def _plain(form: str, extra: str = "") -> bytes:
     return text.encode() + np.array([7], f"{order}i4").tobytes() + table.tobytes()
 
 
+def _bare() -> bytes:
+    """One Gaussian in letters, and nothing that could be left out."""
+    names = [name for name in PROPERTIES if not name.startswith(("n", "f_rest"))]
+    head = ["ply", "format ascii 1.0", "element vertex 1"]
+    head += [f"property float {name}" for name in names]
+    return ("\n".join([*head, "end_header", " ".join(["0.5"] * len(names))]) + "\n").encode()
+
+
 def _seeds() -> Sequence[Case]:
     files = [
         *(_written(Similarity(np.zeros(3), 1.0)), _written(_FAR), _plain("ascii")),
         *(_plain("binary_big_endian"), _plain("binary_little_endian")),
+        *(_plain("ascii", "comment x"), _bare()),
     ]
     return [{_FILE: content} for content in files]
 
@@ -101,8 +110,10 @@ TARGET = Target(
         *(b"SplatRenderMode: mip", b"SplatRenderMode: 2dgs", b"vertex", b"element", b"property"),
     ),
     mutators=(
-        matcher(rb"element \w+ (\S+)", NUMBERS),
+        matcher(rb"element \w+ (\S+)", COUNTS),
+        matcher(rb"element (?:vertex|camera) (\S+)", COUNTS),
         matcher(rb"property (\w+) ", (b"float", b"double", b"uchar", b"list", b"int", b"bool")),
         matcher(rb"crossgrad_offset: (\S+)", NUMBERS),
     ),
 )
+TARGETS = (TARGET,)

@@ -27,10 +27,15 @@ _SIZE = (24, 16)
 
 
 def _prepare(folder: Path) -> None:
-    """Photos for the poses, one of them turned, and one without a pose."""
+    """Photos for the poses, one of them turned and with a mask, and some without a pose."""
     (folder / "images" / "sub").mkdir(parents=True)
-    for name in ("0000.png", "0001.PNG", "0002.png", "stray.png", "sub/0000.png"):
+    (folder / "masks").mkdir()
+    for name in ("0000.png", "0001.PNG", "stray.png", "sub/0000.png"):
         Image.new("RGB", _SIZE, (90, 120, 30)).save(folder / "images" / name)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn
+    Image.new("RGB", _SIZE[::-1]).save(folder / "images" / "0002.png", exif=exif)
+    Image.new("L", _SIZE, 255).save(folder / "masks" / "0002.png")
 
 
 def _seeds() -> Sequence[Case]:
@@ -45,8 +50,9 @@ def _seeds() -> Sequence[Case]:
 
 
 def _parse(folder: Path) -> None:
-    reader = ColmapReader()
-    reader.accepts(folder)
+    reader = ColmapReader(model="sparse/1" if (folder / "sparse/1").is_dir() else None)
+    if not reader.accepts(folder):
+        ColmapReader().read(folder, SceneOptions())  # says what is missing
     scene = reader.read(folder, SceneOptions(max_size=20))
     _check_scene(scene.points, len(scene.views))
     assert scene.train
@@ -88,7 +94,7 @@ def _raw_seeds() -> Sequence[Case]:
 
 def _parse_raw(folder: Path) -> None:
     raw = _raw(folder)
-    options = SceneOptions(init="random" if len(raw.points) % 2 else "points")
+    options = SceneOptions(init="points" if len(raw.points) % 2 else "random")
     check_views(raw)
     points, _ = check_points(raw, options)
     poses = np.stack([view.world_to_camera for view in raw.views])

@@ -63,7 +63,7 @@ METRICS = Target(
     parse=_parse_metrics,
     parser={
         text_files: ("read_json",),
-        metrics_csv: ("metrics_row", "MetricsCsv.append", "regimes_of"),
+        metrics_csv: ("metrics_row", "MetricsCsv.append", "_append", "regimes_of"),
     },
     words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),

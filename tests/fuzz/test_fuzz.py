@@ -1,0 +1,53 @@
+"""A short search on every parser, the inputs on which one once failed, and the defects put back.
+
+The long searches are `make fuzz`.
+"""
+
+from dataclasses import replace
+
+import pytest
+from crossgrad_fuzz.defects import DEFECTS
+from crossgrad_fuzz.law import Bench
+from crossgrad_fuzz.loop import Budget, search
+from crossgrad_fuzz.regressions import REGRESSIONS, known_of
+from crossgrad_fuzz.targets import TARGETS
+
+#: Executions of each short search: about ten seconds for all parsers.
+SHORT = 60
+#: Of a search for a defect that begins with the inputs on which parsers once failed.
+DIRECT = 60
+
+
+def told(found) -> str:
+    return "\n\n".join(f"{kind}\n{what.detail}\n{case}" for kind, (what, case) in found.items())
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_short_search_finds_nothing(name, tmp_path):
+    target = TARGETS[name]
+    found = search(target, Bench(target, tmp_path / "bench"), Budget(executions=SHORT), seed=0)
+    assert not found.findings, told(found.findings)
+    assert found.executions >= SHORT
+
+
+@pytest.mark.parametrize(
+    ("target", "name"), [(target, name) for target, cases in REGRESSIONS.items() for name in cases]
+)
+def test_what_once_failed_ends_well(target, name, tmp_path):
+    seeds = TARGETS[target].seeds()
+    bench = Bench(TARGETS[target], tmp_path / "bench")
+    bench.warm_up(seeds)
+    finding = bench.execute(REGRESSIONS[target][name](seeds))
+    assert finding is None, finding.detail
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_that_is_put_back_is_found(name, tmp_path):
+    # What takes too long is known after half a second here.
+    target = replace(TARGETS[DEFECTS[name].target], seconds=0.5)
+    bench = Bench(target, tmp_path / "bench")
+    bench.warm_up(target.seeds())
+    with DEFECTS[name].put_back():
+        budget = Budget(executions=DIRECT, findings=1, shrinking=0)
+        found = search(target, bench, budget, 0, known_of(target.name))
+    assert found.findings

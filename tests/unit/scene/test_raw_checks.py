@@ -1,0 +1,103 @@
+"""What a reader found is refused or left out before anything is computed with it."""
+
+import numpy as np
+import pytest
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.frame import camera_centers, make_frame
+from crossgrad_core.scene.options import SceneOptions
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
+
+CAMERA = Calibration("PINHOLE", 48, 32, (50.0, 50.0, 24.0, 16.0))
+POINTS = np.arange(12.0).reshape(4, 3)
+
+
+def raw(names=("a.jpg", "b.jpg"), shifts=((0, 0, 0), (1, 0, 0)), points=POINTS, camera=CAMERA):
+    views = []
+    for name, shift in zip(names, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, 3] = shift
+        views.append(RawView(name, camera, pose, np.arange(len(points))))
+    colors = np.zeros((len(points), 3), dtype=np.uint8)
+    return RawScene("scene", "scene/images", tuple(views), np.array(points, float), colors)
+
+
+def refused(check, *words):
+    with pytest.raises(UserError) as caught:
+        check()
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert caught.value.where
+    assert caught.value.todo
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "/a.jpg", "../a.jpg", "x/../a.jpg", "\udcff.jpg", "a\n.jpg",
+             "\x1b[2J.jpg", "a" * 256, "ä" * 128, "a\0.jpg"],
+)  # fmt: skip
+def test_names_that_are_no_paths_below_the_photos_are_refused(name):
+    refused(lambda: check_views(raw(("b.jpg", name))), "an image name")
+
+
+@pytest.mark.parametrize(
+    "name", ["größe.jpg", "写真\u3000一.jpg", "a b.jpg", "x/y/z.jpg", "..a.jpg"]
+)
+def test_names_of_any_language_pass(name):
+    check_views(raw(("b.jpg", name)))
+
+
+def test_two_spellings_of_one_path_are_one_name():
+    refused(lambda: check_views(raw(("x/a.jpg", "x//a.jpg"))), "several poses", "x/a.jpg")
+
+
+@pytest.mark.parametrize("shift", [np.nan, np.inf, 1e31, -1e300])
+def test_positions_that_cannot_be_squared_are_refused(shift):
+    refused(lambda: check_views(raw(shifts=((0, 0, 0), (0, shift, 0)))), "not finite")
+
+
+@pytest.mark.parametrize(
+    ("size", "params", "words"),
+    [
+        ((2**63, 32), CAMERA.params, "more than any photo"),
+        ((48, 32), (1e-9, 50.0, 24.0, 16.0), "focal length"),
+        ((48, 32), (50.0, 50.0, 1e300, 16.0), "camera parameter"),
+        ((48, 32), (50.0, np.nan, 24.0, 16.0), "camera parameter"),
+    ],
+)
+def test_cameras_beyond_single_precision_are_refused(size, params, words):
+    camera = Calibration("PINHOLE", *size, params)
+    refused(lambda: check_views(raw(camera=camera)), words)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_points_that_are_not_finite_are_left_out(value):
+    points = POINTS.copy()
+    points[1, 2] = value
+    checked, notes = check_points(raw(points=points), SceneOptions())
+    assert len(checked.xyz) == 3
+    assert "1 point left out" in notes[0]
+
+
+def test_points_too_far_for_single_precision_are_left_out():
+    points = POINTS.copy()
+    points[1] = 1e25
+    scene, options = raw(points=points), SceneOptions()
+    checked, _ = check_points(scene, options)
+    frame = make_frame(camera_centers(np.stack([v.world_to_camera for v in scene.views])), POINTS)
+    kept, notes = check_distances(scene, options, checked, frame)
+    np.testing.assert_array_equal(kept.xyz, POINTS[[0, 2, 3]])
+    assert kept.rows(np.array([0, 1, 3])).tolist() == [0, 2]
+    assert "1 point left out" in notes[0]
+
+
+def test_a_camera_too_far_for_single_precision_is_refused():
+    scene, options = raw(shifts=((0, 0, 0), (1e25, 0, 0))), SceneOptions()
+    checked, _ = check_points(scene, options)
+    frame = make_frame(np.array([[0.0, 0, 0], [1.0, 0, 0]]), POINTS)
+    refused(lambda: check_distances(scene, options, checked, frame), "too far", "b.jpg")
+
+
+def test_cameras_whose_distance_has_no_inverse_stand_in_one_place():
+    frame = make_frame(np.array([[0.0, 0, 0], [1e-310, 0, 0]]), np.zeros((0, 3)))
+    assert frame.similarity.scale == 1.0
