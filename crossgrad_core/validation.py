@@ -28,7 +28,7 @@ def as_user_error(
     more = f"also wrong: {listed(_path(each['loc']) for each in others)}" if others else ""
     options = _options(model, first["loc"][:-1])
     key = _path(first["loc"])
-    where = ".".join(part for part in (prefix, key) if part)
+    where = ".".join(part for part in (prefix, key) if part) or subject
     if first["type"] == "extra_forbidden":
         return UserError(
             f"{subject} has no option {key!r}",

@@ -142,11 +142,20 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
 
 def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> tuple[Row, ...]:
     try:
-        return tuple(
+        rows = tuple(
             {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
         )
     except ValueError as error:
         raise _unreadable(path, str(error)) from error
+    wrong = [row["step"] for row in rows if not _is_step(row.get("step"))]
+    if wrong:
+        raise _unreadable(path, f"the step {wrong[0]}")
+    return rows
+
+
+def _is_step(number: float | None) -> bool:
+    """Whether a run can have been there; a cell may be empty."""
+    return number is None or (isinstance(number, int) and number >= 0)
 
 
 def _unreadable(path: Path, found: str) -> UserError:

@@ -143,10 +143,15 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
         "a number of 5,000 digits": _file(_YAML, b"seed: " + b"9" * 5000),
         "options that are a number": _file(_YAML, b"observers: {progress: 3}\n"),
         "infinite seconds": _file(_YAML, b"seconds: .inf\n"),
+        "more than any settings": _file(_YAML, b"# \n" * 100_000),
+        "a list of too many": _file(_YAML, b"a: [" + b"0," * 10_001 + b"]\n"),
     },
     "stored-config": {
         "a list": _file(_YAML, b"- 1\n"),
         "not UTF-8": _file(_YAML, b"\xff\xfe"),
+        "a setting without a name": _file(_YAML, b"? \n"),
+        "more than any settings": _file(_YAML, b"# \n" * 100_000),
+        "a list of too many": _file(_YAML, b"a: [" + b"0," * 10_001 + b"]\n"),
     },
     "checkpoint": {
         "lists without an end": _file(_STATE, b"[" * 5000),
@@ -158,6 +163,7 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
     "metrics": {
         "not UTF-8": _file("metrics.csv", b"step\n\xff\n"),
         "a step that is none": _replaced(0, "metrics.csv", b"\n200,", b"\nx,"),
+        "a step before the first": _replaced(0, "metrics.csv", b"\n200,", b"\n-2,"),
     },
     "diagnostics-table": {
         "more cells than columns": _file("table.csv", b"step\n3,4\n"),

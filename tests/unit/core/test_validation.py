@@ -61,3 +61,8 @@ def test_a_value_that_is_no_group_of_settings_is_told_with_its_type():
 
 def test_an_error_of_the_whole_names_the_whole():
     assert explained(Outer, "text").what == "a run is not valid"
+
+
+@pytest.mark.parametrize("values", [{"": 3}, 3])
+def test_what_has_no_name_is_placed_too(values):
+    assert explained(Outer, values).where == "a run"

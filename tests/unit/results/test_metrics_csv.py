@@ -118,6 +118,9 @@ def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
         b"step,psnr,ssim\n1,2,\xff\n",
         b"step,psnr,ssim\n1,2," + b"3" * 200_000 + b"\n",
         b"step,psnr,ssim\n1,2,3\n\n",
+        b"step,psnr,ssim\n-1,2,3\n",
+        b"step,psnr,ssim\n1.5,2,3\n",
+        b"step,psnr,ssim\nnan,2,3\n",
     ],
 )
 def test_unreadable_tables_are_explained(tmp_path: Path, content: bytes):
