@@ -13,7 +13,7 @@ from crossgrad_fuzz.regressions import REGRESSIONS, known_of
 from crossgrad_fuzz.targets import TARGETS
 
 #: Executions of each short search: about ten seconds for all parsers.
-SHORT = 60
+SHORT = 50
 #: Of a search for a defect that begins with the inputs on which parsers once failed.
 DIRECT = 60
 

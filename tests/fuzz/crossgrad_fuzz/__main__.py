@@ -23,6 +23,7 @@ def _arguments() -> argparse.Namespace:
         one.add_argument("targets", nargs="*" if name == "run" else 1, choices=[*TARGETS, []])
         one.add_argument("--seconds", type=float, default=600.0, help="at least so long each")
         one.add_argument("--executions", type=int, default=100_000, help="and at least so many")
+        one.add_argument("--longest", type=float, default=float("inf"), help="seconds at most")
         one.add_argument("--seed", type=int, default=0)
         one.add_argument("--out", type=Path, default=_OUT, help="where findings are kept")
         one.add_argument("--work", type=Path, help=argparse.SUPPRESS)
@@ -37,7 +38,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _run(given: argparse.Namespace) -> int:
-    budget = Budget(given.seconds, given.executions)
+    budget = Budget(given.seconds, given.executions, given.longest)
     if given.command == "alone":
         search_alone(given.targets[0], budget, given.seed, given.work, given.out)
         return 0

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from crossgrad_fuzz.case import MOST_BYTES, Case
+from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.guide import Guide
 from crossgrad_fuzz.law import Bench, Finding
 from crossgrad_fuzz.mutate import BLIND, exchanger, inserter
@@ -40,24 +40,31 @@ class Search:
 
 @dataclass(frozen=True)
 class Budget:
-    """When a search ends: after so many seconds *and* so many executions, or at a finding.
+    """When a search ends: after so many seconds *and* so many executions, or at a bound.
 
     Attributes:
         seconds: Least wall-clock seconds.
         executions: Least number of executions.
+        longest: Most wall-clock seconds, whatever the executions.
         findings: Enough findings.
         shrinking: Executions spent on making a finding smaller.
     """
 
     seconds: float = 0.0
     executions: int = 0
+    longest: float = float("inf")
     findings: int = 20
     shrinking: int = 400
 
     def left(self, search: Search) -> bool:
         """Whether the search goes on."""
         ended = search.seconds >= self.seconds and search.executions >= self.executions
-        return not ended and len(search.findings) < self.findings
+        late = search.seconds >= self.longest
+        return not ended and not late and not self.enough(search)
+
+    def enough(self, search: Search) -> bool:
+        """Whether so much was found that nothing more is looked for."""
+        return len(search.findings) >= self.findings
 
 
 @contextmanager
@@ -109,16 +116,21 @@ def search(
             watcher.begin(state)
             finding = bench.execute(case)
             state.executions += 1
-            if state.guide.news() or given:
+            if (state.guide.news() or given) and _handy(target, case):
                 state.corpus.append(case)
             if finding is not None and finding.kind not in state.findings:
                 small = shrunk(bench, case, finding, budget.shrinking)
                 state.findings[finding.kind] = (finding, small)
                 watcher.find(finding, small)
             state.seconds = time.monotonic() - started
-            if not given and not budget.left(state):
+            if budget.enough(state) or (not given and not budget.left(state)):
                 break
     return state
+
+
+def _handy(target: Target, case: Case) -> bool:
+    """Whether an input is worth changing further: long ones take long."""
+    return all(len(content) <= target.most_bytes for content in case.values())
 
 
 def _inputs(
@@ -153,10 +165,11 @@ def _mutated(
         content = _changed(case[name], mutators, rng)
         if rng.random() < 0.03:
             content = _spliced(content, rng.choice(corpus).get(name, b""), rng)
-        case[name] = content[:MOST_BYTES]
+        case[name] = content
     if rng.random() < 0.01:
         _exchange(case, rng)
-    return target.repair(case, rng)
+    cut = {name: content[: target.most_bytes] for name, content in case.items()}
+    return target.repair(cut, rng)
 
 
 def _changed(content: bytes, mutators: Sequence[Mutator], rng: random.Random) -> bytes:

@@ -36,6 +36,7 @@ class Report:
         target: Name of the parser.
         executions: Inputs parsed.
         seconds: Wall-clock seconds.
+        cpu_seconds: CPU seconds of the process, its start included.
         corpus: Inputs that reached something new.
         branches: Branches of the parser.
         taken: Those that were taken.
@@ -46,6 +47,7 @@ class Report:
     target: str
     executions: int = 0
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     corpus: int = 0
     branches: int = 0
     taken: int = 0
@@ -56,12 +58,13 @@ class Report:
         """One row of the table."""
         share = 100.0 * self.taken / self.branches if self.branches else 0.0
         return (
-            f"{self.target:18} {self.executions:>10,} {self.seconds:>8,.0f} {self.corpus:>7} "
+            f"{self.target:18} {self.executions:>10,} {self.seconds:>8,.0f} "
+            f"{self.cpu_seconds:>6,.0f} {self.corpus:>7} "
             f"{self.taken:>4} of {self.branches:>3} = {share:5.1f} % {len(self.findings):>9}"
         )
 
 
-HEAD = "parser             executions  seconds  inputs  branches taken   findings"
+HEAD = "parser             executions  seconds    CPU  inputs  branches taken   findings"
 
 
 def search_alone(name: str, budget: Budget, seed: int, work: Path, out: Path) -> Report:
@@ -88,7 +91,7 @@ def search_alone(name: str, budget: Budget, seed: int, work: Path, out: Path) ->
     os.close(beat)
     reach = state.guide.reach()
     report.executions, report.seconds = state.executions, state.seconds
-    report.corpus = len(state.corpus)
+    report.corpus, report.cpu_seconds = len(state.corpus), time.process_time()
     report.branches, report.taken, report.missing = (
         reach.branches,
         reach.taken,
@@ -124,7 +127,7 @@ def _in_process(name: str, budget: Budget, seed: int, out: Path) -> Report:
         work = Path(folder)
         command = [sys.executable, "-m", "crossgrad_fuzz", "alone", name, "--work", folder]
         command += ["--seconds", str(budget.seconds), "--executions", str(budget.executions)]
-        command += ["--seed", str(seed), "--out", str(out)]
+        command += ["--longest", str(budget.longest), "--seed", str(seed), "--out", str(out)]
         with (work / "log").open("wb") as log:
             process = subprocess.Popen(
                 command, stdout=log, stderr=log, env={**os.environ, **_THREADS}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
-from crossgrad_fuzz.case import Case
+from crossgrad_fuzz.case import MOST_BYTES, Case
 
 #: Changes one file's bytes.
 Mutator = Callable[[bytes, random.Random], bytes]
@@ -42,6 +42,7 @@ class Target:
         quiet: Whether a warning counts as a finding.
         seconds: CPU seconds for one execution.
         mebibytes: Memory that one execution may take.
+        most_bytes: Mutated files are cut there.
     """
 
     name: str
@@ -57,3 +58,4 @@ class Target:
     quiet: bool = True
     seconds: float = 2.0
     mebibytes: int = 256
+    most_bytes: int = MOST_BYTES

@@ -5,6 +5,7 @@ import json
 import random
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +25,7 @@ from crossgrad_core.checkpoint import Checkpoint, latest, load, save
 from crossgrad_core.checkpoint_folders import STATE, TENSORS
 from crossgrad_core.checkpoint_state import digest
 from crossgrad_core.contexts import StepRecord
+from crossgrad_core.errors import UserError
 from crossgrad_core.optimizer import AdamState
 from crossgrad_core.state import PluginState
 from crossgrad_core.training import persist, rngs
@@ -87,7 +89,8 @@ def _seeds() -> Sequence[Case]:
 
 
 def _parse(folder: Path) -> None:
-    found: Checkpoint = load(latest(folder))
+    _say_what_is_missing(folder)
+    found: Checkpoint = load(latest(latest(folder)))
     for tensors in (found.parameters, found.exp_avg, found.exp_avg_sq):
         assert all(isinstance(tensor, torch.Tensor) for tensor in tensors.values())
     state = from_checkpoint(_SETUP, found)
@@ -95,6 +98,16 @@ def _parse(folder: Path) -> None:
     assert state.parameters["means"].shape[0] == state.parameters["scales"].shape[0]
     assert all(isinstance(value, int | float) for value in vars(state.clock).values())
     assert all(0 <= rng.random() < 1 for rng in state.rngs.values())
+
+
+def _say_what_is_missing(folder: Path) -> None:
+    state, tensors = (folder / _STATE).is_file(), (folder / _TENSORS).is_file()
+    if not state and not tensors:
+        with suppress(UserError):
+            latest(folder / "gone")
+        load(folder / "gone")
+    if not state or not tensors:
+        load(folder / _FOLDER)
 
 
 def _repair(case: dict[str, bytes], rng: random.Random) -> dict[str, bytes]:
@@ -121,14 +134,30 @@ def _header(data: bytes, rng: random.Random) -> bytes:
     change = rng.choice(
         (
             matcher(rb"(\d+)", (*NUMBERS[:40], b"2", b"3", b"[]")),
-            matcher(rb'"dtype":"(\w+)"', (b"F64", b"F16", b"I64", b"BOOL", b"U8", b"F8_E4M3")),
+            matcher(rb'"dtype":"(\w+)"', (b"F64", b"I32", b"I64", b"BOOL", b"U8", b"F8_E4M3")),
             matcher(rb'"([\w/%-]+)":\{', (b"parameters/means", b"plugin/a/tensors/b", b"x", b"")),
-            matcher(rb'"shape":(\[[\d,]*\])', (b"[]", b"[0]", b"[2,3]", b"[1,2,3]", b"[-1]")),
+            matcher(rb'"shape":(\[[\d,]*\])', (b"[]", b"[0]", b"[3,2]", b"[1,2]", b"[-1]")),
         )
     )
     changed = change(header, rng)
     return len(changed).to_bytes(8, "little") + changed + data[8 + length :]
 
+
+def _renamed(case: dict[str, bytes], rng: random.Random) -> dict[str, bytes]:
+    """One tensor has another name, in both files."""
+    old, new = rng.choice(_KEYS), rng.choice((*_KEYS, b"x", b"plugin/a", b"exp_avg/levels", b""))
+    data, changed = case.get(_TENSORS, b""), dict(case)
+    length = int.from_bytes(data[:8], "little")
+    header = data[8 : 8 + length].replace(b'"%s"' % old, b'"%s"' % new)
+    changed[_TENSORS] = len(header).to_bytes(8, "little") + header + data[8 + length :]
+    changed[_STATE] = case.get(_STATE, b"").replace(b'"%s"' % old, b'"%s"' % new)
+    return changed
+
+
+_KEYS = (
+    *(b"parameters/means", b"parameters/scales", b"parameters/levels", b"exp_avg/means"),
+    *(b"exp_avg_sq/means", b"plugin/near-far%2Fx/tensors/order"),
+)
 
 TARGET = Target(
     name="checkpoint",
@@ -151,11 +180,13 @@ TARGET = Target(
     mutators=(
         _header,
         matcher(rb": *(-?[\d.]+)", NUMBERS),
+        matcher(rb": *(-?[\d.]+)", (b"null", b'"x"', b"[]", b"-1", b"true", b"1.5")),
         matcher(rb'("[\w ]+"): ', (b'"x"', b'"step"', b'"means"', b"3")),
         matcher(rb': *("[^"]*")', (b'"x"', b"3", b"null", b"[]", b"{}")),
         matcher(rb"(\[[^\[\]]*\])", (b"[]", b"{}", b"null", b"3")),
         matcher(rb"(\{[^{}]*\})", (b"{}", b"[]", b"null", b"3")),
     ),
+    case_mutators=(_renamed,),
     repair=_repair,
 )
 TARGETS = (TARGET,)

@@ -9,7 +9,7 @@ import numpy as np
 
 from crossgrad_core.testing.scenes import write_tiny_scene
 from crossgrad_fuzz.case import Case, load
-from crossgrad_fuzz.mutate import at_offsets
+from crossgrad_fuzz.mutate import NUMBERS, at_offsets, matcher
 from crossgrad_fuzz.target import Target
 from crossgrad_plugins.readers import (
     _colmap_binary,
@@ -93,11 +93,20 @@ def _point_fields(data: bytes) -> list[tuple[int, int, str]]:
 
 
 def _binary() -> Sequence[Case]:
-    return [*(files(text=False, model=model) for model in _MODELS), _without_points()]
+    models = [files(text=False, model=model) for model in _MODELS]
+    return [*models, _two_cameras(models[0]), files(text=False, points=0), _without_points()]
+
+
+def _two_cameras(case: Case) -> Case:
+    """A second camera, which no image has."""
+    first = case["cameras.bin"][8:]
+    second = struct.pack("<I", 7) + first[4:]
+    return {**case, "cameras.bin": struct.pack("<Q", 2) + first + second}
 
 
 def _text() -> Sequence[Case]:
-    return [*(files(text=True, model=model) for model in _MODELS), _without_text_points()]
+    models = [files(text=True, model=model) for model in _MODELS]
+    return [*models, files(text=False), _without_text_points()]
 
 
 def _without_points() -> Case:
@@ -136,6 +145,7 @@ TEXT = Target(
     seeds=_text,
     parse=_parse,
     parser={_colmap_model: (), _colmap_text: (), _colmap_types: (), colmap: _READER},
+    mutators=(matcher(rb"\n(\d+) ", (b"1", b"2", b"3")), matcher(rb" ([-\d.e]+)", NUMBERS)),
     words=_WORDS,
 )
 TARGETS = (BINARY, TEXT)

@@ -8,9 +8,10 @@ from crossgrad_core.scene import split
 from crossgrad_core.scene.options import SceneOptions
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST, split_views
 from crossgrad_fuzz.case import Case
+from crossgrad_fuzz.mutate import matcher
 from crossgrad_fuzz.target import Target
 from crossgrad_plugins.groupings import lists
-from crossgrad_plugins.groupings.lists import _listed, _require_two, read_labels
+from crossgrad_plugins.groupings.lists import _folder, _listed, _require_two, read_labels
 
 _NAMES = ("far/0001.jpg", "far/0002.jpg", "near/0001.jpg", "near/0002.jpg", "größe.jpg")
 _LABELS = "labels.csv"
@@ -34,6 +35,7 @@ def _parse_split(folder: Path) -> None:
     assert set(found.train) <= set(_NAMES)
     assert set(found.test) <= set(_NAMES)
     assert not set(found.train) & set(found.test)
+    assert split_views(_NAMES[:1], SceneOptions(split="every"), folder).train
     for each in (SceneOptions(split="none"), SceneOptions(split="every", test_every=2)):
         assert set(split_views(_NAMES, each, folder).train) <= set(_NAMES)
 
@@ -50,6 +52,7 @@ def _parse_labels(folder: Path) -> None:
     path = folder / _LABELS
     table = read_labels(path)
     assert all(name and label for name, label in table.items())
+    _require_two({_folder(name) for name in table}, None)
     labels = [_listed(name, table, path) for name in _NAMES]
     _require_two(set(labels), path)
     assert all(labels)
@@ -68,5 +71,6 @@ LABELS = Target(
     parse=_parse_labels,
     parser={text_files: ("read_json", "parse_number"), lists: ("Lists",)},
     words=(*(name.encode() for name in _NAMES), b"far/", b",", b'"', b"\n", b"#", b'""', b",,"),
+    mutators=(matcher(rb",(\w+)", (b"far", b"near")), matcher(rb"([\w/.]+),", (b"far/", b"near/"))),
 )
 TARGETS = (SPLIT, LABELS)

@@ -25,6 +25,8 @@ _PHOTO, _MASK = "photo.img", "mask.img"
 #: While fuzzing, photos above this are too large: what a header claims must not be believed.
 _MOST_PIXELS = 1 << 20
 _SIZE = (24, 16)
+#: Lenses whose photos reach all of the undistorted frame, and not all of it.
+_FILLED, _UNFILLED = (20.0, 8.0, 12.0, -0.05), (14.9, 12.1, 14.8, -0.2)
 _KINDS = (
     ("RGB", "JPEG", {"quality": 80}),
     ("RGB", "JPEG", {"quality": 80, "progressive": True}),
@@ -101,7 +103,7 @@ def _parse_header(folder: Path) -> None:
 def _pixel_seeds() -> Sequence[Case]:
     masks = [_saved("L", "PNG", {}, (12, 8)), _saved("1", "PNG", {}, (16, 24))]
     cases: list[Case] = [{_PHOTO: content} for content in _photos()]
-    return [*cases, *({_PHOTO: cases[3][_PHOTO], _MASK: mask} for mask in masks)]
+    return [*cases, *({_PHOTO: cases[i][_PHOTO], _MASK: mask} for mask in masks for i in (3, 4))]
 
 
 def _parse_pixels(folder: Path) -> None:
@@ -113,7 +115,12 @@ def _parse_pixels(folder: Path) -> None:
     assert alpha is None or alpha.shape == rgb.shape[:2]
     small, _ = decode_photo(path, 4)
     assert small.shape[0] <= rgb.shape[0]
-    for each in (_source(path, mask if mask.is_file() else None), _distorted(path)):
+    for each in (
+        *(_source(path, mask if mask.is_file() else None), _distorted(path, _FILLED)),
+        _distorted(path, _UNFILLED),
+    ):
+        each.try_out()
+        assert min(each.undistorted_size) > 0
         image, keep = each.decode()
         assert tuple(image.shape) == (each.target[1], each.target[0], 3)
         assert keep is None or keep.shape == image.shape[:2]
@@ -124,8 +131,8 @@ def _source(path: Path, mask: Path | None) -> PhotoSource:
     return PhotoSource(path, *_SIZE, 1, mask, True, background, None, (12, 8))
 
 
-def _distorted(path: Path) -> PhotoSource:
-    calibration = Calibration("SIMPLE_RADIAL", *_SIZE[::-1], (20.0, 8.0, 12.0, -0.05))
+def _distorted(path: Path, params: tuple[float, ...]) -> PhotoSource:
+    calibration = Calibration("SIMPLE_RADIAL", *_SIZE[::-1], params)
     pinhole = calibration.pinhole
     target = (pinhole.width, pinhole.height)
     return PhotoSource(path, *_SIZE[::-1], 6, None, True, None, calibration, target)

@@ -15,6 +15,7 @@ from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
 _FILE = "model.ply"
+_ROTATIONS = (b"0 0 0 0", b"1e30 0 0 0", b"1e-30 0 0 0", b"1 0 0 0")
 _FAR = Similarity(np.array([355_142.5, 5_812_377.25, 81.0]), 1 / 60)
 
 
@@ -114,6 +115,9 @@ TARGET = Target(
         matcher(rb"element (?:vertex|camera) (\S+)", COUNTS),
         matcher(rb"property (\w+) ", (b"float", b"double", b"uchar", b"list", b"int", b"bool")),
         matcher(rb"crossgrad_offset: (\S+)", NUMBERS),
+        matcher(rb"SplatRenderMode: (\w+)", (b"default", b"2dgs", b"mip")),
+        matcher(rb"\n((?:0\.5 ){3}0\.5) ", _ROTATIONS),
+        matcher(rb" ((?:0\.5 ){3}0\.5)\n", _ROTATIONS),
     ),
 )
 TARGETS = (TARGET,)

@@ -46,14 +46,20 @@ def _seeds() -> Sequence[Case]:
     other = {f"sparse/1/{name}": content for name, content in files(text=True).items()}
     plain = {f"sparse/{name}": content for name, content in files(text=True).items()}
     lists = {"train_list.txt": b"0001.png\n0002.png\n", "test_list.txt": b"0000.png\n"}
-    return [*cases, {**cases[0], **other}, {**plain, **lists}, {**cases[2], **lists}]
+    second = {name.replace("/1/", "/2/"): content for name, content in other.items()}
+    return [
+        *(*cases, {**cases[0], **other}, {**plain, **lists}, {**cases[2], **lists}),
+        {**cases[1], **second, **lists},
+    ]
 
 
 def _parse(folder: Path) -> None:
-    reader = ColmapReader(model="sparse/1" if (folder / "sparse/1").is_dir() else None)
+    asked = any((folder / "sparse/1").glob("*"))
+    reader = ColmapReader(model="sparse/1" if asked else None)
     if not reader.accepts(folder):
         ColmapReader().read(folder, SceneOptions())  # says what is missing
-    scene = reader.read(folder, SceneOptions(max_size=20))
+    whole = (folder / "train_list.txt").is_file()
+    scene = reader.read(folder, SceneOptions(max_size=None if whole else 20))
     _check_scene(scene.points, len(scene.views))
     assert scene.train
     for view in scene.views:
@@ -106,7 +112,9 @@ def _parse_raw(folder: Path) -> None:
         assert np.isfinite(made.pose(view.world_to_camera)).all()
         rows = points.rows(view.seen)
         assert len(rows) <= len(points.xyz)
-        small = view.calibration.resized(12, 8).pinhole.resized(6, 4)
+        same = view.calibration.resized(view.calibration.width, view.calibration.height)
+        assert same == view.calibration
+        small = same.resized(12, 8).pinhole.resized(6, 4)
         assert min(small.fx, small.fy) > 0
         assert np.isfinite([small.fx, small.fy, small.cx, small.cy]).all()
 

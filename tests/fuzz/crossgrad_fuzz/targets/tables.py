@@ -1,11 +1,13 @@
 """What a run wrote and reads again: metrics.csv, tables of diagnostics, summary.json."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from crossgrad_core import text_files
 from crossgrad_core.diagnostics import report
 from crossgrad_core.diagnostics.report import read_probes
+from crossgrad_core.errors import UserError
 from crossgrad_core.results import metrics_csv, summary
 from crossgrad_core.results.metrics_csv import MetricsCsv, read_metrics
 from crossgrad_core.results.summary import read_summary
@@ -28,6 +30,8 @@ def _metrics() -> bytes:
 
 def _parse_metrics(folder: Path) -> None:
     if not (folder / _METRICS).is_file():
+        with suppress(UserError):
+            read_metrics(folder)
         MetricsCsv.resume(folder, _REGIMES, 100)
         return
     rows = read_metrics(folder)
