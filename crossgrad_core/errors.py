@@ -33,16 +33,18 @@ class UserError(Exception):
     def message(self) -> str:
         """The error as indented lines: what, where, expected, found, what to do."""
         rows = (
-            ("where", _shortened(self.where, LONGEST_PLACE)),
-            ("expected", _shortened(self.expected)),
-            ("found", _shortened(self.found)),
-            ("to do", _shortened(self.todo)),
+            ("where", _short(self.where, LONGEST_PLACE)),
+            ("expected", _short(self.expected)),
+            ("found", _short(self.found)),
+            ("to do", _short(self.todo)),
         )
         lines = [f"  {label + ':':<10}{text}" for label, text in rows if text]
-        return showable("\n".join([_shortened(self.what), *lines]))
+        return "\n".join([_short(self.what), *lines])
 
 
-def _shortened(text: str, longest: int = LONGEST) -> str:
+def _short(content: str, longest: int = LONGEST) -> str:
+    """A part as it is shown: cut after its control characters were written out, not before."""
+    text = showable(content)
     if len(text) <= longest:
         return text
     return f"{text[: longest // 2]} ... {text[-longest // 2 :]}"

@@ -75,7 +75,9 @@ class Guide:
         branches = taken = 0
         missing: dict[str, list[list[int]]] = {}
         for file, found in files.items():
-            left_out = next(n for f, n in self._parser.items() if Path(f) == Path(file).resolve())
+            left_out = next(
+                n for f, n in self._parser.items() if Path(f).resolve() == Path(file).resolve()
+            )
             for name, region in found["functions"].items():
                 # The region without a name is what runs at import.
                 if name == "" or name.split(".")[0] in left_out or name in left_out:

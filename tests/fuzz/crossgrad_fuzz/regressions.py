@@ -142,6 +142,7 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
         "a path that no system takes": _file(_YAML, b'scene: "a\\0b"\n'),
         "a number of 5,000 digits": _file(_YAML, b"seed: " + b"9" * 5000),
         "options that are a number": _file(_YAML, b"observers: {progress: 3}\n"),
+        "a setting of control characters": _file("set.txt", b"\0" * 2000 + b"=\0"),
         "infinite seconds": _file(_YAML, b"seconds: .inf\n"),
         "more than any settings": _file(_YAML, b"# \n" * 100_000),
         "a list of too many": _file(_YAML, b"a: [" + b"0," * 10_001 + b"]\n"),

@@ -1,6 +1,6 @@
 """How the one error that users see is worded."""
 
-from crossgrad_core.errors import LONGEST, UserError
+from crossgrad_core.errors import LONGEST, LONGEST_PLACE, UserError
 
 
 def test_parts_stand_in_lines_of_their_own():
@@ -22,6 +22,12 @@ def test_what_a_file_holds_cannot_fill_or_move_the_terminal():
     assert len(message) < LONGEST + 200
     assert "999 ... 999" in message
     message.encode()
+
+
+def test_what_is_written_out_is_cut_too():
+    text = "\0" * 2000
+    error = UserError(text, where=text, expected=text, found=text, todo=text)
+    assert len(str(error)) < 4 * LONGEST + LONGEST_PLACE + 100
 
 
 def test_a_path_is_not_cut():
