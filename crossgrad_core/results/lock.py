@@ -141,9 +141,9 @@ def _write(file: BinaryIO, text: str) -> None:
 
 
 def _read(file: BinaryIO) -> Holder | None:
-    """What the holder wrote; None where it has not written yet."""
+    """What the holder wrote; None where it has not written yet, or something else did."""
     file.seek(0)
     try:
         return Holder(**json.loads(file.read()))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return None

@@ -3,10 +3,10 @@
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos import FilePhoto
@@ -53,7 +53,7 @@ class FrameMark(_Mark):
     """The local frame: its origin in input units, and local units per input unit."""
 
     offset: tuple[float, float, float]
-    scale: float
+    scale: Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class PointsMark(_Mark):

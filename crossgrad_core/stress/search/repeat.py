@@ -19,13 +19,13 @@ def read_rows(text: str, dtype: torch.dtype) -> Case:
     """The case that a text such as [[1,2],[3,4]] describes: a row per view.
 
     Raises:
-        UserError: It is no matrix of numbers.
+        UserError: It is no matrix of finite numbers.
     """
     try:
         rows = np.array(json.loads(text), np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise _no_matrix(text) from error
-    if rows.ndim != 2 or not rows.size:  # noqa: PLR2004
+    if rows.ndim != 2 or not rows.size or not np.isfinite(rows).all():  # noqa: PLR2004
         raise _no_matrix(text)
     return short(str(dtype).removeprefix("torch."), rows, dtype)
 
@@ -47,7 +47,7 @@ def _cell(subject: Subject, exact: ExactCase) -> Cell:
 
 def _no_matrix(text: str) -> UserError:
     return UserError(
-        "the gradients are no matrix of numbers",
+        "the gradients are no matrix of finite numbers",
         where="--rows",
         expected="a row of equal length for each view, such as [[1,2],[3,4]]",
         found=text if len(text) <= 80 else f"{text[:80]} ...",  # noqa: PLR2004

@@ -170,6 +170,15 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
         "more cells than columns": _file("table.csv", b"step\n3,4\n"),
         "not UTF-8": _file("table.csv", b"\xff\n"),
     },
+    "scene-file": {
+        "a scene without extent": _replaced(0, "scene.json", b'"scale": 0.5', b'"scale": 0.0'),
+    },
+    "lock": {"lists without an end": _file("run.lock", b"[" * 5000)},
+    "rows": {
+        "lists without an end": _file("rows.txt", b"[" * 5000),
+        "a number that no float can be": _file("rows.txt", b"[[1" + b"0" * 400 + b"]]"),
+        "not a number": _file("rows.txt", b"[[NaN, 1]]"),
+    },
     "summary": {
         "lists without an end": _file("summary.json", b"[" * 5000),
         "no object": _file("summary.json", b"3"),

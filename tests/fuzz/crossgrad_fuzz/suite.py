@@ -56,7 +56,7 @@ class Report:
 
     def line(self) -> str:
         """One row of the table."""
-        share = 100.0 * self.taken / self.branches if self.branches else 0.0
+        share = 100.0 * self.taken / self.branches if self.branches else 100.0
         return (
             f"{self.target:18} {self.executions:>10,} {self.seconds:>8,.0f} "
             f"{self.cpu_seconds:>6,.0f} {self.corpus:>7} "

@@ -189,7 +189,13 @@ def test_rows_are_printed_so_that_they_are_read_again_exactly():
         assert np.array_equal(read_rows(text, dtype).exact_head, rows)
 
 
-@pytest.mark.parametrize("text", ["", "1", "[1,2]", "[[1,2],[3]]", "[[1,a]]", "[[]]"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "1", "[1,2]", "[[1,2],[3]]", "[[1,a]]", "[[]]", "[[NaN,1]]", "[[1e999,1]]"),
+        *("[" * 5000, f"[[1{'0' * 400},1]]"),
+    ],
+)
 def test_rows_that_are_no_matrix_are_refused(text):
     with pytest.raises(UserError, match="no matrix"):
         read_rows(text, torch.float32)

@@ -7,6 +7,7 @@ from crossgrad_fuzz.targets import (
     lists,
     photos,
     ply,
+    records,
     scenes,
     settings,
     tables,
@@ -14,6 +15,6 @@ from crossgrad_fuzz.targets import (
 
 TARGETS: dict[str, Target] = {
     target.name: target
-    for module in (ply, colmap, scenes, photos, settings, checkpoints, lists, tables)
+    for module in (ply, colmap, scenes, photos, settings, checkpoints, lists, tables, records)
     for target in module.TARGETS
 }
