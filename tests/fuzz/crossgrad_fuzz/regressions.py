@@ -178,6 +178,7 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
         "lists without an end": _file("rows.txt", b"[" * 5000),
         "a number that no float can be": _file("rows.txt", b"[[1" + b"0" * 400 + b"]]"),
         "not a number": _file("rows.txt", b"[[NaN, 1]]"),
+        "more than float32 can hold": _file("rows.txt", b"[[1e39, 1]]"),
     },
     "summary": {
         "lists without an end": _file("summary.json", b"[" * 5000),

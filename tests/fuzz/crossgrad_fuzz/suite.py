@@ -19,8 +19,9 @@ from crossgrad_fuzz.regressions import known_of
 from crossgrad_fuzz.targets import TARGETS
 
 #: Wall-clock seconds without a new execution after which a process counts as hung. Executions are
-#: bounded in CPU seconds already; this is for code that no signal reaches.
-_HUNG = 120.0
+#: bounded in CPU seconds already; this is for code that no signal reaches. Ample, since a search
+#: may begin on a machine that is busy with other work.
+_HUNG = 900.0
 _BEAT, _REPORT = "beat", "report.json"
 #: One thread per search, so that several do not fight for the cores.
 _THREADS = dict.fromkeys(
@@ -104,6 +105,7 @@ def search_alone(name: str, budget: Budget, seed: int, work: Path, out: Path) ->
 def kept(folder: Path, finding: Finding, case: dict[str, bytes]) -> Path:
     """Writes a finding where `replay` finds it."""
     place = folder / digest(case)
+    place.mkdir(parents=True, exist_ok=True)
     save(case, place)
     place.with_suffix(".txt").write_text(f"{finding.kind}\n\n{finding.detail}\n", errors="replace")
     return place
