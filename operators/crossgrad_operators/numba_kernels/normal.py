@@ -1,8 +1,9 @@
 """Gramians as norms and cosines, which no ratio of norms can spoil."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from crossgrad_core.jit import strict_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -21,7 +22,7 @@ EPSILON = 2.220446049250313e-16
 CAUTION = 4.0
 
 
-@njit(cache=True)
+@strict_kernel
 def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
     """Fills norms [K] and cosines [K, K] of one Gramian; zero for views that are not present."""
     views = present.size
@@ -37,7 +38,7 @@ def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) 
             cosines[j, i] = c
 
 
-@njit(cache=True)
+@strict_kernel
 def form(a: Floats, cosines: Floats, b: Floats) -> float:
     """a^T C b."""
     total = 0.0
@@ -50,7 +51,7 @@ def form(a: Floats, cosines: Floats, b: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@strict_kernel
 def times(cosines: Floats, j: int, b: Floats) -> float:
     """(C b)_j."""
     total = 0.0
