@@ -41,6 +41,11 @@ def strict_device(function: Callable[P, R]) -> Callable[P, R]:
     return inlined(function)
 
 
+def strict_part(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a function of its own that only strict kernels call."""
+    return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
 def strict_parallel_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """As `strict_kernel`, with `prange` loops on all of Numba's threads."""
     return compiled(function, parallel=True)

@@ -7,7 +7,7 @@ times 2^-104.
 
 import numpy as np
 
-from crossgrad_core.jit import strict_device
+from crossgrad_core.jit import strict_device, strict_part
 
 #: Splits a float64 number into two halves whose products are exact.
 _SPLITTER = 134217729.0
@@ -58,7 +58,7 @@ def multiply(a: float, a_low: float, b: float, b_low: float) -> tuple[float, flo
     return quick_two_sum(high, low + (a * b_low + a_low * b))
 
 
-@strict_device
+@strict_part
 def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
     """(a + a_low) / (b + b_low)."""
     first = a / b
@@ -71,7 +71,7 @@ def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float
     return add(high, low, rest / b, 0.0)
 
 
-@strict_device
+@strict_part
 def square_root(a: float, a_low: float) -> tuple[float, float]:
     """The root of a + a_low >= 0."""
     if a <= 0.0:

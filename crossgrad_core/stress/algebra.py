@@ -1,7 +1,6 @@
-"""Small linear algebra in 50 digits for the oracles: solves, supports, complementarity."""
+"""Small linear algebra in 50 digits for the oracles: solves and complementarity."""
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations
+from collections.abc import Sequence
 
 from crossgrad_core.stress.exact import Matrix, Number, require_mpmath
 
@@ -9,8 +8,8 @@ Vector = list[Number]
 
 #: Relative size of a pivot that counts as zero; exact singularity shows at about 1e-50.
 SINGULAR = "1e-35"
-#: Up to this many views all supports are tried.
-ENUMERATED = 8
+#: A multiple of a direction that is not reached before some entry meets zero.
+FAR = 10**30
 
 
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
@@ -26,12 +25,6 @@ def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
 def form(matrix: Matrix, x: Sequence[Number]) -> Number:
     """The quadratic form x^T M x."""
     return dot(x, apply(matrix, x))
-
-
-def supports(count: int) -> Iterator[tuple[int, ...]]:
-    """All non-empty subsets of range(count)."""
-    for size in range(1, count + 1):
-        yield from combinations(range(count), size)
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
@@ -60,61 +53,53 @@ def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Ve
     return x
 
 
-def null_vector(matrix: Matrix, support: Sequence[int]) -> Vector | None:
-    """Vector x on a minimal dependent support with (M x)_S = 0; None where M_SS is regular."""
-    mp = require_mpmath().mp
-    *rest, last = support
-    right = [-row[last] for row in matrix]
-    x = solve(matrix, rest, right) if rest else [mp.mpf(0)] * len(matrix)
-    if x is None:
-        return None
-    x[last] = mp.mpf(1)
-    left = form(matrix, x)
-    return x if abs(left) <= mp.mpf(SINGULAR) * max(abs(v) for v in x) ** 2 else None
-
-
 def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
     """Solution x >= 0 with s = M x + offset >= 0 and x.s = 0: the optimality conditions of a QP.
 
-    Murty's least-index pivoting, which ends for every positive definite M; None where it does not
-    (M is singular), up to `ENUMERATED` rows all supports are tried instead.
+    Lawson and Hanson's algorithm, whose every result is checked: of the constraints that are not
+    met the worst becomes active, which it can do only if its column does not depend on the active
+    ones, or else one of them leaves; so M may be singular. None where there is no solution.
     """
-    if len(matrix) <= ENUMERATED:
-        return _complementary_by_enumeration(matrix, offset)
-    inside: set[int] = set()
-    for _ in range(5000):
-        x = _with_support(matrix, offset, sorted(inside))
-        if x is None:
+    mp = require_mpmath().mp
+    x = [mp.mpf(0)] * len(matrix)
+    active: set[int] = set()
+    for _ in range(50 * len(matrix)):
+        slack = [m + o for m, o in zip(apply(matrix, x), offset, strict=True)]
+        tolerance = mp.mpf(SINGULAR) * max(1, *x)
+        waiting = [i for i in range(len(matrix)) if i not in active]
+        worst = min(waiting, key=lambda i: slack[i], default=None)
+        if worst is None or slack[worst] >= -tolerance:
+            met = all(abs(slack[i]) <= tolerance for i in active)
+            return x if met else None
+        active.add(worst)
+        if not _settle(matrix, offset, x, active, worst):
             return None
-        wrong = [i for i, s in enumerate(_slack(matrix, offset, x)) if _violates(i, inside, x, s)]
-        if not wrong:
-            return x
-        inside ^= {wrong[0]}
     return None
 
 
-def _complementary_by_enumeration(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
-    for support in ((), *supports(len(matrix))):
-        x = _with_support(matrix, offset, support)
-        if x is not None and not any(
-            _violates(i, set(support), x, s) for i, s in enumerate(_slack(matrix, offset, x))
-        ):
-            return x
-    return None
-
-
-def _with_support(
-    matrix: Matrix, offset: Sequence[Number], support: Sequence[int]
-) -> Vector | None:
-    if not support:
-        return [require_mpmath().mp.mpf(0)] * len(matrix)
-    return solve(matrix, support, [-o for o in offset])
-
-
-def _slack(matrix: Matrix, offset: Sequence[Number], x: Sequence[Number]) -> Vector:
-    return [m + o for m, o in zip(apply(matrix, x), offset, strict=True)]
-
-
-def _violates(i: int, inside: set[int], x: Sequence[Number], slack: Number) -> bool:
-    tolerance = require_mpmath().mp.mpf(SINGULAR) * max(1, *(abs(v) for v in x))
-    return bool(x[i] < -tolerance) if i in inside else bool(slack < -tolerance)
+def _settle(
+    matrix: Matrix, offset: Sequence[Number], x: list[Number], active: set[int], entered: int
+) -> bool:
+    """Solves for the active entries of x; those that meet zero on the way are let go."""
+    least = require_mpmath().mp.mpf("1e-300")
+    while active:
+        target = solve(matrix, sorted(active), [-o for o in offset])
+        if target is None:
+            # The new column depends on the others: along that dependence nothing but x changes.
+            rest = sorted(active - {entered})
+            along = solve(matrix, rest, [-row[entered] for row in matrix])
+            if along is None or all(v >= 0 for v in along):
+                return False
+            target = [x[i] + FAR * along[i] for i in range(len(x))]
+            target[entered] = x[entered] + FAR
+            target = [v if i in active else x[i] for i, v in enumerate(target)]
+        falling = {i: x[i] / max(x[i] - target[i], least) for i in active if target[i] <= 0}
+        share = min(falling.values(), default=1)
+        for i in active:
+            x[i] += share * (target[i] - x[i])
+        for i in [i for i, part in falling.items() if part == share]:
+            x[i] *= 0
+            active.remove(i)
+        if not falling:
+            return True
+    return True

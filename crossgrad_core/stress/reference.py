@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crossgrad_core.stress import oracles, solvers
+from crossgrad_core.stress import oracles, polyhedra, solvers
 from crossgrad_core.stress.algebra import apply
 from crossgrad_core.stress.exact import Matrix, Number, require_mpmath
 from crossgrad_core.stress.oracles import Oracle, Question, column_sums, number
@@ -18,14 +18,14 @@ ORACLES: Final[Mapping[str, Oracle]] = {
     "symmetric": oracles.symmetric,
     "pcgrad": oracles.pcgrad,
     "gradvac": oracles.gradvac,
-    "cagrad": solvers.cagrad,
-    "mgda": solvers.mgda,
+    "cagrad": polyhedra.cagrad,
+    "mgda": polyhedra.mgda,
     "gradnorm": oracles.gradnorm,
     "imtl-g": solvers.imtl_g,
     "nash": solvers.nash,
     "aligned": solvers.aligned,
-    "upgrad": solvers.upgrad,
-    "dualproj": solvers.dualproj,
+    "upgrad": polyhedra.upgrad,
+    "dualproj": polyhedra.dualproj,
     "preconditioner": oracles.preconditioned,
     "confgate": oracles.confgate,
     "anchors": oracles.anchors,

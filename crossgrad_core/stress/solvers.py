@@ -1,31 +1,24 @@
 """Oracles of the methods that solve a small problem, in 50 digits and by other ways.
 
-The operators enumerate supports or follow active sets in float64; here optimality conditions are
-solved as complementarity problems, and checked.
+See `polyhedra` for those that minimise over convex combinations.
 """
 
-from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 
 from crossgrad_core.stress.algebra import (
-    ENUMERATED,
     Vector,
     apply,
-    complementary,
     dot,
     form,
-    null_vector,
     solve,
-    supports,
 )
-from crossgrad_core.stress.exact import Matrix, Number, require_mpmath
+from crossgrad_core.stress.exact import Matrix, require_mpmath
 from crossgrad_core.stress.oracles import (
     OPPOSITE,
     Question,
     cancels,
-    column_sums,
     cosines,
     is_noise,
     lengths,
@@ -44,150 +37,6 @@ FAR: Final = 1e-10
 
 class UnprovenError(RuntimeError):
     """The oracle found no point that meets the optimality conditions."""
-
-
-def _projection(cosine: Matrix, b: Vector) -> Vector:
-    """Coefficients of the projection of sum b_k e_k on the cone {x: x.e_l >= 0}."""
-    y = complementary(cosine, apply(cosine, b))
-    if y is None:
-        raise UnprovenError
-    x = [u + v for u, v in zip(b, y, strict=True)]
-    return zeros(len(b)) if is_noise(cosine, x) else x
-
-
-def upgrad(question: Question) -> Vector:
-    """Each gradient projected, over K."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    rows = []
-    for k in range(question.count):
-        x = _projection(cosine, [number(int(i == k)) for i in range(question.count)])
-        rows.append([v * n[k] / n[i] / question.views for i, v in enumerate(x)])
-    return column_sums(rows)
-
-
-def dualproj(question: Question) -> Vector:
-    """The mean projected."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    longest = max(n)
-    x = _projection(cosine, [v / longest for v in n])
-    return [v * longest / n[k] / question.views for k, v in enumerate(x)]
-
-
-def _meets_zero(cosine: Matrix) -> bool:
-    """Whether some convex combination of the directions is exactly zero."""
-    if len(cosine) > ENUMERATED:
-        return False
-    for support in supports(len(cosine)):
-        x = null_vector(cosine, support)
-        if x is not None and (all(v >= 0 for v in x) or all(v <= 0 for v in x)):
-            return True
-    return False
-
-
-def mgda(question: Question) -> Vector:
-    """Shortest convex combination: C x = r + s, x >= 0, s >= 0, x.s = 0 up to a factor."""
-    n, cosine = lengths(question.gramian), cosines(question.gramian)
-    shortest = min(n)
-    r = [shortest / v for v in n]
-    x = None if _meets_zero(cosine) else complementary(cosine, [-v for v in r])
-    if x is None:
-        if _meets_zero(cosine):
-            return zeros(question.count)
-        raise UnprovenError
-    if is_noise(cosine, x):
-        return zeros(question.count)
-    total = dot(x, r)
-    return [v * w / total for v, w in zip(x, r, strict=True)]
-
-
-def cagrad(question: Question) -> Vector:
-    """g_0 + c |g_0| g_w / |g_w| with g_w from its optimality conditions on the simplex."""
-    mp = require_mpmath().mp
-    gramian, c = question.gramian, number(question.options["c"])
-    share = number(question.count) / question.views
-    if question.count == 1:
-        return [share]
-    mean = [number(1) / question.count] * question.count
-    cosine = cosines(gramian)
-    if question.count == 2 and 1 + cosine[0][1] <= number(OPPOSITE):  # noqa: PLR2004
-        return [(1 - c) * share * m for m in mean]
-    length = mp.sqrt(max(form(gramian, mean), number(0)))
-    if length <= mp.sqrt(max(gramian[k][k] for k in range(question.count))) * number("1e-40"):
-        return zeros(question.count)
-    try:
-        w = _worst_off(gramian, apply(gramian, mean), c * length)
-    except UnprovenError:
-        if _meets_zero(cosine):
-            return zeros(question.count)
-        raise
-    n = lengths(gramian)
-    if question.count > 2 and is_noise(cosine, [v * x for v, x in zip(w, n, strict=True)]):  # noqa: PLR2004
-        return zeros(question.count)
-    factor = c * length / mp.sqrt(form(gramian, w))
-    return [share * (m + factor * v) for m, v in zip(mean, w, strict=True)]
-
-
-def _worst_off(gramian: Matrix, q: Vector, rho: Number) -> Vector:
-    """Minimum of w.q + rho |g_w| on the simplex."""
-    size = len(gramian)
-    candidates = supports(size) if size <= ENUMERATED else _growing_supports(gramian, q, rho)
-    for support in candidates:
-        w = _stationary(gramian, q, rho, support)
-        if w is not None and _optimal(gramian, q, rho, w):
-            return w
-    raise UnprovenError
-
-
-def _growing_supports(gramian: Matrix, q: Vector, rho: Number) -> Iterator[tuple[int, ...]]:
-    """Supports that take up the most violated view and let go of the most negative weight."""
-    size = len(gramian)
-    support = {min(range(size), key=lambda k: q[k])}
-    for _ in range(20 * size):
-        chosen = tuple(sorted(support))
-        yield chosen
-        w = _stationary(gramian, q, rho, chosen)
-        lowest = min(chosen, key=lambda k: w[k]) if w is not None else chosen[0]
-        if w is None or w[lowest] < 0:
-            support -= {lowest}
-        else:
-            slope = _slope(gramian, q, rho, w)
-            support |= {min(range(size), key=lambda k: slope[k])}
-        if not support:
-            return
-
-
-def _stationary(gramian: Matrix, q: Vector, rho: Number, support: Sequence[int]) -> Vector | None:
-    """Weights with q + rho G w / |g_w| = lambda on the support, adding up to 1."""
-    mp = require_mpmath().mp
-    size = len(gramian)
-    if len(support) == 1:
-        return [number(int(k == support[0])) for k in range(size)]
-    a = solve(gramian, support, [number(1)] * size)
-    p = solve(gramian, support, q)
-    if a is None or p is None:
-        return None
-    sum_a, sum_p = sum(a), sum(p)
-    square = sum_p**2 - sum_a * (dot([q[k] for k in support], [p[k] for k in support]) - rho**2)
-    if square <= 0:
-        return None
-    root = mp.sqrt(square)
-    level = (sum_p + root) / sum_a
-    return [(level * u - v) / root for u, v in zip(a, p, strict=True)]
-
-
-def _optimal(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> bool:
-    mp = require_mpmath().mp
-    if any(v < 0 for v in w):
-        return False
-    slope = _slope(gramian, q, rho, w)
-    level = dot(slope, w)
-    scale = max(abs(v) for v in slope)
-    return all(v >= level - scale * mp.mpf("1e-35") for v in slope)
-
-
-def _slope(gramian: Matrix, q: Vector, rho: Number, w: Vector) -> Vector:
-    length = require_mpmath().mp.sqrt(form(gramian, w))
-    return [a + rho * b / length for a, b in zip(q, apply(gramian, w), strict=True)]
 
 
 def imtl_g(question: Question) -> Vector:

@@ -102,12 +102,13 @@ def facts_of(exact: ExactCase, answer: Answer) -> Facts:
     gramian, views = exact.gramian, range(exact.case.views)
     norms = [mp.sqrt(gramian[k][k]) for k in views]
     cosines = [
-        [float(gramian[i][j] / norms[i] / norms[j]) if norms[i] * norms[j] else 0.0 for j in views]
+        [gramian[i][j] / norms[i] / norms[j] if norms[i] * norms[j] else mp.mpf(0) for j in views]
         for i in views
     ]
+    pairs = [[(float(c), float(c - float(c))) for c in row] for row in cosines]
     return Facts(
         norms=np.array([[float(n) for n in norms]]),
-        cosines=np.array([cosines]),
+        directions=np.array([pairs]),
         present=np.array([[bool(n > 0) for n in norms]]),
         weights=np.array([[float(w) for w in answer.weights]]),
         length=np.array([float(answer.length)]),

@@ -1,6 +1,7 @@
 """What operators share that give each gradient one weight."""
 
 from collections.abc import Callable
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,10 @@ from numpy.typing import NDArray
 from crossgrad_core.operator import OperatorContext
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+#: Unit roundoff of float32.
+FLOAT32: Final = 2.0**-24
 
 
 def weighting(weights: Floats) -> Floats:
@@ -20,10 +25,10 @@ def weighting(weights: Floats) -> Floats:
 
 def sharpened(
     weights: Floats,
-    doubtful: NDArray[np.bool_],
+    doubtful: Flags,
     gramians: Floats,
     context: OperatorContext,
-    exact: Callable[[Floats, Floats, NDArray[np.bool_]], Floats],
+    exact: Callable[[Floats, Floats, Flags], Floats],
 ) -> Floats:
     """Weights of which the doubtful ones are worked out anew, with twice the digits.
 
@@ -42,3 +47,27 @@ def sharpened(
         part = np.flatnonzero(doubtful)
         weights[part] = exact(gramians[part], context.remainders()[part], context.present[part])
     return weights
+
+
+class Kernel(Protocol):
+    """A kernel: Gramians, remainders, presence, True for 32 digits -> weights, which to doubt."""
+
+    def __call__(
+        self, gramians: Floats, remainders: Floats, present: Flags, exact: Literal[True] | None, /
+    ) -> tuple[Floats, Flags]: ...
+
+
+def with_digits(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
+    """Weights with as many digits as the gradients ask for.
+
+    That is 32 for gradients finer than float32, if their Gramians are known that well; else 16, and
+    32 where the kernel finds these doubtful.
+    """
+    if context.unit < FLOAT32 and context.remainders is not None:
+        return kernel(gramians, context.remainders(), context.present, True)[0]
+    weights, doubtful = kernel(gramians, np.zeros_like(gramians), context.present, None)
+
+    def exact(part: Floats, remainders: Floats, present: Flags) -> Floats:
+        return kernel(part, remainders, present, True)[0]
+
+    return sharpened(weights, doubtful, gramians, context, exact)

@@ -11,15 +11,16 @@ from typing_extensions import override
 from crossgrad_core.component import Selection
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import Flags, Floats, weighting, with_digits
 
 
 class CAGrad(Operator):
     """The direction near the mean that serves the worst-off view best.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
-    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views, all
-    supports for up to four, an active-set method above. A single view is left as it is.
+    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views; above, the
+    nearest point to g_0 of the polyhedron in which all views reach a level, by active sets, with 32
+    digits for gradients in float64. A single view is left as it is.
     """
 
     idle_at_one: ClassVar[bool] = True
@@ -49,7 +50,12 @@ class CAGrad(Operator):
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.simplex import cagrad
 
-        weights = cagrad(gramians, context.present, self.c)
+        def kernel(
+            part: Floats, remainders: Floats, present: Flags, exact: Literal[True] | None
+        ) -> tuple[Floats, Flags]:
+            return cagrad(part, remainders, present, exact, self.c)
+
+        weights = with_digits(kernel, gramians, context)
         several = context.present.sum(axis=1, keepdims=True) > 1
         scale = {"none": 1.0, "1+c": 1.0 / (1.0 + self.c), "1+c^2": 1.0 / (1.0 + self.c**2)}
         return weighting(weights * np.where(several, scale[self.rescale], 1.0)), state

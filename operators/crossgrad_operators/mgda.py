@@ -8,14 +8,14 @@ from typing_extensions import override
 
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_operators._weights import weighting, with_digits
 
 
 class MGDA(Operator):
     """The shortest convex combination of the gradients: min |sum w_k g_k|, w on the simplex.
 
-    Closed form on every face: all supports for up to four views, Wolfe's method above. |u| is at
-    most the shortest gradient's length; zero where the gradients oppose each other exactly.
+    Closed form for two views, Lawson and Hanson's active sets above, with 32 digits for gradients
+    in float64. |u| is at most the shortest gradient's length; zero where a convex combination is.
     """
 
     idle_at_one: ClassVar[bool] = True
@@ -30,4 +30,4 @@ class MGDA(Operator):
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.simplex import mgda
 
-        return weighting(mgda(gramians, context.present)), state
+        return weighting(with_digits(mgda, gramians, context)), state

@@ -8,13 +8,15 @@ from typing_extensions import override
 
 from crossgrad_core.operator import Operator, OperatorContext
 from crossgrad_core.state import PluginState
+from crossgrad_operators._weights import with_digits
 
 
 class UPGrad(Operator):
     """The mean of the gradients, each projected on the cone that conflicts with no gradient.
 
     For each k: v_k = argmin v^T G v subject to v >= e_k / K; u = sum of the v_k G. Two views: half
-    of `symmetric`. All active sets for up to four views, Lawson and Hanson's method above.
+    of `symmetric`. Closed form for two views, Lawson and Hanson's active sets above, with 32 digits
+    for gradients in float64.
     """
 
     idle_at_one: ClassVar[bool] = True
@@ -29,4 +31,4 @@ class UPGrad(Operator):
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.cone import upgrad
 
-        return upgrad(gramians, context.present), state
+        return with_digits(upgrad, gramians, context), state

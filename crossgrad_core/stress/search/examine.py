@@ -69,9 +69,9 @@ def examine(subject: Subject, batch: Batch) -> Examined:
 
 def facts_of(batch: Batch) -> Facts:
     """What sets are stated in, without the answers."""
-    norms, cosines = (each[..., 0] for each in batch.directions)
-    nothing = np.zeros(len(norms))
-    return Facts(norms, cosines, batch.present, np.zeros(norms.shape), nothing, batch.unit)
+    (norms, cosines), nothing = batch.directions, np.zeros(batch.present.shape)
+    unknown = np.zeros(len(norms))
+    return Facts(norms[..., 0], cosines, batch.present, nothing, unknown, batch.unit)
 
 
 def _ratio(facts: Facts, found: Floats) -> Floats:

@@ -27,6 +27,8 @@ _DEVIATION: Final = 1e-6
 _ERROR: Final = 1e-30
 #: The share of the unit roundoff that it may be.
 _SHARE: Final = 0.01
+#: Square of a label's sum, over that of its longest gradient, that GradNorm may take for zero.
+_CANCELS: Final = 1e-9
 #: Cosines that all pairs and that no pairs are below.
 _ALL, _NONE = 2.0, -2.0
 
@@ -99,6 +101,19 @@ def _confgate(batch: Batch, options: Options) -> Solved:
     return _projection(batch, _order(batch.views), limit=limit)
 
 
+def _balanced(batch: Batch, options: Options) -> Solved:
+    """GradNorm at its first step: the sum, unless the gradients of a label cancel."""
+    weights, trust = _sum(batch, options)
+    norms, cosines = (each[..., 0] for each in batch.directions)
+    gramians = cosines * norms[:, :, None] * norms[:, None, :]
+    labels = np.array(search_views(batch.views).labels)
+    for label in dict.fromkeys(labels.tolist()):
+        own = labels == label
+        square = np.einsum("bij->b", gramians[:, own][:, :, own])
+        trust = np.where(square > _CANCELS * norms[:, own].max(axis=1) ** 2, trust, -1.0)
+    return weights, trust
+
+
 def _factors(batch: Batch, power: float) -> Floats:
     """[K] (r / r_ref)^power: powers of two, which multiply without error."""
     return np.array(search_views(batch.views).ratios) ** power
@@ -128,7 +143,7 @@ def _cone(batch: Batch, *, apart: bool) -> Solved:
 QUICK: Final[Mapping[str, Quick]] = {
     "sum": _sum,
     "mean": _mean,
-    "gradnorm": _sum,
+    "gradnorm": _balanced,
     "preconditioner": _preconditioned,
     "symmetric": _symmetric,
     "anchors": _symmetric,
@@ -140,7 +155,7 @@ QUICK: Final[Mapping[str, Quick]] = {
     "chain": _chained,
     "upgrad": lambda batch, _options: _cone(batch, apart=True),
     "dualproj": lambda batch, _options: _cone(batch, apart=False),
-    "mgda": lambda batch, _options: convex.on_simplex(*batch.directions, batch.present, -1.0),
+    "mgda": lambda batch, _options: convex.shortest(*batch.directions, batch.present),
     "cagrad": lambda batch, options: convex.on_simplex(
         *batch.directions, batch.present, options["c"]
     ),

@@ -15,7 +15,7 @@ def _partners(order: Indices, places: Indices) -> Indices:
     position = np.full(order.shape[0], -1)
     for i in range(n):
         position[places[i]] = i
-    partners = np.empty((n, n - 1), np.int64)
+    partners = np.empty((n, max(n - 1, 0)), np.int64)
     for i in range(n):
         count = 0
         for j in order[places[i]]:

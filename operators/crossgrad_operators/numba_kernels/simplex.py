@@ -2,274 +2,281 @@
 
 Weights w on the simplex are held as x_k = w_k |g_k| / s, s the smallest norm, so that whatever the
 ratio of the norms the combination is sum x_k e_k with cosines alone, and the constraint reads
-sum_k r_k x_k = 1 with r_k = s / |g_k|. Both problems are
+sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor both methods ask for the nearest point of a
+polyhedron {x: x.e_k >= level r_k}:
 
-    minimise  q.x + rho sqrt(x^T C x)   (CAGrad)      or      x^T C x   (MGDA: q = 0)
-
-and on the face of a support S their minimum is known in closed form from C_SS^-1 r and C_SS^-1 q.
+- MGDA: its nearest point to 0 at any level is the direction of the shortest combination.
+- CAGrad: the direction d with the largest min_k g_k.d in the ball of radius rho about g_0 is the
+  nearest point to g_0 at the level at which that is as far away as rho.
 """
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
-from crossgrad_operators.numba_kernels.linear import solve
-from crossgrad_operators.numba_kernels.normal import (
-    OPPOSITE,
+import numpy as np
+
+from crossgrad_core.jit import strict_device, strict_kernel, strict_part
+from crossgrad_operators.numba_kernels.digits import (
+    Exact,
+    Pair,
+    Pairs,
+    at,
+    clear,
+    copy,
+    longest_of,
+    minus,
+    plus,
+    product,
+    products,
+    put,
+    quotient,
+    root,
+)
+from crossgrad_operators.numba_kernels.directions import (
     Flags,
     Floats,
-    Indices,
-    form,
-    normalised,
-    times,
+    Solved,
+    directions,
+    what_is_left,
+)
+from crossgrad_operators.numba_kernels.normal import OPPOSITE
+from crossgrad_operators.numba_kernels.polyhedron import (
+    ROUNDS,
+    Polyhedron,
+    approach,
+    forget,
+    is_settled,
+    polyhedron,
+    project,
+    share_left,
+    square,
+    substitute,
 )
 
-#: Up to this many gradients all supports are tried; above, they are found one by one.
-ENUMERATED = 4
-#: A multiplier counts as negative beyond this share of the objective's gradient.
-TOLERANCE = 1e-14
+#: Levels that are tried before the last one stands; a handful is usual.
+LEVELS = 60
+#: A level stands if the active constraints stay the same and it changes by no more than this share
+#: (or changes back): the next rounds take up what is left.
+CLOSE = 1e-6
+#: The share of rho^2 that the ridge adds to the distance from which on directions may cancel.
+HELD_BY_RIDGE = 1e-5
+#: A squared distance this close to another one is equal to it.
+TIE = 1e-9
+#: Smallest square of the sine between two gradients that are combined.
+PIVOT = 1e-15
 
 
-@njit(cache=True)
-def _value(cosines: Floats, q: Floats, rho: float, x: Floats) -> float:
-    square: float = max(form(x, cosines, x), 0.0)
-    if rho < 0.0:
-        return square
-    total: float = rho * np.sqrt(square)
-    for k in range(x.size):
-        total += q[k] * x[k]
-    return total
-
-
-@njit(cache=True)
-def _face(
-    cosines: Floats, r: Floats, q: Floats, rho: float, chosen: Indices, count: int, x: Floats
-) -> bool:
-    """Minimum on the affine hull of a support; False where there is none (rho < 0 is MGDA).
-
-    Stationarity q + rho C x / |x| = lambda r gives x = t (lambda a - p) with a = C^-1 r and
-    p = C^-1 q; |x| = rho t and r.x = 1 then fix lambda and t.
-    """
-    views = r.size
-    a = np.zeros(views)
-    p = np.zeros(views)
-    solve(cosines, chosen, count, r, a)
-    ra = 0.0
-    for i in range(count):
-        ra += r[chosen[i]] * a[chosen[i]]
-    x[:] = 0.0
-    if not ra > 0.0:
-        return False
-    if rho < 0.0:
-        for i in range(count):
-            x[chosen[i]] = a[chosen[i]] / ra
-        return True
-    solve(cosines, chosen, count, q, p)
-    rp = 0.0
-    qp = 0.0
-    for i in range(count):
-        rp += r[chosen[i]] * p[chosen[i]]
-        qp += q[chosen[i]] * p[chosen[i]]
-    root = rp * rp - ra * (qp - rho * rho)
-    if not root > 0.0:
-        return False
-    root = np.sqrt(root)
-    for i in range(count):
-        k = chosen[i]
-        x[k] = ((rp + root) / ra * a[k] - p[k]) / root
-    return True
-
-
-@njit(cache=True)
-def _by_enumeration(
-    cosines: Floats, r: Floats, q: Floats, rho: float, members: Indices, count: int
-) -> Floats:
-    """The best of all supports whose weights are not negative."""
-    chosen = np.empty(count, np.int64)
-    x = np.zeros(r.size)
-    found = np.zeros(r.size)
-    best = np.inf
-    for code in range(1, 1 << count):
-        size = 0
-        for i in range(count):
-            if code >> i & 1:
-                chosen[size] = members[i]
-                size += 1
-        if size == 1:
-            x[:] = 0.0
-            x[chosen[0]] = 1.0 / r[chosen[0]]
-        elif not _face(cosines, r, q, rho, chosen, size, x):
-            continue
-        feasible = True
-        for i in range(size):
-            feasible &= x[chosen[i]] >= 0.0
-        if feasible:
-            value = _value(cosines, q, rho, x)
-            if value < best:
-                best = value
-                found[:] = x
-    return found
-
-
-@njit(cache=True)
-def _entering(
-    cosines: Floats, r: Floats, q: Floats, rho: float, active: Flags, present: Flags, x: Floats
-) -> int:
-    """The view whose weight should grow most, -1 at the minimum."""
-    views = r.size
-    length = np.sqrt(max(form(x, cosines, x), 0.0))
-    if length == 0.0:
-        return -1
-    factor = 1.0 if rho < 0.0 else rho / length
-    slope = np.zeros(views)
-    level = 0.0
-    scale = 0.0
-    for k in range(views):
-        slope[k] = factor * times(cosines, k, x) + (0.0 if rho < 0.0 else q[k])
-        level += slope[k] * x[k]
-        scale = max(scale, abs(slope[k]))
-    worst, entering = -TOLERANCE * scale, -1
-    for k in range(views):
-        if present[k] and not active[k] and slope[k] - level * r[k] < worst:
-            worst, entering = slope[k] - level * r[k], k
-    return entering
-
-
-@njit(cache=True)
-def _by_active_set(cosines: Floats, r: Floats, q: Floats, rho: float, present: Flags) -> Floats:
-    """Wolfe's method: supports grow by the best view and shrink where a weight meets zero.
-
-    The objective falls with every support, so that none comes twice; the optimality conditions hold
-    to `TOLERANCE` at the end.
-    """
-    views = r.size
-    active = np.zeros(views, np.bool_)
-    chosen = np.empty(views, np.int64)
-    x = np.zeros(views)
-    trial = np.zeros(views)
-    best = np.inf
-    start = -1
-    for k in range(views):
+@strict_device
+def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
+    """Fills r_k = s / |g_k|, zero for views that are not present."""
+    shortest = -1
+    for k in range(present.size):
+        if present[k] and (shortest < 0 or norms[k, 0] < norms[shortest, 0]):
+            shortest = k
+    clear(r)
+    for k in range(present.size):
         if present[k]:
-            trial[:] = 0.0
-            trial[k] = 1.0 / r[k]
-            value = _value(cosines, q, rho, trial)
-            if value < best:
-                best, start = value, k
-    x[start] = 1.0 / r[start]
-    active[start] = True
-    for _ in range(10 * views):
-        entering = _entering(cosines, r, q, rho, active, present, x)
-        if entering < 0:
-            break
-        before = _value(cosines, q, rho, x)
-        kept, kept_active = x.copy(), active.copy()
-        active[entering] = True
-        _settle(cosines, r, q, rho, active, chosen, x, trial)
-        if not _value(cosines, q, rho, x) < before:
-            # Rounding has the last word: no further progress is possible.
-            x[:] = kept
-            active[:] = kept_active
-            break
-    return x
+            put(r, k, quotient(at(norms, shortest), at(norms, k), exact))
 
 
-@njit(cache=True)
-def _settle(
-    cosines: Floats,
-    r: Floats,
-    q: Floats,
-    rho: float,
-    active: Flags,
-    chosen: Indices,
-    x: Floats,
-    trial: Floats,
-) -> None:
-    """Goes to the minimum of the active face, dropping views whose weight meets zero."""
-    views = r.size
-    while True:
-        count = 0
-        for k in range(views):
-            if active[k]:
-                chosen[count] = k
-                count += 1
-        if count == 1:
-            trial[:] = 0.0
-            trial[chosen[0]] = 1.0 / r[chosen[0]]
-        elif not _face(cosines, r, q, rho, chosen, count, trial):
-            return
-        step, leaving = 1.0, -1
-        for i in range(count):
-            k = chosen[i]
-            if trial[k] <= 0.0 and x[k] - trial[k] > 0.0:
-                share = x[k] / (x[k] - trial[k])
-                if share < step:
-                    step, leaving = share, k
-        for k in range(views):
-            x[k] += step * (trial[k] - x[k])
-        if leaving < 0:
-            return
-        x[leaving] = 0.0
-        active[leaving] = False
+@strict_device
+def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
+    """Fills x [2] with the shortest of the two gradients and their combinations."""
+    one, other = r[0, 0], r[1, 0]
+    x[0, 0], x[1, 0] = 1.0 / one, 0.0
+    best = x[0, 0] * x[0, 0]
+    if (1.0 / other) * (1.0 / other) < best:
+        x[0, 0], x[1, 0] = 0.0, 1.0 / other
+        best = x[1, 0] * x[1, 0]
+    pivot = np.sqrt(max(1.0 - cosine * cosine, PIVOT))
+    second = (other - cosine * one) / pivot / pivot
+    first = one - cosine * second
+    level = one * first + other * second
+    if level > 0.0:
+        first, second = first / level, second / level
+        if first >= 0.0 and second >= 0.0:
+            length = first * (first + cosine * second) + second * (cosine * first + second)
+            if max(length, 0.0) < best:
+                x[0, 0], x[1, 0] = first, second
 
 
-@njit(cache=True)
-def _minimum(
-    cosines: Floats,
-    r: Floats,
-    q: Floats,
-    rho: float,
-    members: Indices,
-    count: int,
-    present: Flags,
-) -> Floats:
-    if count <= ENUMERATED:
-        return _by_enumeration(cosines, r, q, rho, members, count)
-    return _by_active_set(cosines, r, q, rho, present)
+@strict_part
+def _shortest(problem: Polyhedron, x: Pairs) -> float:
+    """Fills x and returns the share of it that is not rounding noise; heights are r."""
+    exact, r = problem.rounding.exact, problem.heights
+    if len(x) == 2 and exact is None and r[0, 0] > 0.0 and r[1, 0] > 0.0:
+        _mgda_pair(problem.cosines[0, 1, 0], r, x)
+    else:
+        project(problem)
+        total = products(problem.y, r, 0, len(x), exact)
+        for k in range(len(x)):
+            put(x, k, quotient(at(problem.y, k), total, exact))
+    return what_is_left(problem, x)
 
 
-@njit(cache=True)
-def _is_noise(cosines: Floats, x: Floats) -> bool:
-    largest = np.abs(x).max()
-    return bool(form(x, cosines, x) <= 2.0 * OPPOSITE * largest * largest)
-
-
-@njit(cache=True)
-def mgda(gramians: Floats, present: Flags) -> Floats:
+@strict_kernel
+def mgda(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -> Solved:
     """[B, K] weights of the shortest convex combination; zero where that is zero to rounding."""
     blocks, views, _ = gramians.shape
-    result = np.zeros((blocks, views))
-    norms, cosines = np.empty(views), np.empty((views, views))
-    members = np.empty(views, np.int64)
-    r, q = np.zeros(views), np.zeros(views)
+    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    problem = polyhedron(views, exact)
+    norms, x = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        normalised(gramians[b], present[b], norms, cosines)
-        count = _reciprocals(norms, present[b], members, r)
-        if count == 0:
+        if directions(gramians[b], remainders[b], present[b], norms, problem) == 0:
             continue
-        x = _minimum(cosines, r, q, -1.0, members, count, present[b])
-        if not _is_noise(cosines, x):
-            for k in range(views):
-                result[b, k] = x[k] * r[k]
-    return result
+        _reciprocals(norms, present[b], problem.heights, exact)
+        problem.doubtful[0] = False
+        share = _shortest(problem, x)
+        for k in range(views):
+            result[b, k] = product(at(x, k), at(problem.heights, k), exact)[0] * share
+        doubtful[b] = problem.doubtful[0]
+    return result, doubtful
 
 
-@njit(cache=True)
-def _reciprocals(norms: Floats, present: Flags, members: Indices, r: Floats) -> int:
-    """Fills r_k = s / |g_k| and the members; returns their number."""
-    count = 0
-    shortest = np.inf
-    for k in range(present.size):
-        r[k] = 0.0
-        if present[k]:
-            members[count] = k
-            count += 1
-            shortest = min(shortest, norms[k])
+class Search(NamedTuple):
+    """What CAGrad looks for: the level at which the nearest point to g_0 is at distance rho.
+
+    Attributes:
+        q: [K] e_k.g_0.
+        r: [K] s / |g_k|.
+        rho: Square of the distance, and the distance.
+    """
+
+    q: Pairs
+    r: Pairs
+    rho: tuple[Pair, Pair]
+
+
+@strict_device
+def _limits(search: Search) -> tuple[float, float]:
+    """Levels below which no constraint is active, and at which a single one is as far as rho."""
+    low, high = np.inf, np.inf
+    for k in range(len(search.r)):
+        q, r = search.q[k, 0], search.r[k, 0]
+        if r > 0.0:
+            low, high = min(low, q / r), min(high, (q + search.rho[1][0]) / r)
+    return low, high
+
+
+@strict_device
+def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge: float) -> Pair:
+    """Change of the level that brings the nearest point to distance rho on the active face.
+
+    With the slope a = C^-1 r of the multipliers the square of the distance is a quadratic function
+    of the change. Infinite where no constraint is active, or the rounding of huge multipliers
+    leaves nothing of the distance.
+    """
+    exact, slope = problem.rounding.exact, problem.step
+    substitute(problem, count, search.r, slope)
+    gap, along, across = search.rho[0], (0.0, 0.0), (0.0, 0.0)
     for i in range(count):
-        r[members[i]] = shortest / norms[members[i]]
-    return count
+        k = problem.chosen[i]
+        y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
+        # C y and C a on the active face, where C y + q - level r + ridge (y - centre) = 0.
+        pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
+        force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
+        turn = minus(r, (ridge * a[0], ridge * a[1]), exact)
+        gap = minus(gap, product(y, force, exact), exact)
+        along = plus(along, product(y, turn, exact), exact)
+        across = plus(across, product(a, turn, exact), exact)
+    if not along[0] > 0.0:
+        return (-np.inf, 0.0) if count > 0 else (np.inf, 0.0)
+    under = plus(product(along, along, exact), product(across, gap, exact), exact)
+    return quotient(gap, plus(along, root(under, exact), exact), exact)
 
 
-@njit(cache=True)
+@strict_device
+def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
+    """Whether the ridge alone holds the multipliers: what they add up to is their rounding."""
+    total = 0.0
+    for k in range(len(search.r)):
+        moved = problem.y[k, 0] - problem.centre[k, 0]
+        total += moved * moved
+    return problem.rounding.ridge * total > 2.0 * search.rho[0][0]
+
+
+@strict_device
+def _repeats(problem: Polyhedron, before: Flags) -> bool:
+    """Whether the active constraints are those noted last; notes them."""
+    same = True
+    for k in range(before.size):
+        same &= before[k] == problem.active[k]
+        before[k] = problem.active[k]
+    return same
+
+
+@strict_part
+def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
+    """The level at which the nearest point is at distance rho, and its multipliers.
+
+    The distance is a convex, increasing function of the level, of which one piece after the other
+    is solved; where that leaves the interval that holds the solution, it is halved instead.
+    """
+    exact, before = problem.rounding.exact, np.zeros(problem.active.size, np.bool_)
+    low, high = _limits(search)
+    high += 1e-9 * (high - low)
+    solved, last = False, 0.0
+    for _ in range(LEVELS):
+        for k in range(len(search.r)):
+            put(problem.heights, k, product(level, at(search.r, k), exact))
+        count = approach(problem)
+        same = _repeats(problem, before) and solved
+        change = _change(problem, count, search, level, ridge)
+        if _is_beyond_reach(problem, search):
+            change = (-np.inf, 0.0)
+        if change[0] <= 0.0:
+            high = level[0]
+        else:
+            low = level[0]
+        if same and (abs(change[0]) <= CLOSE * abs(level[0]) or change[0] * last < 0.0):
+            break
+        last = change[0] if same else 0.0
+        solved = low <= level[0] + change[0] <= high
+        level = plus(level, change, exact) if solved else (0.5 * (low + high), 0.0)
+    return level
+
+
+@strict_device
+def _reach(problem: Polyhedron, search: Search) -> None:
+    """Raises the level of all constraints until the nearest point is as far away as rho."""
+    forget(problem)
+    level = (_limits(search)[1], 0.0)
+    for turn in range(ROUNDS):
+        copy(problem.y, problem.centre)
+        # In the first round the ridge counts as part of the directions: nothing cancels then.
+        ridge = problem.rounding.ridge if turn > 0 else 0.0
+        level = _find_level(problem, search, level, ridge)
+        if is_settled(problem) or share_left(problem, problem.y) == 0.0:
+            return
+
+
+@strict_part
+def _defined(problem: Polyhedron, search: Search) -> float:
+    """The share of CAGrad's direction that is defined; forgets no multipliers.
+
+    It is not where 0 is a convex combination of the gradients, so that no level above 0 can be
+    reached, and level 0 is within the distance: then all directions of a whole set are as good.
+    """
+    largest, rho = 0.0, search.rho[0][0]
+    for k in range(len(search.r)):
+        largest = max(largest, problem.y[k, 0])
+    if problem.rounding.ridge * largest * largest <= HELD_BY_RIDGE * rho:
+        return 1.0
+    base, y = problem.base.copy(), problem.y.copy()
+    clear(problem.base)
+    copy(search.r, problem.heights)
+    project(problem)
+    share = share_left(problem, problem.y)
+    copy(base, problem.base)
+    if share < 1.0:
+        clear(problem.heights)
+        project(problem)
+        if square(problem, problem.y)[0] >= (1.0 - TIE) * rho:
+            share = 1.0
+    copy(y, problem.y)
+    return share
+
+
+@strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
     """Weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of the two), for 1 = n1 >= n2.
 
@@ -297,51 +304,99 @@ def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, 
     return x, length, mean
 
 
-@njit(cache=True)
-def cagrad(gramians: Floats, present: Flags, c: float) -> Floats:
+@strict_part
+def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
+    """Fills the weights [2] of two gradients."""
+    i, j = (0, 1) if norms[0, 0] >= norms[1, 0] else (1, 0)
+    longest = norms[i, 0]
+    share, length, mean = _cagrad_pair(1.0, norms[j, 0] / longest, cosine, c)
+    if length > 0.0:
+        factor = c * mean / length
+        result[i] = 0.5 + factor * share
+        result[j] = 0.5 + factor * (1.0 - share)
+
+
+@strict_device
+def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
+    """The search from the mean, in units of the longest gradient; r are the heights so far."""
+    exact, views = problem.rounding.exact, len(norms)
+    longest, count = longest_of(norms)
+    r = np.empty((views, 2))
+    copy(problem.heights, r)
+    for k in range(views):
+        part = quotient(at(norms, k), longest, exact)
+        put(problem.base, k, quotient(part, (count, 0.0), exact))
+    for k in range(views):
+        put(q, k, products(problem.cosines[k], problem.base, 0, views, exact))
+    mean = square(problem, problem.base)
+    rho = product((c, 0.0), root(mean, exact), exact)
+    return Search(q, r, (product(rho, rho, exact), rho))
+
+
+@strict_part
+def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
+    """Fills the weights [K] of at least two gradients; q is room to work in.
+
+    Where the mean, or a convex combination of the gradients, vanishes the direction is undefined,
+    and zero by convention.
+    """
+    exact, views = problem.rounding.exact, len(norms)
+    search = _set_out(problem, norms, q, c)
+    share = share_left(problem, problem.base)
+    if share > 0.0:
+        _reach(problem, search)
+        share *= share_left(problem, problem.y) * _defined(problem, search)
+    if share == 0.0:
+        return
+    longest, count = longest_of(norms)
+    factor = quotient(search.rho[1], root(square(problem, problem.y), exact), exact)
+    for k in range(views):
+        if norms[k, 0] > 0.0:
+            added = product(factor, at(problem.y, k), exact)
+            total = plus(at(problem.base, k), added, exact)
+            weight = product(total, quotient(longest, at(norms, k), exact), exact)
+            result[k] = share * weight[0] * count / views
+
+
+@strict_device
+def _least_cosine(problem: Polyhedron) -> float:
+    """The smallest cosine between two views that are present."""
+    least, cosines = 1.0, problem.cosines
+    for i in range(len(cosines)):
+        for j in range(i):
+            if cosines[i, i, 0] > 0.0 and cosines[j, j, 0] > 0.0:
+                least = min(least, cosines[i, j, 0])
+    return least
+
+
+@strict_device
+def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
+    """Fills the weights [K] of one block; the heights are r."""
+    views, exact = len(norms), problem.rounding.exact
+    _, count = longest_of(norms)
+    cosine = _least_cosine(problem)
+    opposite = count == 2 and 1.0 + cosine <= OPPOSITE
+    if count <= 1 or c == 0.0 or opposite:
+        share = max(1.0 - c, 0.0) if opposite else 1.0
+        for k in range(views):
+            result[k] = share / views if norms[k, 0] > 0.0 else 0.0
+    elif views == 2 and exact is None:
+        _cagrad_two(norms, cosine, c, result)
+    else:
+        _cagrad_many(problem, norms, q, c, result)
+
+
+@strict_kernel
+def cagrad(gramians: Floats, remainders: Floats, present: Flags, exact: Exact, c: float) -> Solved:
     """[B, K] weights 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
     blocks, views, _ = gramians.shape
-    result = np.zeros((blocks, views))
-    norms, cosines = np.empty(views), np.empty((views, views))
-    members = np.empty(views, np.int64)
-    r, q = np.zeros(views), np.zeros(views)
+    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    problem = polyhedron(views, exact)
+    norms, q = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        normalised(gramians[b], present[b], norms, cosines)
-        count = _reciprocals(norms, present[b], members, r)
-        if count == 0:
-            continue
-        if count == 1 or c == 0.0:
-            for i in range(count):
-                result[b, members[i]] = 1.0 / views
-            continue
-        longest = norms.max()
-        if count == 2:
-            i, j = members[0], members[1]
-            if norms[i] < norms[j]:
-                i, j = j, i
-            if 1.0 + cosines[i, j] <= OPPOSITE:
-                result[b, i] = result[b, j] = max(1.0 - c, 0.0) / views
-                continue
-            n1, n2 = norms[i] / longest, norms[j] / longest
-            share, length, mean = _cagrad_pair(n1, n2, cosines[i, j], c)
-            if length > 0.0:
-                # The mean is over K views; that over the two present ones is K / 2 times longer.
-                factor = c * mean / length
-                result[b, i] = (0.5 + factor * share) * 2.0 / views
-                result[b, j] = (0.5 + factor * (1.0 - share)) * 2.0 / views
-            continue
-        lengths = norms / longest / count
-        for k in range(views):
-            q[k] = times(cosines, k, lengths)
-        mean = np.sqrt(max(form(lengths, cosines, lengths), 0.0))
-        x = _minimum(cosines, r, q, c * mean, members, count, present[b])
-        length = np.sqrt(max(form(x, cosines, x), 0.0))
-        # Where a convex combination vanishes the direction is undefined, and zero by convention.
-        if _is_noise(cosines, x):
-            continue
-        for i in range(count):
-            k = members[i]
-            added = c * mean * x[k] / length if mean > 0.0 else 0.0
-            total = lengths[k] + added
-            result[b, k] = total * (longest / norms[k]) * count / views
-    return result
+        if directions(gramians[b], remainders[b], present[b], norms, problem) > 0:
+            problem.doubtful[0] = False
+            _reciprocals(norms, present[b], problem.heights, exact)
+            _cagrad(problem, norms, q, c, result[b])
+            doubtful[b] = problem.doubtful[0]
+    return result, doubtful

@@ -52,27 +52,3 @@ def test_soft_at_strength_zero_is_sum(ask):
     for rows in pairs():
         present = rows.any(axis=1)
         np.testing.assert_array_equal(ask(weak, rows).weights, present.astype(float))
-
-
-@pytest.mark.parametrize("views", [3, 4, 6])
-def test_enumeration_and_active_sets_find_the_same_minimum(views):
-    from crossgrad_operators.numba_kernels import cone, simplex
-
-    rng = np.random.default_rng(views)
-    norms, cosines = np.empty(views), np.empty((views, views))
-    for _ in range(50):
-        rows = rng.standard_normal((views, 7)) * 10.0 ** rng.uniform(-3, 3, (views, 1))
-        present = np.ones(views, bool)
-        simplex.normalised(rows @ rows.T, present, norms, cosines)
-        members = np.arange(views)
-        r = norms.min() / norms
-        q = cosines @ (norms / norms.max() / views)
-        for rho in (-1.0, 0.3):
-            one = simplex._by_enumeration(cosines, r, q, rho, members, views)
-            other = simplex._by_active_set(cosines, r, q, rho, present)
-            np.testing.assert_allclose(one, other, atol=1e-9 * abs(one).max())
-        one, other = np.empty(views), np.empty(views)
-        b = np.eye(views)[0]
-        cone._by_enumeration(cosines, members, views, b, one)
-        cone._by_active_set(cosines, members, views, b, other)
-        np.testing.assert_allclose(one, other, atol=1e-9 * abs(one).max())

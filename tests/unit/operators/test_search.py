@@ -1,6 +1,7 @@
 """The search for the worst gradients finds what it should, and finds it again."""
 
 import json
+from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -12,6 +13,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.operator import Operator
 from crossgrad_core.stress.case import short
 from crossgrad_core.stress.exact import exact_gramian
+from crossgrad_core.stress.promises import PROMISES
 from crossgrad_core.stress.reference import answer
 from crossgrad_core.stress.search.batch import Batch, results, search_views
 from crossgrad_core.stress.search.examine import examine
@@ -103,6 +105,18 @@ def test_an_operator_without_a_reference_must_scale_with_the_gradients():
 
 def test_the_right_operator_keeps_every_promise():
     assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
+
+
+@pytest.mark.parametrize("name", sorted(QUICK))
+def test_a_short_search_finds_nothing_outside_what_is_stated(name):
+    (tally, wide) = search([subject_of(name, made(name))], Extent(seed=1, rounds=16))
+    assert not tally.failures and not wide.failures
+
+
+def test_what_is_stated_is_what_the_page_says():
+    page = (Path(__file__).parents[3] / "docs" / "operators.md").read_text(encoding="utf-8")
+    for name, promise in PROMISES.items():
+        assert f"| {name} | " in page and f" | {promise.factor_words} |" in page
 
 
 def test_a_longer_search_begins_with_the_cases_of_a_shorter_one():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crossgrad_core.jit import strict_kernel
+from crossgrad_core.jit import strict_kernel, strict_part
 from crossgrad_core.stress.search.numba_kernels.convex import NOISE, Solved
 from crossgrad_core.stress.search.numba_kernels.doubled import (
     Flags,
@@ -12,7 +12,6 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     at,
     divide,
     entry,
-    inner,
     minus,
     multiply,
     root,
@@ -33,9 +32,11 @@ OPPOSITE = 1e-12
 #: Sweeps of Jacobi's method.
 SWEEPS = 40
 EPSILON = 2.220446049250313e-16
+#: Share of the largest eigenvalue that is nothing, before it is too small to be divided by.
+NEGLIGIBLE = 1e-100
 
 
-@inner
+@strict_part
 def _bargain(cosines: Floats, present: Flags, beta: Floats) -> bool:
     """C beta = 1 / beta for beta > 0 by damped Newton in log beta; False if it does not end."""
     views = beta.shape[0]
@@ -68,7 +69,7 @@ def _bargain(cosines: Floats, present: Flags, beta: Floats) -> bool:
     return False
 
 
-@inner
+@strict_part
 def _geometric_mean(norms: Floats, present: Flags) -> Pair:
     """The n-th root of a product of norms."""
     members = places(present)
@@ -144,19 +145,22 @@ def imtl_g(norms_of: Floats, cosines_of: Floats, present: Flags) -> Solved:
     return weights, trust
 
 
-@inner
+@strict_part
 def _eigen(matrix: Floats, vectors: Floats) -> None:
     """Jacobi's method: the matrix [n, n, 2] becomes diagonal, vectors [n, n, 2] are columns."""
     n = matrix.shape[0]
     vectors[:] = 0.0
     for i in range(n):
         vectors[i, i, 0] = 1.0
+    least = 0.0
+    for i in range(n):
+        least = max(least, NEGLIGIBLE * matrix[i, i, 0])
     for _ in range(SWEEPS):
         rotated = False
         for p in range(n - 1):
             for q in range(p + 1, n):
                 size = np.sqrt(max(matrix[p, p, 0], 0.0)) * np.sqrt(max(matrix[q, q, 0], 0.0))
-                if matrix[p, q, 0] == 0.0 or abs(matrix[p, q, 0]) <= 1e-31 * size:
+                if abs(matrix[p, q, 0]) <= max(1e-31 * size, least):
                     matrix[p, q] = 0.0
                     matrix[q, p] = 0.0
                     continue
@@ -166,7 +170,7 @@ def _eigen(matrix: Floats, vectors: Floats) -> None:
             break
 
 
-@inner
+@strict_part
 def _rotate(matrix: Floats, vectors: Floats, p: int, q: int) -> None:
     """Makes the entry p, q zero."""
     one, apq = (1.0, 0.0), entry(matrix, p, q)
@@ -226,7 +230,7 @@ def aligned(norms_of: Floats, cosines_of: Floats, present: Flags) -> Solved:
     return weights, trust
 
 
-@inner
+@strict_part
 def _levelled(
     matrix: Floats, vectors: Floats, cosines: Floats, members: Floats, weights: Floats
 ) -> float:

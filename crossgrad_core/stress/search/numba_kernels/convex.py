@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.jit import strict_kernel
+from crossgrad_core.jit import strict_kernel, strict_part
 from crossgrad_core.stress.search.numba_kernels.doubled import (
     Flags,
     Floats,
@@ -19,7 +19,6 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     at,
     divide,
     entry,
-    inner,
     minus,
     multiply,
     root,
@@ -34,25 +33,42 @@ from crossgrad_core.stress.search.numba_kernels.linear import (
 
 Solved: TypeAlias = tuple[Floats, NDArray[np.float64]]
 
-#: What exactly opposite directions leave, as a share of the largest coefficient squared.
+#: What two opposite directions leave, as a share of the largest coefficient squared.
 NOISE = 2e-12
+#: 1 + cos up to which two directions are opposite.
+OPPOSITE = 1e-12
+#: What 32 digits leave of a sum of more directions that is zero; up to `UNSURE` nobody knows.
+VANISHED, UNSURE = 1e-28, 1e-24
 #: Steps of CAGrad's one-dimensional search.
 STEPS = 60
 
 
-@inner
-def _is_noise(cosines: Floats, x: Floats) -> bool:
+@strict_part
+def _is_pair(cosines: Floats) -> bool:
+    count = 0
+    for k in range(cosines.shape[0]):
+        count += int(cosines[k, k, 0] > 0.0)
+    return count <= 2
+
+
+@strict_part
+def _zero(cosines: Floats, x: Floats, trust: float) -> tuple[bool, float]:
+    """Whether sum x_k e_k is zero, and the trust in that: -1 where these digits do not tell."""
     size = largest(x)
-    return form(cosines, x)[0] <= NOISE * size * size
+    square, scale = form(cosines, x)[0], size * size
+    if _is_pair(cosines):
+        return square <= NOISE * scale, trust
+    unsure = VANISHED * scale < square <= UNSURE * scale
+    return square <= VANISHED * scale, -1.0 if unsure else trust
 
 
-@inner
+@strict_part
 def _times(matrix: Floats, x: Floats, out: Floats) -> None:
     for k in range(x.shape[0]):
         out[k, 0], out[k, 1] = dot(matrix[k], x)
 
 
-@inner
+@strict_part
 def _projection(cosines: Floats, b: Floats, present: Flags, z: Floats) -> float:
     """Coefficients z of the projection of sum b_k e_k on {x: x.e_l >= 0}; zero where noise."""
     offset = np.empty((b.shape[0], 2))
@@ -60,7 +76,8 @@ def _projection(cosines: Floats, b: Floats, present: Flags, z: Floats) -> float:
     trust = complementary(cosines, offset, present, z)
     for k in range(b.shape[0]):
         z[k, 0], z[k, 1] = add(at(z, k), at(b, k))
-    if _is_noise(cosines, z):
+    zero, trust = _zero(cosines, z, trust)
+    if zero:
         z[:] = 0.0
     return trust
 
@@ -91,7 +108,7 @@ def on_cone(norms_of: Floats, cosines_of: Floats, present: Flags, apart: bool) -
     return weights, trust
 
 
-@inner
+@strict_part
 def _reciprocals(norms: Floats, present: Flags, r: Floats) -> int:
     """Fills r_k = s / |g_k|, s the smallest norm; returns the number of present views."""
     shortest, count = np.inf, 0
@@ -106,7 +123,7 @@ def _reciprocals(norms: Floats, present: Flags, r: Floats) -> int:
     return count
 
 
-@inner
+@strict_part
 def _shortest(cosines: Floats, r: Floats, present: Flags, x: Floats) -> float:
     """The shortest sum of x_k e_k with x >= 0 and r.x = 1.
 
@@ -125,7 +142,7 @@ def _shortest(cosines: Floats, r: Floats, present: Flags, x: Floats) -> float:
     return trust
 
 
-@inner
+@strict_part
 def _lowest(q: Floats, r: Floats, present: Flags) -> int:
     """The view that g_0 serves worst."""
     lowest = -1
@@ -135,7 +152,7 @@ def _lowest(q: Floats, r: Floats, present: Flags) -> int:
     return lowest
 
 
-@inner
+@strict_part
 def _worst_off(
     cosines: Floats, r: Floats, q: Floats, rho: Pair, present: Flags, y: Floats, vanishes: bool
 ) -> float:
@@ -158,7 +175,7 @@ def _worst_off(
             return trust
         length = root(form(cosines, y))
         gap = add(length, minus(rho))
-        if vanishes and step == 0 and gap[0] <= 0.0:
+        if vanishes and step == 0 and gap[0] < -1e-20 * rho[0]:
             y[:] = 0.0
             return trust
         if abs(gap[0]) <= 1e-28 * rho[0] or (step > 1 and abs(gap[0]) >= last):
@@ -173,36 +190,75 @@ def _worst_off(
 
 
 @strict_kernel
-def on_simplex(norms_of: Floats, cosines_of: Floats, present: Flags, c: float) -> Solved:
-    """CAGrad: g_0 + v with v the best of length c |g_0|; MGDA for c < 0; zero where it is noise."""
+def shortest(norms_of: Floats, cosines_of: Floats, present: Flags) -> Solved:
+    """MGDA: the shortest convex combination."""
     blocks, views = present.shape
     weights = np.zeros((blocks, views, 2))
     trust = np.ones(blocks)
-    r, q, x = np.empty((views, 2)), np.empty((views, 2)), np.empty((views, 2))
-    lengths, y = np.empty((views, 2)), np.zeros((views, 2))
+    r, x = np.empty((views, 2)), np.empty((views, 2))
+    for block in range(blocks):
+        cosines = cosines_of[block]
+        if _reciprocals(norms_of[block], present[block], r) == 0:
+            continue
+        zero, trust[block] = _zero(cosines, x, _shortest(cosines, r, present[block], x))
+        for k in range(views):
+            if not zero:
+                weights[block, k, 0], weights[block, k, 1] = multiply(at(x, k), at(r, k))
+    return weights, trust
+
+
+@strict_part
+def _conflict_averse(
+    cosines: Floats, lengths: Floats, r: Floats, present: Flags, c: float, y: Floats
+) -> float:
+    """Coefficients y of what CAGrad adds to g_0 = sum l_k e_k, or -l where the result is zero."""
+    views = r.shape[0]
+    q, x = np.empty((views, 2)), np.empty((views, 2))
+    zero, trust = _zero(cosines, lengths, _shortest(cosines, r, present, x))
+    vanishes, trust = _zero(cosines, x, trust)
+    if not zero:
+        _times(cosines, lengths, q)
+        rho = multiply((c, 0.0), root(form(cosines, lengths)))
+        trust = min(trust, _worst_off(cosines, r, q, rho, present, y, vanishes))
+        zero, trust = _zero(cosines, y, trust)
+    if zero:
+        for k in range(views):
+            y[k, 0], y[k, 1] = minus(at(lengths, k))
+    return trust
+
+
+@strict_part
+def _pair_cosine(cosines: Floats) -> float:
+    """The cosine of the only two directions; 1 if there are more."""
+    if not _is_pair(cosines):
+        return 1.0
+    least = 1.0
+    for i in range(cosines.shape[0]):
+        for j in range(i):
+            if cosines[i, i, 0] > 0.0 and cosines[j, j, 0] > 0.0:
+                least = cosines[i, j, 0]
+    return least
+
+
+@strict_kernel
+def on_simplex(norms_of: Floats, cosines_of: Floats, present: Flags, c: float) -> Solved:
+    """CAGrad: g_0 + v, v the best of length c |g_0|; of two that are opposite v = -c g_0."""
+    blocks, views = present.shape
+    weights = np.zeros((blocks, views, 2))
+    trust = np.ones(blocks)
+    r, lengths, y = np.empty((views, 2)), np.empty((views, 2)), np.empty((views, 2))
     for block in range(blocks):
         norms, cosines = norms_of[block], cosines_of[block]
         count = _reciprocals(norms, present[block], r)
-        if count == 0:
-            continue
-        trust[block] = _shortest(cosines, r, present[block], x)
-        vanishes = _is_noise(cosines, x)
-        if c < 0.0:
-            for k in range(views):
-                if not vanishes:
-                    weights[block, k, 0], weights[block, k, 1] = multiply(at(x, k), at(r, k))
-            continue
-        unit = multiply((largest(norms), 0.0), (float(count), 0.0))
+        unit = multiply((largest(norms), 0.0), (float(max(count, 1)), 0.0))
         for k in range(views):
             lengths[k, 0], lengths[k, 1] = divide(at(norms, k), unit)
             y[k, 0], y[k, 1] = 0.0, 0.0
-        _times(cosines, lengths, q)
-        rho = multiply((c, 0.0), root(form(cosines, lengths)))
-        if count > 1 and rho[0] > 0.0:
-            found = _worst_off(cosines, r, q, rho, present[block], y, vanishes)
-            trust[block] = min(trust[block], found)
-            if vanishes and _is_noise(cosines, y):
-                continue
+        if 1.0 + _pair_cosine(cosines) <= OPPOSITE:
+            for k in range(views):
+                y[k, 0], y[k, 1] = multiply((-min(c, 1.0), 0.0), at(lengths, k))
+        elif count > 1:
+            trust[block] = _conflict_averse(cosines, lengths, r, present[block], c, y)
         for k in range(views):
             if present[block, k]:
                 total = add(at(lengths, k), at(y, k))

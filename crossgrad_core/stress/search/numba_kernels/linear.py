@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from crossgrad_core.jit import strict_part
 from crossgrad_core.stress.search.numba_kernels.doubled import (
     Flags,
     Floats,
@@ -11,7 +12,6 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     at,
     divide,
     entry,
-    inner,
     minus,
     multiply,
     root,
@@ -24,7 +24,7 @@ SINGULAR = 1e-27
 TOLERANCE = 1e-25
 
 
-@inner
+@strict_part
 def dot(a: Floats, b: Floats) -> Pair:
     """a.b of vectors [N, 2]."""
     total = (0.0, 0.0)
@@ -34,7 +34,7 @@ def dot(a: Floats, b: Floats) -> Pair:
     return total
 
 
-@inner
+@strict_part
 def form(matrix: Floats, x: Floats) -> Pair:
     """x^T M x."""
     total = (0.0, 0.0)
@@ -44,7 +44,7 @@ def form(matrix: Floats, x: Floats) -> Pair:
     return total
 
 
-@inner
+@strict_part
 def negated(x: Floats) -> Floats:
     """The opposite of a vector [N, 2]; loops compile faster than expressions of arrays."""
     result = np.empty((x.shape[0], 2))
@@ -53,13 +53,13 @@ def negated(x: Floats) -> Floats:
     return result
 
 
-@inner
+@strict_part
 def _assign(x: Floats, value: Floats) -> None:
     for k in range(x.shape[0]):
         x[k, 0], x[k, 1] = value[k, 0], value[k, 1]
 
 
-@inner
+@strict_part
 def places(flags: Flags) -> Indices:
     """Where flags are set."""
     count = 0
@@ -71,7 +71,7 @@ def places(flags: Flags) -> Indices:
     return result[:count]
 
 
-@inner
+@strict_part
 def _any(flags: Flags) -> bool:
     found = False
     for flag in flags:
@@ -79,7 +79,7 @@ def _any(flags: Flags) -> bool:
     return found
 
 
-@inner
+@strict_part
 def largest(x: Floats) -> float:
     """The largest magnitude of a vector."""
     size = 0.0
@@ -88,7 +88,7 @@ def largest(x: Floats) -> float:
     return size
 
 
-@inner
+@strict_part
 def directions(rows: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
     """Fills norms [K, 2] and cosines [K, K, 2] of float64 rows [K, P]; zero where not present."""
     views, size = rows.shape
@@ -112,7 +112,7 @@ def directions(rows: Floats, present: Flags, norms: Floats, cosines: Floats) -> 
         cosines[i, i, 1] = 0.0
 
 
-@inner
+@strict_part
 def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Floats) -> float:
     """Solves M_SS x = r_S by L D L^T; x is zero for members that depend on earlier ones.
 
@@ -151,7 +151,7 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
     return smallest
 
 
-@inner
+@strict_part
 def _substituted(
     lower: Floats, pivots: Floats, chosen: Indices, count: int, right: Floats, out: Floats
 ) -> None:
@@ -171,7 +171,7 @@ def _substituted(
             out[chosen[i], 0], out[chosen[i], 1] = value
 
 
-@inner
+@strict_part
 def complementary(matrix: Floats, offset: Floats, members: Flags, x: Floats) -> float:
     """Finds x >= 0 with s = M x + offset >= 0 and x.s = 0 (Lawson and Hanson 1974).
 
@@ -232,7 +232,7 @@ def complementary(matrix: Floats, offset: Floats, members: Flags, x: Floats) -> 
     return -1.0
 
 
-@inner
+@strict_part
 def _most_violated(
     matrix: Floats, offset: Floats, members: Flags, inside: Flags, barred: Flags, x: Floats
 ) -> int:

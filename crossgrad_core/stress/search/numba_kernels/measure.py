@@ -9,6 +9,8 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     Floats,
     add,
     at,
+    divide,
+    entry,
     minus,
     multiply,
     number,
@@ -53,3 +55,30 @@ def directions_of(rows: Floats, present: Flags) -> tuple[Floats, Floats]:
     for b in range(blocks):
         directions(rows[b], present[b], norms[b], cosines[b])
     return norms, cosines
+
+
+@strict_kernel
+def pivots_of(cosines_of: Floats) -> NDArray[np.float64]:
+    """[B, K] pivots of the Cholesky factors of cosines [B, K, K, 2], the largest first."""
+    blocks, views = cosines_of.shape[:2]
+    result = np.zeros((blocks, views))
+    for b in range(blocks):
+        left = cosines_of[b].copy()
+        for turn in range(views):
+            p = 0
+            for k in range(views):
+                if left[k, k, 0] > left[p, p, 0]:
+                    p = k
+            pivot = entry(left, p, p)
+            if pivot[0] <= 0.0:
+                break
+            result[b, turn] = pivot[0]
+            column = left[p].copy()
+            for i in range(views):
+                share = divide(at(column, i), pivot)
+                for j in range(views):
+                    rest = add(entry(left, i, j), minus(multiply(share, at(column, j))))
+                    left[i, j, 0], left[i, j, 1] = rest
+            left[p, :] = 0.0
+            left[:, p] = 0.0
+    return result

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crossgrad_core.jit import strict_kernel
+from crossgrad_core.jit import strict_kernel, strict_part
 from crossgrad_core.stress.search.numba_kernels.convex import NOISE, Solved
 from crossgrad_core.stress.search.numba_kernels.doubled import (
     Flags,
@@ -11,7 +11,6 @@ from crossgrad_core.stress.search.numba_kernels.doubled import (
     add,
     at,
     divide,
-    inner,
     minus,
     multiply,
     root,
@@ -62,7 +61,7 @@ def projected(
     return weights, np.ones(blocks)
 
 
-@inner
+@strict_part
 def _one(
     cosines: Floats,
     present: Flags,

@@ -1,0 +1,119 @@
+"""Arithmetic in one float64 number or in two: the same algorithms at 16 and at 32 digits.
+
+A number is a pair (high, low). `exact` is True for 32 digits and None for 16, where only the first
+of the pair counts: a type of its own, so that Numba compiles the two cases apart.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.jit import strict_device, strict_part
+from crossgrad_core.numba_kernels.double_double import (
+    add,
+    divide,
+    multiply,
+    quick_two_sum,
+    square_root,
+    two_product,
+    two_sum,
+)
+
+Pair = tuple[float, float]
+Exact = Literal[True] | None
+#: [n, 2] numbers, or [n, n, 2].
+Pairs = NDArray[np.float64]
+
+
+@strict_device
+def plus(a: Pair, b: Pair, exact: Exact) -> Pair:
+    """The sum."""
+    if exact is None:
+        return a[0] + b[0], 0.0
+    return add(a[0], a[1], b[0], b[1])
+
+
+@strict_device
+def minus(a: Pair, b: Pair, exact: Exact) -> Pair:
+    """The difference."""
+    if exact is None:
+        return a[0] - b[0], 0.0
+    return add(a[0], a[1], -b[0], -b[1])
+
+
+@strict_device
+def product(a: Pair, b: Pair, exact: Exact) -> Pair:
+    """The product."""
+    if exact is None:
+        return a[0] * b[0], 0.0
+    return multiply(a[0], a[1], b[0], b[1])
+
+
+@strict_device
+def quotient(a: Pair, b: Pair, exact: Exact) -> Pair:
+    """The quotient."""
+    if exact is None:
+        return a[0] / b[0], 0.0
+    return divide(a[0], a[1], b[0], b[1])
+
+
+@strict_device
+def root(a: Pair, exact: Exact) -> Pair:
+    """The square root; of a negative number, 0."""
+    if exact is None:
+        return np.sqrt(max(a[0], 0.0)), 0.0
+    return square_root(a[0], a[1])
+
+
+@strict_part
+def products(a: Pairs, b: Pairs, first: int, last: int, exact: Exact) -> Pair:
+    """The sum of a_i b_i, i from `first` to `last` - 1."""
+    high = low = 0.0
+    if exact is None:
+        for i in range(first, last):
+            high += a[i, 0] * b[i, 0]
+        return high, 0.0
+    for i in range(first, last):
+        one, lost = two_product(a[i, 0], b[i, 0])
+        high, more = two_sum(high, one)
+        low += more + (lost + (a[i, 0] * b[i, 1] + a[i, 1] * b[i, 0]))
+    return quick_two_sum(high, low)
+
+
+@strict_device
+def at(values: Pairs, k: int) -> Pair:
+    """The number at place k."""
+    return values[k, 0], values[k, 1]
+
+
+@strict_device
+def put(values: Pairs, k: int, value: Pair) -> None:
+    """Puts a number at place k."""
+    values[k, 0], values[k, 1] = value
+
+
+@strict_device
+def clear(values: Pairs) -> None:
+    """Fills numbers with zero."""
+    for k in range(len(values)):
+        values[k, 0], values[k, 1] = 0.0, 0.0
+
+
+@strict_device
+def copy(values: Pairs, to: Pairs) -> None:
+    """Copies numbers."""
+    for k in range(len(values)):
+        to[k, 0], to[k, 1] = values[k, 0], values[k, 1]
+
+
+@strict_device
+def longest_of(norms: Pairs) -> tuple[Pair, float]:
+    """The largest of non-negative numbers, and how many of them are not zero."""
+    place, count = 0, 0.0
+    for k in range(len(norms)):
+        if norms[k, 0] > norms[place, 0]:
+            place = k
+        if norms[k, 0] > 0.0:
+            count += 1.0
+    return at(norms, place), count

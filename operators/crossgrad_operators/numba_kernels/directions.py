@@ -1,0 +1,89 @@
+"""Gramians as norms and cosines in numbers of 16 or 32 digits, and what counts as opposite."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.jit import strict_device, strict_part
+from crossgrad_operators.numba_kernels.digits import (
+    Pair,
+    Pairs,
+    at,
+    clear,
+    put,
+    quotient,
+    root,
+)
+from crossgrad_operators.numba_kernels.normal import CANCELLED
+from crossgrad_operators.numba_kernels.polyhedron import Polyhedron, share_left, square
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+#: Weights, and which of the blocks more digits may change.
+Solved = tuple[Floats, Flags]
+
+
+@strict_part
+def directions(
+    gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, problem: Polyhedron
+) -> int:
+    """Fills norms [K] and the problem's cosines, zero for views that are not present.
+
+    Args:
+        gramian: [K, K].
+        remainder: [K, K] what rounding took from it; not looked at if the problem has 16 digits.
+        present: [K].
+        norms: [K] numbers.
+        problem: Gets the cosines [K, K].
+
+    Returns:
+        How many views are present.
+    """
+    exact, cosines, count = problem.rounding.exact, problem.cosines, 0
+    clear(norms)
+    for k in range(present.size):
+        clear(cosines[k])
+        if present[k]:
+            put(norms, k, root((gramian[k, k], remainder[k, k]), exact))
+            count += 1
+    for i in range(present.size):
+        if present[i]:
+            cosines[i, i, 0] = 1.0
+        for j in range(i):
+            if present[i] and present[j]:
+                cosine = quotient((gramian[i, j], remainder[i, j]), at(norms, i), exact)
+                put(cosines[i], j, _limited(quotient(cosine, at(norms, j), exact)))
+                put(cosines[j], i, at(cosines[i], j))
+    return count
+
+
+@strict_device
+def _limited(cosine: Pair) -> Pair:
+    if cosine[0] > 1.0:
+        return 1.0, 0.0
+    if cosine[0] < -1.0:
+        return -1.0, 0.0
+    return cosine
+
+
+@strict_device
+def present_in(problem: Polyhedron) -> int:
+    """How many directions there are."""
+    count = 0
+    for k in range(problem.active.size):
+        if problem.cosines[k, k, 0] > 0.0:
+            count += 1
+    return count
+
+
+@strict_device
+def what_is_left(problem: Polyhedron, x: Pairs) -> float:
+    """Factor for coefficients x of a result: 0 where it is what opposite directions leave.
+
+    Of two directions those with 1 + cos up to 1e-12 are opposite; see `share_left` for more.
+    """
+    if present_in(problem) > 2:
+        return share_left(problem, x)
+    largest = 0.0
+    for k in range(len(x)):
+        largest = max(largest, abs(x[k, 0]))
+    return 0.0 if square(problem, x)[0] <= CANCELLED * largest * largest else 1.0
