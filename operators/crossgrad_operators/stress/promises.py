@@ -136,6 +136,11 @@ def pairwise_bound(facts: Facts) -> Floats:
     return usual_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
+def views_bound(facts: Facts) -> Floats:
+    """One per view, at least eight: sums of one sign never get shorter."""
+    return np.asarray(np.maximum(PROMISED, facts.present.sum(axis=1)))
+
+
 def everywhere(facts: Facts) -> Flags:
     """Every Gramian."""
     return np.ones(len(facts.norms), np.bool_)
@@ -235,6 +240,7 @@ PROMISES: Final[Mapping[str, Promise]] = {
     ),
     "nash": _plain("sqrt(K)", lambda views: 1.001 * float(views) ** 0.5),
     "imtl-g": Promise(_REGULAR, "7.1e5 K", lambda views: 7.1e5 * views, independent),
+    "graddrop": Promise("all gradients", "K", float, everywhere, views_bound),
     "aligned": _plain("1", lambda _views: 1.0),
     "mgda": Promise(_CLEAR, "1", lambda _views: 1.0 + SLIGHTLY, clear),
     "upgrad": Promise(_CLEAR, "1", lambda _views: 1.0 + SLIGHTLY, clear, continuous=hull_apart),
