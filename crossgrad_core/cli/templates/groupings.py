@@ -30,5 +30,9 @@ class Template(Grouping):
             return tuple("near" if each <= threshold else "far" for each in distances)
 
         if len(set(labels(scene.train_views))) == 1:
-            raise UserError("all training cameras are equally far", where="grouping")
+            raise UserError(
+                "all training cameras are equally far",
+                where="grouping",
+                todo="choose a grouping that looks at something else, such as altitude",
+            )
         return Rule(labels)
