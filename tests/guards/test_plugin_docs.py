@@ -77,4 +77,6 @@ def test_the_example_names_its_own_plugins():
             assert f"`{name}`" in readme
             module, _, kind = value.partition(":")
             source = example / f"{module.replace('.', '/')}.py"
-            assert f"class {kind}(" in source.read_text(encoding="utf-8")
+            assert re.search(
+                rf"^(class|def) {kind}\(", source.read_text(encoding="utf-8"), re.MULTILINE
+            )

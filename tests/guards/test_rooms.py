@@ -10,7 +10,8 @@ from support.imports import CORE, ROOT, SHELVES, circle, import_graph, imports, 
 #: The rooms and files of the core from the lowest floor to the highest; imports go down. Those of
 #: one floor do not import each other.
 FLOORS = (
-    ("errors", "wording", "defaults"),
+    ("wording", "defaults"),
+    ("errors",),
     ("system",),
     ("numerics",),
     ("contract",),

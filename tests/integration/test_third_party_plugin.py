@@ -66,7 +66,11 @@ def broken(python, installed, tmp_path):
     source = tmp_path / "broken"
     shutil.copytree(installed, source)
     package = source / "crossgrad_example"
-    replace(package / "equal_length.py", "np.maximum(present.sum(axis=1), 1)", "context.step / 1e9")
+    replace(
+        package / "equal_length.py",
+        "np.maximum(context.present.sum(axis=1), 1)",
+        "context.step / 1e9",
+    )
     replace(package / "equal_length.py", "lengths = np.sqrt(", "lengths = np.sqrt(1e-8 + ")
     replace(package / "least_seen.py", "context.rng.random", "np.random.random")
     replace(package / "clip.py", "return answer.with_state", "answer.with_state")
@@ -95,7 +99,8 @@ def test_it_keeps_the_contract(crossgrad):
     assert "operator equal-length pass" in report
     assert "sampler least-seen pass" in report
     assert "observer clip pass" in report
-    assert "3 of 3 plugins keep the contract of their slot" in report
+    assert "command count-views pass" in report
+    assert "9 of 9 plugins keep the contract of their slot" in report
 
 
 @pytest.mark.usefixtures("broken")
@@ -105,7 +110,14 @@ def test_a_broken_one_fails_with_the_reasons(crossgrad):
     assert "compare lengths with each other, never with a constant" in report
     assert "draws from the global generator of numpy" in report
     assert "the seam crossgrad_aggregate_gradients was not answered" in report
-    assert "0 of 3 plugins keep the contract of their slot" in report
+    assert "6 of 9 plugins keep the contract of their slot" in report
+
+
+@pytest.mark.usefixtures("installed")
+def test_its_command_is_one_of_crossgrad_s(crossgrad, tmp_path):
+    scene = write_tiny_scene(tmp_path / "tiny", views=6)
+    assert "count-views Count the training views of a scene." in crossgrad("--help")[0]
+    assert crossgrad("count-views", scene)[0] == "tiny: 5 training views, read by colmap"
 
 
 @pytest.mark.usefixtures("installed")

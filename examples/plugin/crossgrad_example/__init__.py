@@ -1,1 +1,1 @@
-"""An operator, a sampler and a hook wrapper for crossgrad."""
+"""One plugin for every slot of crossgrad, and one command."""

@@ -2,22 +2,16 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
 
 
 class EqualLength(Weighting):
-    """Brings the K gradients of a block to their mean length, then adds them.
+    """Brings the K gradients of a block to their mean length, then adds them."""
 
-    u = sum of (mean length / |g_k|) g_k over the views that have a gradient.
-    """
-
-    @override
     def weights(
         self, gramians: NDArray[np.float64], context: OperatorContext
     ) -> NDArray[np.float64]:
-        present = context.present
         lengths = np.sqrt(np.einsum("bkk->bk", gramians))  # [B, K]
-        mean = lengths.sum(axis=1) / np.maximum(present.sum(axis=1), 1)  # [B]
-        return np.divide(mean[:, None], lengths, out=np.zeros_like(lengths), where=present)
+        mean = lengths.sum(axis=1) / np.maximum(context.present.sum(axis=1), 1)  # [B]
+        return np.divide(mean[:, None], lengths, out=np.zeros_like(lengths), where=context.present)

@@ -1,27 +1,32 @@
 """The contract checks of each slot: two lines per plugin."""
 
 import pytest
+from crossgrad_example.borrowed import Borrowed
 from crossgrad_example.clip import Clip
+from crossgrad_example.count_views import count_views
 from crossgrad_example.equal_length import EqualLength
+from crossgrad_example.faint import Faint
 from crossgrad_example.least_seen import LeastSeen
+from crossgrad_example.median_distance import MedianDistance
+from crossgrad_example.poses import Poses
+from crossgrad_example.spheres import Spheres
 
-from crossgrad_core.plugin import Observer, Operator, Sampler
-from crossgrad_core.testing.contract import Check
-from crossgrad_core.testing.observers import OBSERVER_CHECKS
-from crossgrad_core.testing.operators import OPERATOR_CHECKS
-from crossgrad_core.testing.samplers import SAMPLER_CHECKS
+from crossgrad_core.testing.checking import AnyCheck, checks_of
+
+PLUGINS = {
+    "backbones": Spheres,
+    "samplers": LeastSeen,
+    "groupings": MedianDistance,
+    "operators": EqualLength,
+    "densifiers": Faint,
+    "rasterizers": Borrowed,
+    "readers": Poses,
+    "observers": Clip,
+    "commands": count_views,
+}
+CASES = [(slot, check) for slot in PLUGINS for check in checks_of(slot)]
 
 
-@pytest.mark.parametrize("check", OPERATOR_CHECKS)
-def test_equal_length(check: Check[Operator]) -> None:
-    check(EqualLength)
-
-
-@pytest.mark.parametrize("check", SAMPLER_CHECKS)
-def test_least_seen(check: Check[Sampler]) -> None:
-    check(LeastSeen)
-
-
-@pytest.mark.parametrize("check", OBSERVER_CHECKS)
-def test_clip(check: Check[Observer]) -> None:
-    check(Clip)
+@pytest.mark.parametrize(("slot", "check"), CASES)
+def test_it_keeps_the_contract(slot: str, check: AnyCheck) -> None:
+    check(PLUGINS[slot])

@@ -1,0 +1,39 @@
+"""Another rasterizer under a name of one's own: a place to put faster kernels."""
+
+from typing import ClassVar, cast
+
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    Camera,
+    Field,
+    Gaussians,
+    Rasterizer,
+    Render,
+    Response,
+    build_component,
+)
+
+
+class Borrowed(Rasterizer):
+    """Draws with another rasterizer."""
+
+    provides: ClassVar[frozenset[str]] = frozenset(
+        {"depth", "pixels", "abs_gradient", "directions"}
+    )
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
+
+    by: str = Field("torch", description="name of the rasterizer that draws")
+
+    @override
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        options = self.model_dump(include=set(Rasterizer.model_fields))
+        reference = cast("Rasterizer", build_component("rasterizers", self.by, options))
+        return reference.render(gaussians, camera, background, outputs)

@@ -1,0 +1,34 @@
+"""Near and far by the median distance from the mean camera."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    Rule,
+    Scene,
+    UserError,
+    View,
+    radial_distances,
+)
+
+
+class MedianDistance(Grouping):
+    """near where a camera is at most the median distance from the mean camera, else far."""
+
+    @override
+    def fit(
+        self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
+    ) -> Rule:
+        threshold = float(np.median(radial_distances(scene, scene.train_views)))
+
+        def labels(views: Sequence[View]) -> tuple[str, ...]:
+            distances = radial_distances(scene, views)
+            return tuple("near" if each <= threshold else "far" for each in distances)
+
+        if len(set(labels(scene.train_views))) == 1:
+            raise UserError("all training cameras are equally far", where="grouping")
+        return Rule(labels)
