@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.wording import showable
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.limits import TooSlowError, cpu_limit, memory_limit
 from crossgrad_fuzz.target import Target
@@ -137,7 +138,7 @@ def complaint(error: UserError) -> Finding | None:
         faults.append("control characters")
     if not faults:
         return None
-    return Finding(f"{error.what[:40]}: {', '.join(faults)}", message)
+    return Finding(f"{showable(error.what)[:40]}: {', '.join(faults)}", message)
 
 
 def _signature(error: BaseException) -> str:

@@ -95,7 +95,11 @@ def _raw_seeds() -> Sequence[Case]:
     names = "a.jpg\nsub/b.jpg\nc.jpg"
     case = {"poses": content, "points": points, "camera": camera, "names": names.encode()}
     distorted = struct.pack("<QQ8d", *_SIZE, 20.0, 20.0, 12.0, 8.0, 0.01, 0.0, 0.0, 0.0)
-    return [case, {**case, "camera": distorted, "points": b""}]
+    far = np.array([1e20, 0.0, 0.0]).tobytes()  # is left out with a note
+    return [
+        *(case, {**case, "camera": distorted, "points": b""}),
+        {**case, "points": points + far},
+    ]
 
 
 def _parse_raw(folder: Path) -> None:
