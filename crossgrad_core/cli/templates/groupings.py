@@ -33,6 +33,6 @@ class Template(Grouping):
             raise UserError(
                 "all training cameras are equally far",
                 where="grouping",
-                todo="choose a grouping that looks at something else, such as altitude",
+                todo="choose a grouping that looks at something else",
             )
         return Rule(labels)

@@ -159,4 +159,4 @@ def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
     with pytest.raises(UserError) as caught:
         options_of(preset="inria")
     assert "footprint of the original code" in str(caught.value)
-    assert "choose another rasterizer" in str(caught.value)
+    assert "leave --rasterizer out" in str(caught.value)

@@ -257,6 +257,13 @@ class ForgetsTheBackground(Torch):
         return super().render(gaussians, camera, torch.zeros_like(background), outputs)
 
 
+class FastEverywhere(Torch):
+    devices = frozenset({"cpu"})
+
+    def speed(self, device):
+        return 10.0
+
+
 class NeedsGaussians(Torch):
     def render(self, gaussians, camera, background, outputs=frozenset()):
         if len(gaussians) == 0:
@@ -518,6 +525,7 @@ DEFECTS = [
     (groupings.the_rule_is_fitted_on_training_views, FittedOnWhatIsAsked),
     (groupings.the_quantity_is_one_number_per_view, MeasuresRanks),
     (groupings.same_seed_same_labels, GlobalLabels),
+    (rasterizers.speed_says_where_it_runs, FastEverywhere),
     (rasterizers.renders_have_the_shape, FlatImage),
     (rasterizers.the_background_shows_through, ForgetsTheBackground),
     (rasterizers.nothing_to_draw_is_no_error, ForgetsTheBackground),
