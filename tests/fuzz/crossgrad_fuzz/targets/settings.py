@@ -4,10 +4,10 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-from crossgrad_core.cli import settings
 from crossgrad_core.config import RunConfig
 from crossgrad_core.registry import validation
 from crossgrad_core.registry.entries import build
+from crossgrad_core.run import settings
 from crossgrad_core.run.opening import parsed
 from crossgrad_core.run.settings import merged
 from crossgrad_core.system import yaml_values
