@@ -1,6 +1,6 @@
 """The fully resolved configuration of a run: one schema for command line, file and results."""
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -82,9 +82,31 @@ class RunConfig(BaseModel):
         ComponentChoice(name=AUTO),
         description="What draws. Default: auto, the fastest one for the device.",
     )
+    loss: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.LOSS),
+        description=f"How far a render is from its photo. Default: {defaults.LOSS}.",
+    )
+    exposure: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.EXPOSURE),
+        description="What cameras do to light between render and photo. "
+        f"Default: {defaults.EXPOSURE}.",
+    )
+    resolution: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.RESOLUTION),
+        description=f"At which scale a step renders its views. Default: {defaults.RESOLUTION}.",
+    )
+    exporter: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.EXPORTER),
+        description=f"What writes the trained scene to a file. Default: {defaults.EXPORTER}.",
+    )
     reader: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
         description="What reads the scene. Default: auto, the one that accepts the folder.",
+    )
+    metrics: Annotated[tuple[ComponentChoice, ...], Flag("NAME", PARTS)] = Field(
+        tuple(ComponentChoice(name=name) for name in defaults.METRICS.split("+")),
+        description="Adds a figure that is measured of held-out views, repeatable. "
+        f"Default: {', '.join(defaults.METRICS.split('+'))}.",
     )
     observers: Annotated[tuple[ComponentChoice, ...], Flag("NAME", PARTS, "observe")] = Field(
         (), description="Adds an observer, repeatable."
@@ -133,7 +155,6 @@ class RunConfig(BaseModel):
         None, ge=1, description="CPU threads. Default: all there are."
     )
     reading: SceneOptions = SceneOptions()
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="share of 1 - SSIM in the loss")
     background: Annotated[str, Flag("COLOR", TRAINING)] = Field(
         "black",
         description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
@@ -162,6 +183,18 @@ class RunConfig(BaseModel):
         if not isinstance(value, dict):
             return value
         return {current_name(key, value): each for key, each in value.items()}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_loss(cls, data: object) -> object:
+        """`ssim_weight` was a setting of its own until 0.1; it is an option of the loss."""
+        if not isinstance(data, Mapping) or "ssim_weight" not in data:
+            return data
+        rest = {name: value for name, value in data.items() if name != "ssim_weight"}
+        loss = rest.get("loss") or {"name": defaults.LOSS}
+        if isinstance(loss, Mapping):
+            rest["loss"] = {"ssim_weight": data["ssim_weight"], **loss}
+        return rest
 
     @field_validator("operator", mode="before")
     @classmethod

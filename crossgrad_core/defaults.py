@@ -9,6 +9,11 @@ from typing import Final
 BACKBONE: Final = "vanilla"
 SAMPLER: Final = "random"
 OPERATOR: Final = "sum"
+LOSS: Final = "l1-ssim"
+EXPOSURE: Final = "none"
+RESOLUTION: Final = "full"
+EXPORTER: Final = "ply"
+METRICS: Final = "psnr+ssim+ssim-skimage+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
 #: The reader that says what is missing in a folder that no reader accepts.

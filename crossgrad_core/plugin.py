@@ -19,28 +19,38 @@ from crossgrad_core.contract.contexts import (
     EvaluationReport,
     Model,
     OperatorContext,
+    PixelContext,
     RegularizeContext,
     Regularized,
     RunInfo,
     SampleContext,
     Sampled,
+    ScaleContext,
+    Scaled,
     StepContext,
     StepRecord,
     ViewRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.exposure import Exposure, PerPhoto
+from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
+from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
+from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scales import octave
 from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
@@ -48,6 +58,9 @@ from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.evaluation.metrics import SSIM_SKIMAGE_TOO_SMALL, psnr, ssim, ssim_skimage
+from crossgrad_core.ply.cloud import SplatCloud
+from crossgrad_core.ply.file import write_ply
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.run.results.lines import (
@@ -60,12 +73,14 @@ from crossgrad_core.run.results.lines import (
 from crossgrad_core.scene.bimodality import bimodality
 from crossgrad_core.system.terminal import shows_bar
 from crossgrad_core.system.text_files import read_rows
+from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_core.training.loss.reference import masked, ssim_map, unit_range
 
 __all__ = [
     "EMPTY_STATE",
     "NO_EDIT",
     "SHORTEST_ANCHOR_INTERVAL",
+    "SSIM_SKIMAGE_TOO_SMALL",
     "AfterStepContext",
     "AggregateContext",
     "Aggregated",
@@ -73,6 +88,7 @@ __all__ = [
     "Block",
     "BlockKind",
     "Camera",
+    "Compared",
     "Component",
     "Densified",
     "Densifier",
@@ -80,7 +96,10 @@ __all__ = [
     "Draw",
     "Edit",
     "EvaluationReport",
+    "Exporter",
+    "Exposure",
     "Field",
+    "Figure",
     "Gaussians",
     "GradientProbe",
     "GramianOperator",
@@ -90,15 +109,19 @@ __all__ = [
     "IncompatibleSelectionError",
     "Json",
     "LearningRate",
+    "Loss",
     "MatrixOperator",
+    "Metric",
     "Model",
     "Observer",
     "Operator",
     "OperatorContext",
     "Pace",
     "Parameters",
+    "PerPhoto",
     "Phase",
     "Photo",
+    "PixelContext",
     "PluginState",
     "Quantity",
     "Rasterizer",
@@ -107,6 +130,7 @@ __all__ = [
     "RegularizeContext",
     "Regularized",
     "Render",
+    "Resolution",
     "Response",
     "Rows",
     "Rule",
@@ -114,6 +138,8 @@ __all__ = [
     "SampleContext",
     "Sampled",
     "Sampler",
+    "ScaleContext",
+    "Scaled",
     "Scene",
     "SceneOptions",
     "Schedule",
@@ -121,6 +147,7 @@ __all__ = [
     "Selection",
     "SeparateGradients",
     "Similarity",
+    "SplatCloud",
     "StepContext",
     "StepRecord",
     "UserError",
@@ -141,13 +168,19 @@ __all__ = [
     "length_lines",
     "masked",
     "objections_to_views",
+    "octave",
+    "photometric_loss",
     "progress_line",
+    "psnr",
     "radial_distances",
     "read_rows",
     "screen_statistics",
     "set_for_nothing",
     "shows_bar",
+    "ssim",
     "ssim_map",
+    "ssim_skimage",
     "unit_range",
     "upward",
+    "write_ply",
 ]

@@ -14,8 +14,13 @@ def showable(text: str) -> str:
 
 
 def singular(slot: str) -> str:
-    """The word for one member of a slot: `operators` -> `operator`."""
-    return slot.removesuffix("s")
+    """The word for one member of a slot: `operators` -> `operator`, `losses` -> `loss`."""
+    return slot.removesuffix("es" if slot.endswith("sses") else "s")
+
+
+def plural(word: str) -> str:
+    """The slot of one member's word, the inverse of `singular`."""
+    return f"{word}es" if word.endswith("ss") else f"{word}s"
 
 
 def listed(names: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from crossgrad_core.contract.component import Component
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.commands import load_command, summary
-from crossgrad_core.registry.slots import COMMANDS
+from crossgrad_core.registry.slots import COMMANDS, LISTS
 from crossgrad_core.wording import listed, singular
 
 _WIDTH = 80
@@ -94,8 +94,7 @@ def _options(entry: registry.Entry, component: type[Component]) -> str:
     fields = component.model_fields
     if not fields:
         return f"{_MARGIN}no options"
-    word = singular(entry.slot)
-    prefix = f"observers.{entry.name}" if entry.slot == "observers" else word
+    prefix = f"{entry.slot}.{entry.name}" if entry.slot in LISTS else singular(entry.slot)
     heading = f"{_MARGIN}options (--set {prefix}.OPTION=VALUE):"
     return "\n".join([heading, *(_option(name, field) for name, field in fields.items())])
 

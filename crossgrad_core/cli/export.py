@@ -1,6 +1,5 @@
 """`crossgrad export`: a run's scene in a file format of other programs."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,19 +8,18 @@ import typer
 from crossgrad_core.system.startup import announce
 
 
-class Format(StrEnum):
-    """File formats."""
-
-    PLY = "ply"
-
-
 def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
     ],
     file_format: Annotated[
-        Format, typer.Option("--format", help="File format; ply is the usual 3DGS file.")
-    ] = Format.PLY,
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="File format, an exporter; ply is the usual 3DGS file. Default: the run's.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The file to write. Default: RUN/point_cloud.ply."),
@@ -54,4 +52,4 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
-    afterwards.export(run, file_format=file_format.value, out=out, camera=camera, how=how)
+    afterwards.export(run, file_format=file_format, out=out, camera=camera, how=how)

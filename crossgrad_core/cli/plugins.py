@@ -9,7 +9,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.slots import COMMANDS, OFFERED, OWN_COMMANDS
 from crossgrad_core.system.grouped import GroupedCommand
-from crossgrad_core.wording import did_you_mean, listed, sentences
+from crossgrad_core.wording import did_you_mean, listed, plural, sentences
 
 app = typer.Typer(
     help="List, explain, check and begin plugins.",
@@ -111,14 +111,14 @@ def new(
 def _slots(slot: str | None) -> tuple[str, ...]:
     if slot is None:
         return tuple(OFFERED)
-    plural = slot if slot in OFFERED else f"{slot}s"
-    if plural not in OFFERED:
+    group = slot if slot in OFFERED else plural(slot)
+    if group not in OFFERED:
         raise UserError(
             f"there is no slot named {slot!r}",
             expected=f"one of {listed(OFFERED)}",
             todo=sentences(did_you_mean(slot, OFFERED), "leave --slot out to see all of them"),
         )
-    return (plural,)
+    return (group,)
 
 
 def _rows(offers: tuple[registry.Entry, ...]) -> list[str]:

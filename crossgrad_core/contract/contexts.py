@@ -12,7 +12,7 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.gradients import Gradients, SeparateGradients
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import Edit
@@ -20,6 +20,7 @@ from crossgrad_core.contract.topology import Edit
 if TYPE_CHECKING:
     from crossgrad_core.contract.adam_state import AdamState
     from crossgrad_core.contract.backbone import Backbone
+    from crossgrad_core.contract.loss import Loss
     from crossgrad_core.contract.rasterizer import Rasterizer
 
 
@@ -46,8 +47,15 @@ class ViewRecord:
         label: Its group label, or None.
         loss: Its own photometric loss.
         gaussians: What was drawn, detached.
-        screen: Screen statistics, gradients included.
+        screen: Screen statistics in pixels of the render, gradients included; read in units of the
+            full photo, whatever the scale, through `contract.screen_statistics`.
         background: [3] RGB that it was drawn over.
+        camera: The camera that it was rendered with: that of the view in another size where `scale`
+            is not 1.
+        scale: Sides of the render over those of the photo as trained, as the resolution chose it.
+        image: [H, W, 3] the image that was compared, detached: the render after exposure.
+        photo: [H, W, 3] uint8 the photo that it was compared with, in the size of the render.
+        mask: [H, W] bool, True where the pixel counted; None where every pixel did.
     """
 
     index: int
@@ -57,6 +65,11 @@ class ViewRecord:
     gaussians: Gaussians
     screen: Screen
     background: Tensor
+    camera: Camera = field(kw_only=True)
+    scale: float = field(kw_only=True)
+    image: Tensor = field(kw_only=True)
+    photo: Tensor = field(kw_only=True)
+    mask: Tensor | None = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,8 @@ class StepRecord:
         counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
             `cloned`, `split`, `pruned`, `reset` primitives of the densification.
         train_seconds: Training seconds since the start of the run, this step included.
+        scales: The scales at which the views were rendered and compared; empty where all had their
+            full size.
     """
 
     step: int
@@ -83,6 +98,7 @@ class StepRecord:
     primitives: int
     counts: Mapping[str, int]
     train_seconds: float
+    scales: tuple[float, ...] = ()
 
 
 #: The photo [H, W, 3] uint8 of a view and its mask [H, W] bool, None where every pixel counts.
@@ -92,6 +108,15 @@ PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
 def decoded(view: View) -> tuple[Tensor, Tensor | None]:
     """The photo and the mask of a view, decoded off any clock."""
     return view.photo.image(), view.photo.mask()
+
+
+#: A view and its render [H, W, 3] -> the image as the view's camera would have taken it.
+ExposedBy = Callable[[View, Tensor], Tensor]
+
+
+def unexposed(_view: View, image: Tensor) -> Tensor:
+    """The image as it is."""
+    return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +163,45 @@ class SampleContext(StepContext):
 
 
 @dataclass(frozen=True, eq=False)
+class ScaleContext(StepContext):
+    """For `crossgrad_choose_scales`.
+
+    Attributes:
+        draw: The views of the step.
+        last: Record of the step before, None in the first one.
+    """
+
+    draw: Draw
+    last: StepRecord | None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views of the step."""
+        return tuple(self.scene.train_views[index] for index in self.draw.views)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelContext(StepContext):
+    """For `crossgrad_pixel_weights`.
+
+    Attributes:
+        index: Position of the view in `scene.train_views`.
+        view: The view.
+        camera: The camera that it is rendered with.
+        scale: Sides of the render over those of the photo as trained.
+        target: [H, W, 3] uint8 the photo that the render is compared with, in its size.
+        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+    """
+
+    index: int
+    view: View
+    camera: Camera
+    scale: float
+    target: Tensor
+    mask: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
 class AggregateContext(StepContext):
     """For `crossgrad_aggregate_gradients`.
 
@@ -148,6 +212,7 @@ class AggregateContext(StepContext):
         distances: [K] float64 distance of each camera from the mean training camera, local units.
         reference_distance: Median of these distances over all training cameras.
         blocks: The blocks, in the order of every Gramian's first dimension.
+        scales: K scales at which losses and gradients were taken; empty where all are 1.
     """
 
     gradients: Gradients
@@ -156,6 +221,7 @@ class AggregateContext(StepContext):
     distances: NDArray[np.float64]
     reference_distance: float
     blocks: tuple[Block, ...]
+    scales: tuple[float, ...] = field(default=(), kw_only=True)
 
     @property
     def separate(self) -> SeparateGradients:
@@ -245,6 +311,13 @@ class Sampled(Answer):
     draw: Draw
 
 
+@dataclass(frozen=True)
+class Scaled(Answer):
+    """Answer of `crossgrad_choose_scales`: one scale in (0, 1] for each drawn view."""
+
+    scales: tuple[float, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Aggregated(Answer):
     """Answer of `crossgrad_aggregate_gradients`.
@@ -305,8 +378,10 @@ class Model:
         parameters: The parameters.
         adam: The optimizer's moments.
         background: [3] RGB that evaluated views are drawn over.
-        ssim_weight: Share of 1 - SSIM in the photometric loss.
+        loss: The photometric loss.
         groups: Group label of each training view, or None.
+        exposed: What the run's exposure makes of a render [H, W, 3] of a view; it goes before the
+            loss.
     """
 
     phase: Phase
@@ -316,16 +391,24 @@ class Model:
     parameters: Parameters
     adam: "AdamState"
     background: Tensor
-    ssim_weight: float
+    loss: "Loss"
     groups: tuple[str, ...] | None
+    exposed: ExposedBy = field(default=unexposed)
 
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """What observers learn after an evaluation: the new row of metrics.csv."""
+    """What observers learn after an evaluation.
+
+    Attributes:
+        step: The step.
+        row: The new row of metrics.csv.
+        regimes: The regimes of the held-out views; `psnr_far` is the PSNR of regime `far`.
+    """
 
     step: int
     row: Mapping[str, float | int | str | None]
+    regimes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,6 +430,7 @@ class OperatorContext:
         remainders: Works out [B, K, K], what rounding to float64 took from the Gramians; both
             together have twice the digits. It takes another, slower pass over the gradients: for
             Gramians so close to singular that their own rounding shows. None where nobody knows.
+        scales: K scales at which losses and gradients were taken; empty where all are 1.
     """
 
     step: int
@@ -359,3 +443,4 @@ class OperatorContext:
     present: NDArray[np.bool_]
     unit: float = 2.0**-24
     remainders: Callable[[], NDArray[np.float64]] | None = None
+    scales: tuple[float, ...] = ()

@@ -162,6 +162,7 @@ def operator_context(
         present=present,
         unit=context.separate.unit,
         remainders=partial(context.separate.remainders, granularity),
+        scales=context.scales,
     )
 
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from crossgrad_core.contract.marks import hookspec
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from crossgrad_core.contract.contexts import (
         AfterStepContext,
         AggregateContext,
@@ -19,11 +21,14 @@ if TYPE_CHECKING:
         DensifyContext,
         EvaluationReport,
         Model,
+        PixelContext,
         RegularizeContext,
         Regularized,
         RunInfo,
         SampleContext,
         Sampled,
+        ScaleContext,
+        Scaled,
         StepRecord,
     )
     from crossgrad_core.contract.selection import Selection
@@ -46,6 +51,17 @@ class HookSpecs:
     @hookspec(firstresult=True)
     def crossgrad_sample_views(self, context: "SampleContext") -> "Sampled | None":
         """Seam 1: the K views of this step. Answered by the selected sampler."""
+
+    @hookspec(firstresult=True)
+    def crossgrad_choose_scales(self, context: "ScaleContext") -> "Scaled | None":
+        """The scale at which each drawn view is rendered and compared. The selected resolution."""
+
+    @hookspec
+    def crossgrad_pixel_weights(self, context: "PixelContext") -> "Tensor | None":
+        """How much each pixel of a view counts in its loss, [H, W], not negative.
+
+        Every plugin is asked, once per view; None means "all alike". Answers multiply.
+        """
 
     @hookspec
     def crossgrad_regularize(self, context: "RegularizeContext") -> "Regularized | None":

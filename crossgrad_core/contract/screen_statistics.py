@@ -1,4 +1,8 @@
-"""Reading the screen statistics of a rendered view, per primitive and in NDC units."""
+"""Reading the screen statistics of a rendered view, whatever its scale, per primitive.
+
+Everything is in units of the full photo: gradients per NDC unit, radii over the longer side, pixels
+of the photo as trained. A loss is a mean over pixels, so its gradients need no other factor.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,8 +14,8 @@ from crossgrad_core.contract.state import PluginState
 
 
 def half_size(record: ViewRecord, like: Tensor) -> Tensor:
-    """[2] pixels per NDC unit: W/2, H/2 (3DGS)."""
-    camera = record.view.camera
+    """[2] pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
+    camera = record.camera
     return torch.tensor([camera.width / 2, camera.height / 2]).to(like)
 
 
@@ -27,9 +31,30 @@ def ndc_abs_gradient(record: ViewRecord) -> Tensor:
     return gradient * half_size(record, gradient)
 
 
+def directions(record: ViewRecord) -> Tensor:
+    """[6, 5, N] `Screen.directions` with the absolute gradients per NDC unit; bins, then fields.
+
+    With the Gaussians last, sums over bins are sums of whole rows: much faster on the CPU.
+    """
+    found = _present(record.screen.directions)
+    bins = found.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    bins[:, 2:4] *= half_size(record, bins)[:, None]
+    return bins
+
+
 def pixels(record: ViewRecord) -> Tensor:
-    """[N] number of pixels in which the Gaussian was blended, as floating-point numbers."""
-    return _present(record.screen.pixels).to(record.gaussians.means)
+    """[N] pixels of the full photo in which the Gaussian was blended, floating point."""
+    found = _present(record.screen.pixels).to(record.gaussians.means)
+    if record.scale == 1.0:
+        return found
+    full, drawn = record.view.camera, record.camera
+    return found * (full.width * full.height / (drawn.width * drawn.height))
+
+
+def radii(record: ViewRecord) -> Tensor:
+    """[N] radius on the screen over the image's longer side; 0 where it touches no pixel."""
+    camera = record.camera
+    return record.screen.radii.to(record.gaussians.means) / max(camera.width, camera.height)
 
 
 def visible(record: ViewRecord) -> Tensor:

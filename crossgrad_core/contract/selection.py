@@ -7,9 +7,14 @@ from typing import Protocol, runtime_checkable
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.loss import Loss
+from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 
 
@@ -23,6 +28,11 @@ class Selection:
         operator: The operator.
         densifier: The densifier.
         rasterizer: The rasterizer.
+        loss: The photometric loss.
+        exposure: What cameras do to light.
+        resolution: The scale of each view of a step.
+        exporter: What writes the trained scene to a file.
+        metrics: What is measured of held-out views, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
         views_per_step: K.
         device: Torch device type.
@@ -36,6 +46,11 @@ class Selection:
     operator: Operator
     densifier: Densifier
     rasterizer: Rasterizer
+    loss: Loss
+    exposure: Exposure
+    resolution: Resolution
+    exporter: Exporter
+    metrics: Mapping[str, Metric]
     names: Mapping[str, str]
     views_per_step: int
     device: str
@@ -51,6 +66,10 @@ class Selection:
             "operator": self.operator,
             "densifier": self.densifier,
             "rasterizer": self.rasterizer,
+            "loss": self.loss,
+            "exposure": self.exposure,
+            "resolution": self.resolution,
+            "exporter": self.exporter,
             "grouping": self.grouping,
         }
         return {slot: each for slot, each in filled.items() if each is not None}

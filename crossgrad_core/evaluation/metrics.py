@@ -22,14 +22,6 @@ SSIM_SKIMAGE_TOO_SMALL = (
 )
 
 
-def lpips_unavailable_reason() -> str:
-    """Why LPIPS is null: no package brings the weights of its network."""
-    return (
-        "LPIPS needs the pretrained AlexNet or VGG trunk, which no Python package ships; "
-        "it is not computed"
-    )
-
-
 def quantise(image: Tensor) -> Tensor:
     """The image [H, W, 3] clamped to [0, 1] and rounded to multiples of 1/255; NaN becomes 0."""
     return _eight_bit(image).to(image.dtype) / 255

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, OFFERED
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
 
@@ -32,7 +32,12 @@ _BASES: Final[dict[str, str]] = {
     "operators": "crossgrad_core.contract.operator:Operator",
     "densifiers": "crossgrad_core.contract.densifier:Densifier",
     "rasterizers": "crossgrad_core.contract.rasterizer:Rasterizer",
+    "losses": "crossgrad_core.contract.loss:Loss",
+    "exposures": "crossgrad_core.contract.exposure:Exposure",
+    "resolutions": "crossgrad_core.contract.resolution:Resolution",
     "readers": "crossgrad_core.contract.reader:Reader",
+    "exporters": "crossgrad_core.contract.exporter:Exporter",
+    "metrics": "crossgrad_core.contract.metric:Metric",
     "observers": "crossgrad_core.contract.observer:Observer",
 }
 
@@ -162,7 +167,7 @@ def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
             error,
             component,
             subject=f"{word} {name}",
-            prefix=word if slot != "observers" else f"observers.{name}",
+            prefix=f"{slot}.{name}" if slot in LISTS else word,
             todo=f"`crossgrad plugins show {name}` explains the options",
         ) from None
 

@@ -12,10 +12,17 @@ GROUPS: Final[dict[str, str]] = {
         "operators",
         "densifiers",
         "rasterizers",
+        "losses",
+        "exposures",
+        "resolutions",
         "readers",
+        "exporters",
+        "metrics",
         "observers",
     )
 }
+#: Slots that a run fills with any number of components.
+LISTS: Final = ("metrics", "observers")
 #: What packages offer as commands of `crossgrad`; no slot of a run.
 COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.

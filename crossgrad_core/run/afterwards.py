@@ -5,12 +5,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
+from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.evaluation import EvaluationResult
 from crossgrad_core.evaluation.evaluation import evaluate as measured
-from crossgrad_core.run.export import Exported, described, export_ply, renderer
+from crossgrad_core.evaluation.result import EvaluationResult
+from crossgrad_core.registry.entries import build, find
+from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_names import flat_names
@@ -20,7 +22,7 @@ from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
 from crossgrad_core.run.results.totals import Totals
-from crossgrad_core.run.session import totals
+from crossgrad_core.run.session import CLOUD, totals
 from crossgrad_core.system.writability import check_file, check_folder
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -81,7 +83,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
     with _writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
-        result = measured(setup.scene.test_views, renderer(setup, state))
+        result = measured(setup.scene.test_views, renderer(setup, state), setup.metrics)
         if writes:
             write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
         return result, totals(setup, state)
@@ -108,14 +110,14 @@ def render(folder: Path, *, split: str, out: Path | None, how: Opens = AS_IT_IS)
         writer = PanelWriter.of(folder, state.step, views, len(views))
         if out is not None:
             writer = replace(writer, folder=out)
-        measured(views, renderer(setup, state), on_view=writer.write)
+        measured(views, renderer(setup, state), setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
 
 def export(
     folder: Path,
     *,
-    file_format: str,
+    file_format: str | None,
     out: Path | None,
     camera: str | None = None,
     how: Opens = AS_IT_IS,
@@ -141,7 +143,7 @@ def export(
 def exported(
     folder: Path,
     *,
-    file_format: str,
+    file_format: str | None,
     out: Path | None,
     camera: str | None = None,
     how: Opens = AS_IT_IS,
@@ -150,7 +152,7 @@ def exported(
 
     Args:
         folder: The run's folder.
-        file_format: `ply`.
+        file_format: Name of an exporter; None takes the run's own.
         out: The file; by default one in the run's folder that summary.json does not describe as
             something else.
         camera: Name of the view to bake for; by default the average over the training views.
@@ -160,21 +162,32 @@ def exported(
         The file and what is in it.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, the file exists, there is no such view or
-            nothing to bake for it, or the run is training and no other file is named.
+        UserError: There is no such format, it is no run, it has no checkpoint, the file exists,
+            there is no such view or nothing to bake for it, or the run is training and no other
+            file is named.
     """
+    if file_format is not None:
+        find("exporters", file_format)
     with _writing(folder, out, "exporting"):
         if out is not None:
             _check_new(out)
             check_file(out)
         setup, state = how.open(folder)
+        exporter = _exporter(setup, file_format)
         if camera is not None:
             _check_bakes(setup)
-            path = out or folder / f"point_cloud_{_flat(setup, camera)}.{file_format}"
+            path = out or folder / f"{CLOUD}_{_flat(setup, camera)}.{exporter.suffix}"
             _check_new(path)
         else:
-            path = out or folder / _own_name(folder, f"point_cloud.{file_format}", state.step)
-        return path, export_ply(setup, state, path, camera)
+            path = out or folder / _own_name(folder, f"{CLOUD}.{exporter.suffix}", state.step)
+        return path, export_scene(setup, state, path, camera, exporter)
+
+
+def _exporter(setup: Setup, name: str | None) -> Exporter:
+    """The exporter of that name, with the run's own options where it is the run's."""
+    if name is None or name == setup.selection.names["exporter"]:
+        return setup.selection.exporter
+    return cast("Exporter", build("exporters", name, {}))
 
 
 @contextmanager

@@ -12,11 +12,16 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.loss import Loss
+from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
+from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
@@ -24,18 +29,26 @@ from crossgrad_core.defaults import CHAIN, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.registry.slots import LISTS
 from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import listed, plural
 
 _LOG = logging.getLogger(__name__)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
 #: Up to which K one that suits both sampler and operator is looked for.
 _MOST_VIEWS = 13
+#: Settings that name one component.
+SINGLE = (
+    *("backbone", "sampler", "grouping", "densifier", "rasterizer", "loss"),
+    *("exposure", "resolution", "exporter", "reader"),
+)
 
 
 def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
@@ -63,9 +76,8 @@ def check_names(config: RunConfig) -> None:
     """
     choose_device(config.device)
     named = [("operators", link) for link in config.operators]
-    named += [("observers", observer) for observer in config.observers]
-    for slot in ("backbone", "sampler", "grouping", "densifier", "rasterizer", "reader"):
-        named.append((f"{slot}s", getattr(config, slot)))
+    named += [(slot, choice) for slot in LISTS for choice in getattr(config, slot)]
+    named += [(plural(slot), getattr(config, slot)) for slot in SINGLE]
     for slot, choice in named:
         if choice is not None and choice.name != AUTO:
             find(slot, choice.name)
@@ -128,7 +140,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     config = _with_first_degree(config)
     selection, notes = select(config, scene, reader)
     observers = {choice.name: _built("observers", choice) for choice in config.observers}
-    plugins = _plugins(selection.components, observers)
+    plugins = _plugins(selection, observers)
     manager = make_manager(plugins)
     answers = manager.hook.crossgrad_objections(selection=selection)
     refuse(reasons_against(config, selection, answers))
@@ -196,6 +208,10 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "operator": operator_name,
         "densifier": densifier_choice.name,
         "rasterizer": rasterizer_name,
+        "loss": config.loss.name,
+        "exposure": config.exposure.name,
+        "resolution": config.resolution.name,
+        "exporter": config.exporter.name,
         "reader": reader,
     }
     grouping = None
@@ -208,6 +224,11 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         operator=operator,
         densifier=densifier,
         rasterizer=rasterizer,
+        loss=cast("Loss", _built("losses", config.loss)),
+        exposure=cast("Exposure", _built("exposures", config.exposure)),
+        resolution=cast("Resolution", _built("resolutions", config.resolution)),
+        exporter=cast("Exporter", _built("exporters", config.exporter)),
+        metrics=_metrics(config, scene),
         names=names,
         views_per_step=views,
         device=device.type,
@@ -227,6 +248,25 @@ def _require_points(config: RunConfig, scene: Scene) -> None:
 
 def _built(slot: str, choice: ComponentChoice) -> Component:
     return build(slot, choice.name, choice.options)
+
+
+def _metrics(config: RunConfig, scene: Scene) -> dict[str, Metric]:
+    """The metrics by name.
+
+    Raises:
+        UserError: Two columns of metrics.csv would have one name.
+    """
+    metrics = {each.name: cast("Metric", _built("metrics", each)) for each in config.metrics}
+    regimes = sorted({view.regime for view in scene.test_views})
+    columns = columns_for(regimes, [metric.figure for metric in metrics.values()])
+    if twice := sorted({name for name in columns if columns.count(name) > 1}):
+        raise UserError(
+            f"two columns of metrics.csv would be called {listed(twice)}",
+            where=f"metrics {listed(metrics)}; regimes {listed(regimes)}",
+            expected="figures whose names are no other's, nor those of another one in a regime",
+            todo="leave one of the metrics out, or rename the folder of photos",
+        )
+    return metrics
 
 
 def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
@@ -304,15 +344,15 @@ def _groups(
     notes += rule.notes
     notes += mode_note(selection.names["grouping"], grouping, scene)
     counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
-    listed = ", ".join(f"{label} {count}" for label, count in counts.items())
-    notes.append(f"groups of training views: {listed}")
+    counted = listed(f"{label} {count}" for label, count in counts.items())
+    notes.append(f"groups of training views: {counted}")
     return labels
 
 
-def _plugins(
-    components: Mapping[str, Component], observers: Mapping[str, Component]
-) -> dict[str, object]:
-    plugins: dict[str, object] = {**components}
+def _plugins(selection: Selection, observers: Mapping[str, Component]) -> dict[str, object]:
+    plugins: dict[str, object] = {**selection.components}
+    for name, metric in selection.metrics.items():
+        plugins[f"metric:{name}"] = metric
     for name, observer in observers.items():
         plugins[f"observer:{name}"] = observer
     return plugins

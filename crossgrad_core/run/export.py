@@ -1,19 +1,21 @@
-"""Writing the trained scene as a standard PLY, and what that costs where it is an approximation."""
+"""Writing the trained scene to a file, and what that costs where it is an approximation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import fsum
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.evaluation import evaluate
-from crossgrad_core.ply.cloud import SplatCloud
-from crossgrad_core.ply.file import write_ply
+from crossgrad_core.evaluation.evaluation import compare
+from crossgrad_core.evaluation.metrics import psnr
+from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import eval_background
@@ -21,7 +23,7 @@ from crossgrad_core.training.views import eval_background
 
 @dataclass(frozen=True)
 class Exported:
-    """What is in a PLY.
+    """What is in a file.
 
     Attributes:
         gaussians: Number of Gaussians.
@@ -61,8 +63,14 @@ class Exported:
         }
 
 
-def export_ply(setup: Setup, state: TrainState, path: Path, camera: str | None = None) -> Exported:
-    """Writes the standard PLY in the coordinates of the input.
+def export_scene(
+    setup: Setup,
+    state: TrainState,
+    path: Path,
+    camera: str | None = None,
+    exporter: Exporter | None = None,
+) -> Exported:
+    """Writes the trained scene in the coordinates of the input.
 
     Args:
         setup: The run.
@@ -70,6 +78,7 @@ def export_ply(setup: Setup, state: TrainState, path: Path, camera: str | None =
         path: The file.
         camera: Name of the view to bake what depends on the view for; None takes the average over
             the training views.
+        exporter: What writes the file; the run's own where none is given.
 
     Raises:
         UserError: There is no view of that name, or the file cannot be written.
@@ -79,21 +88,33 @@ def export_ply(setup: Setup, state: TrainState, path: Path, camera: str | None =
     views = setup.train_views if view is None else (view,)
     with torch.no_grad():
         cameras = [each.camera for each in views]
-        cloud = SplatCloud.from_gaussians(setup.backbone.bake(state.parameters, phase, cameras))
+        baked = setup.backbone.bake(state.parameters, phase, cameras)
+    exporter = exporter or setup.selection.exporter
     comments = (f"crossgrad step {state.step}",)
-    notes = write_ply(path, cloud, setup.scene.similarity, comments)
+    notes = exporter.write(baked, setup.scene.similarity, path, comments)
     if setup.backbone.plain:
-        return Exported(len(cloud), notes=notes)
+        return Exported(len(baked), notes=notes)
     compared = setup.scene.test_views if view is None else (view,)
-    drawn = drawer(setup, cloud.to_gaussians())
+    drawn = drawer(setup, state, exporter.stored(baked))
     return Exported(
-        gaussians=len(cloud),
+        gaussians=len(baked),
         baked_for=camera or f"{len(views)} training views",
         views=len(compared),
-        psnr=evaluate(compared, drawn).overall.psnr,
-        live_psnr=evaluate(compared, renderer(setup, state)).overall.psnr,
+        psnr=_mean_psnr(compared, drawn),
+        live_psnr=_mean_psnr(compared, renderer(setup, state)),
         notes=notes,
     )
+
+
+def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> float | None:
+    """dB, mean over the views that have pixels to compare; None without any."""
+    each = []
+    with torch.no_grad():
+        for view in views:
+            pair = compare(view, render_one(view))
+            each.append(psnr(pair.render, pair.photo, pair.mask))
+    known = [value for value in each if value is not None]
+    return fsum(known) / len(known) if known else None
 
 
 def view_named(setup: Setup, name: str) -> View:
@@ -115,13 +136,13 @@ def view_named(setup: Setup, name: str) -> View:
 
 
 def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
-    """Renders a view with the current parameters as an evaluation does."""
+    """Renders a view with the current parameters as an evaluation does, exposure included."""
     through = camera_renderer(setup, state)
-    return lambda view: through(view.camera)
+    return lambda view: exposed(setup, state, view, through(view.camera))
 
 
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
-    """Renders what any camera sees with the current parameters as an evaluation does."""
+    """Renders what any camera sees with the current parameters, before any exposure."""
     background = eval_background(setup)
     phase = setup.phase(state.step, training=False)
 
@@ -132,19 +153,20 @@ def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tenso
     return render_one
 
 
-def drawer(setup: Setup, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Renders a view of Gaussians that are the same for every camera."""
+def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[View], Tensor]:
+    """Renders a view of Gaussians that are the same for every camera, exposure included."""
     background = eval_background(setup)
     moved = gaussians.mapped(lambda tensor: tensor.to(setup.device))
 
     def render_one(view: View) -> Tensor:
-        return setup.rasterizer.render(moved, view.camera, background).image
+        image = setup.rasterizer.render(moved, view.camera, background).image
+        return exposed(setup, state, view, image)
 
     return render_one
 
 
 def described(exported: Exported, path: Path) -> Sequence[str]:
-    """Lines for the user about a PLY."""
+    """Lines for the user about a file."""
     lines = [*exported.notes]
     if exported.loss is not None:
         lines.append(

@@ -8,9 +8,11 @@ from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.contents import Checkpoint
-from crossgrad_core.training.rngs import restored_streams, stream_states
+from crossgrad_core.training.clock import Clock
+from crossgrad_core.training.photo_parameters import check_photos_are
+from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.state import Clock, Counters, TrainState
+from crossgrad_core.training.state import Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed
 
 
@@ -38,13 +40,15 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     """The state that continues bit for bit where the checkpoint was written.
 
     Raises:
-        UserError: It is not a state of this run: of another backbone, or damaged.
+        UserError: It is not a state of this run: of another backbone, of other photos, or damaged.
     """
     _check_tensors(setup, checkpoint)
     try:
-        return _restored(setup, checkpoint)
+        state = _restored(setup, checkpoint)
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise _misfit(checkpoint, "the state of a run", in_one_line(error)) from error
+    check_photos_are(setup, state)
+    return state
 
 
 def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
@@ -61,14 +65,25 @@ def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
             exp_avg_sq={name: tensor.to(device) for name, tensor in checkpoint.exp_avg_sq.items()},
             steps=dict(checkpoint.adam_steps),
         ),
-        rngs=restored_streams(checkpoint.generators),
+        # A checkpoint of an earlier version lacks the streams that came later.
+        rngs={
+            **make_streams(setup.config.seed, scalars["rewinds"]),
+            **restored_streams(checkpoint.generators),
+        },
         states={name: state.to(device) for name, state in checkpoint.plugins.items()},
         step=checkpoint.step,
         last=_record(scalars["last"]),
         counters=Counters(**_figures(scalars["counters"])),
-        clock=Clock(**_figures(scalars["clock"])),
+        clock=_clock(scalars["clock"]),
         rewinds=scalars["rewinds"],
     )
+
+
+def _clock(plain: dict[str, Any]) -> Clock:
+    """The clock; checkpoints of earlier versions do not tell training seconds by phase."""
+    phases = _figures(plain.get("phases", {}))
+    rest = {name: value for name, value in plain.items() if name != "phases"}
+    return Clock(**_figures(rest), phases=phases)
 
 
 def _figures(plain: dict[str, Any]) -> dict[str, Any]:
@@ -125,5 +140,6 @@ def _record(plain: dict[str, Any] | None) -> StepRecord | None:
             "names": tuple(plain["names"]),
             "labels": None if labels is None else tuple(labels),
             "losses": tuple(plain["losses"]),
+            "scales": tuple(plain.get("scales", ())),
         }
     )

@@ -8,6 +8,12 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.training.setup import Setup
 
+#: Slots that every run fills with one component.
+ALWAYS = (
+    *("backbone", "sampler", "densifier", "rasterizer"),
+    *("loss", "exposure", "resolution", "exporter"),
+)
+
 
 def resolved(setup: Setup) -> RunConfig:
     """The configuration that repeats the run: components with all options, K and steps fixed.
@@ -16,10 +22,7 @@ def resolved(setup: Setup) -> RunConfig:
     """
     config, selection = setup.config, setup.selection
     components, names = selection.components, selection.names
-    chosen: dict[str, Any] = {
-        slot: _choice(names[slot], components[slot])
-        for slot in ("backbone", "sampler", "densifier", "rasterizer")
-    }
+    chosen: dict[str, Any] = {slot: _choice(names[slot], components[slot]) for slot in ALWAYS}
     if "grouping" in components:
         chosen["grouping"] = _choice(names["grouping"], components["grouping"])
     scene = None if config.scene is None else Path(config.scene).resolve()
@@ -30,6 +33,7 @@ def resolved(setup: Setup) -> RunConfig:
             **chosen,
             "operator": _operator(config, setup),
             "reader": ComponentChoice(name=names["reader"]),
+            "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,
             "reading": config.reading.model_copy(update={"init": init}),

@@ -2,29 +2,34 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 
 from crossgrad_core.contract.contexts import EvaluationReport
-from crossgrad_core.evaluation.evaluation import EvaluationResult, evaluate
+from crossgrad_core.evaluation.evaluation import evaluate
+from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint.checkpoint import drop_later, save
 from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.export import Exported, described, export_ply, renderer
+from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.persist import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
-from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row, read_metrics
+from crossgrad_core.run.results.metrics_csv import (
+    MetricsCsv,
+    columns_for,
+    metrics_row,
+    read_metrics,
+)
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
-from crossgrad_core.run.results.totals import Seconds, Totals
+from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.training.memory import peak_mebibytes
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
-#: The trained scene, for viewers.
-PLY = "point_cloud.ply"
+#: The trained scene, for viewers; the suffix is the exporter's.
+CLOUD = "point_cloud"
 #: Held-out views of which panels are drawn.
 PANELS = 4
 
@@ -48,12 +53,12 @@ class Session:
     @classmethod
     def fresh(cls, folder: Path, setup: Setup) -> "Session":
         """The session of a new run."""
-        return cls(folder, MetricsCsv.create(folder, regimes_of(setup)))
+        return cls(folder, MetricsCsv.create(folder, columns_of(setup)))
 
     @classmethod
     def resumed(cls, folder: Path, setup: Setup, step: int) -> "Session":
         """The session of a run that continues after `step`."""
-        session = cls(folder, MetricsCsv.resume(folder, regimes_of(setup), step))
+        session = cls(folder, MetricsCsv.resume(folder, columns_of(setup), step))
         session._saved_step = step
         rows = read_metrics(folder)
         if rows:
@@ -78,6 +83,7 @@ class Session:
         result = evaluate(
             setup.scene.test_views,
             renderer(setup, state),
+            setup.metrics,
             on_view=None if writer is None else writer.write,
         )
         state.clock.evaluate += perf_counter() - start
@@ -87,7 +93,8 @@ class Session:
         row = metrics_row(totals(setup, state), result)
         self._table.append(row)
         self._evaluated_step = state.step
-        setup.hook.crossgrad_evaluation(report=EvaluationReport(state.step, row))
+        report = EvaluationReport(state.step, row, tuple(result.regimes))
+        setup.hook.crossgrad_evaluation(report=report)
 
     def save(self, setup: Setup, state: TrainState) -> None:
         """Writes a checkpoint."""
@@ -99,7 +106,7 @@ class Session:
 
     def rewind(self, setup: Setup, step: int) -> None:
         """Drops rows and checkpoints of steps that training went back behind."""
-        self._table = MetricsCsv.resume(self.folder, regimes_of(setup), step)
+        self._table = MetricsCsv.resume(self.folder, columns_of(setup), step)
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1
 
@@ -123,9 +130,9 @@ class Session:
 
     def export(self, setup: Setup, state: TrainState) -> None:
         """Writes the trained scene and says what the file is."""
-        path = self.folder / PLY
+        path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
         with reporting(state):
-            self._exported = export_ply(setup, state, path)
+            self._exported = export_scene(setup, state, path)
         for line in described(self._exported, path):
             setup.hook.crossgrad_message(text=line)
 
@@ -140,7 +147,7 @@ class Session:
             result=self.result(state.step),
             ply=None if self._exported is None else self._exported.as_data(),
             rows=read_metrics(self.folder),
-            seconds=Seconds(**asdict(state.clock)),
+            seconds=state.clock,
             config=setup.config.model_dump(mode="json"),
             environment=environment(str(setup.device)),
             notes=setup.notes,
@@ -174,6 +181,11 @@ def totals(setup: Setup, state: TrainState) -> Totals:
 def regimes_of(setup: Setup) -> list[str]:
     """The regimes of the held-out views."""
     return sorted({view.regime for view in setup.scene.test_views})
+
+
+def columns_of(setup: Setup) -> tuple[str, ...]:
+    """The columns of metrics.csv."""
+    return columns_for(regimes_of(setup), [metric.figure for metric in setup.metrics])
 
 
 def view_counts(setup: Setup) -> dict[str, int]:

@@ -13,7 +13,7 @@ import yaml
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
@@ -21,9 +21,10 @@ from crossgrad_core.wording import listed, singular
 
 Settings: TypeAlias = dict[str, Any]
 
-OBSERVERS: Final = "observers"
+#: Options that add to a list of components, by the setting that they add to.
+ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
 #: Settings that name one component (or a chain of operators) and hold its options.
-CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot != OBSERVERS)
+CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
 #: Settings that say how long a run is.
 LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
 _FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")
@@ -84,7 +85,7 @@ def _normalized(settings: Settings) -> Settings:
 def _long_form(key: str, value: object) -> object:
     if key in CHOICES and value is not None:
         return _choice(value)
-    if key == OBSERVERS and value is not None:
+    if key in LISTS and value is not None:
         return [_named(each) for each in _items(value)]
     return value
 
@@ -161,14 +162,22 @@ def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
     key, *rest = path
     if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str):
         settings[key] = _renamed(settings.get(key), _choice(value))
-    elif key == OBSERVERS and not rest and value is not None:
-        settings[key] = _extended(_links(settings.get(key)), _links(_long_form(key, value)))
+    elif key in LISTS and not rest and value is not None:
+        settings[key] = _extended(_links(_listed(settings, key)), _links(_long_form(key, value)))
     elif not rest:
         settings[key] = _long_form(key, value)
     else:
-        if key == OBSERVERS and settings.get(key) is None:
-            settings[key] = []
+        if key in LISTS:
+            settings[key] = _listed(settings, key)
         _holder(settings, path)[path[-1]] = value
+
+
+def _listed(settings: Settings, key: str) -> object:
+    """A list of components as it is so far: that of a run by default, where none was given."""
+    given = settings.get(key)
+    if given is not None:
+        return given
+    return [choice.model_dump() for choice in RunConfig.model_fields[key].default]
 
 
 def _links(value: object) -> list[Settings]:
@@ -243,5 +252,5 @@ def _whose(links: list[object], path: tuple[str, ...]) -> UserError:
         f"{path[0]} is a list; the option must say whose it is",
         where=f"--set {'.'.join(path)}",
         expected=listed(f"{path[0]}.{name}.{path[-1]}" for name in names),
-        todo="--observe NAME adds an observer" if path[0] == OBSERVERS else whole,
+        todo=f"{ADDING[path[0]]} NAME adds one" if path[0] in ADDING else whole,
     )

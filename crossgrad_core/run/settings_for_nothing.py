@@ -15,11 +15,12 @@ from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
+from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, plural
 
-_SLOTS = ("backbone", "sampler", "grouping", "densifier", "rasterizer")
+_SLOTS = ("grouping", *ALWAYS)
 _TIMES = ("densify_from", "densify_until", "densify_every", "max_gaussians")
 
 
@@ -79,7 +80,7 @@ def _of_choice(
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
     # As the user set it: fitted to the scene, it may have lost what the scene does not need.
-    component = build(f"{slot}s", name, choice.options)
+    component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{place}.{option}", why
 

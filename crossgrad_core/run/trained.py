@@ -18,7 +18,7 @@ from crossgrad_core.run.results.summary import read_summary
 
 if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Camera, Scene
-    from crossgrad_core.evaluation.evaluation import EvaluationResult
+    from crossgrad_core.evaluation.result import EvaluationResult
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
@@ -99,14 +99,16 @@ class Run:
         """
         import torch
 
-        from crossgrad_core.run.export import camera_renderer, view_named
+        from crossgrad_core.run.export import camera_renderer, renderer, view_named
         from crossgrad_core.run.process import as_in_a_command
 
         setup, state = self._open()
-        camera = view_named(setup, view).camera if isinstance(view, str) else view
         with as_in_a_command(), torch.no_grad():
-            image = camera_renderer(setup, state)(camera).clamp(0.0, 1.0)
-            return np.asarray(image.cpu().numpy(), dtype=np.float32)
+            if isinstance(view, str):
+                image = renderer(setup, state)(view_named(setup, view))
+            else:
+                image = camera_renderer(setup, state)(view)
+            return np.asarray(image.clamp(0.0, 1.0).cpu().numpy(), dtype=np.float32)
 
     def evaluate(self) -> "EvaluationResult":
         """Evaluates the held-out views again and renews per_view.csv, as `crossgrad eval` does.
@@ -121,7 +123,7 @@ class Run:
             return evaluated(self.folder, self._opened)[0]
 
     def export(self, path: Path | str, camera: str | None = None) -> Path:
-        """Writes the trained scene as a PLY file that viewers open, as `crossgrad export` does.
+        """Writes the trained scene with the run's exporter, as `crossgrad export` does.
 
         Args:
             path: The file.
@@ -140,7 +142,7 @@ class Run:
 
         with as_in_a_command():
             out = Path(path)
-            exported(self.folder, file_format="ply", out=out, camera=camera, how=self._opened)
+            exported(self.folder, file_format=None, out=out, camera=camera, how=self._opened)
             return out
 
     def _open(self) -> "tuple[Setup, TrainState]":

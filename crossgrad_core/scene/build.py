@@ -12,7 +12,7 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene.blank_photos import without_blank_photos
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
-from crossgrad_core.scene.photos import FilePhoto, PhotoCache
+from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
@@ -46,7 +46,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     seen = [points.rows(view.seen) for view in used]
     by_folder = label_by_folder([view.name for view in used])
     regimes = by_folder or label_by_footprint(cameras, seen, local, train)
-    cache = PhotoCache(options.cache_mib)
+    cache: PhotoCache[PhotoSource] = PhotoCache(options.cache_mib)
     return Scene(
         name=raw.root.resolve().name or "scene",
         views=tuple(

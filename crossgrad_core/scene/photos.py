@@ -4,6 +4,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -132,7 +133,18 @@ class PhotoSource:
         return _both(keep, np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8))
 
 
-class PhotoCache:
+class Decodable(Protocol):
+    """Something to be decoded; hashable, and equal where the outcome is."""
+
+    def decode(self) -> _Decoded:
+        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts."""
+        ...
+
+
+Key = TypeVar("Key", bound=Decodable)
+
+
+class PhotoCache(Generic[Key]):
     """Decoded photos in a bounded amount of memory; may be used from several threads.
 
     Training walks through all photos again and again. Were the least recently used photo dropped, a
@@ -147,8 +159,8 @@ class PhotoCache:
     def __init__(self, mib: int) -> None:
         self._limit = mib * 2**20
         self._used = 0
-        self._kept: OrderedDict[PhotoSource, _Decoded] = OrderedDict()
-        self._latest: OrderedDict[PhotoSource, _Decoded] = OrderedDict()
+        self._kept: OrderedDict[Key, _Decoded] = OrderedDict()
+        self._latest: OrderedDict[Key, _Decoded] = OrderedDict()
         self._lock = Lock()
 
     @property
@@ -156,7 +168,7 @@ class PhotoCache:
         """Bytes of the decoded photos and masks."""
         return self._used
 
-    def get(self, source: PhotoSource) -> _Decoded:
+    def get(self, source: Key) -> _Decoded:
         """The decoded photo and mask of `source`; shared, so never to be written to."""
         with self._lock:
             decoded = self._kept.get(source) or self._latest.get(source)
@@ -166,7 +178,7 @@ class PhotoCache:
                 self._keep(source, decoded)
         return decoded
 
-    def _keep(self, source: PhotoSource, decoded: _Decoded) -> None:
+    def _keep(self, source: Key, decoded: _Decoded) -> None:
         if source in self._kept or source in self._latest:
             return
         self._latest[source] = decoded
@@ -187,7 +199,7 @@ class FilePhoto(Photo):
     """A photo on disk, decoded on demand into the scene's cache."""
 
     source: PhotoSource
-    cache: PhotoCache
+    cache: PhotoCache[PhotoSource]
 
     @override
     def image(self) -> Tensor:

@@ -31,6 +31,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.records import view_record
 
 #: Steps of the published schedule around its second and third edit, at 600 and 700.
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
@@ -102,7 +103,7 @@ class DensifierRun:
         with torch.no_grad():
             gaussians = self.backbone.decode(self.parameters, view.camera, sample_phase(step))
         screen = _screen(len(gaussians), self.densifier.needs, (index, step))
-        return ViewRecord(index, view, None, 0.1, gaussians, screen, torch.zeros(3))
+        return view_record(view, gaussians, screen, index)
 
     def _require_rows(self, state: PluginState) -> None:
         for name, tensor in state.per_primitive.items():

@@ -27,12 +27,13 @@ from crossgrad_core.contract.contexts import (
     StepRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.topology import NO_EDIT
-from crossgrad_core.defaults import BACKBONE, NO_DENSIFIER, REFERENCE_RASTERIZER
+from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
@@ -171,7 +172,7 @@ def _model(step: int) -> Model:
             steps=dict.fromkeys(parameters, step),
         ),
         background=torch.zeros(3),
-        ssim_weight=0.2,
+        loss=cast("Loss", build("losses", LOSS, {})),
         groups=None,
     )
 

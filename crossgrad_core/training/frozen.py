@@ -7,7 +7,6 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.contract.scene import View
-from crossgrad_core.training.loss.loss import photometric_loss
 
 
 def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str, Tensor]:
@@ -26,11 +25,11 @@ def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str
     gaussians = model.backbone.decode(model.parameters, view.camera, model.phase)
     image = model.rasterizer.render(gaussians, view.camera, model.background).image
     mask = view.photo.mask()
-    loss = photometric_loss(
-        image,
+    loss = model.loss.loss(
+        model.exposed(view, image),
         view.photo.image().to(image.device),
         None if mask is None else mask.to(image.device),
-        model.ssim_weight,
+        None,
     )
     if not loss.requires_grad:
         return {}

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from time import perf_counter
 from typing import Literal, Protocol
 
 import torch
 
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
+from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.setup import Setup
@@ -111,11 +111,12 @@ def _steps(
 
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     """One step on the training clock; decoding photos is counted as loading."""
-    start, loaded = perf_counter(), state.clock.load
+    state.laps = Laps()
     record = take_step(setup, state)
     if setup.device.type == "cuda":
         torch.cuda.synchronize(setup.device)
-    state.clock.train += perf_counter() - start - (state.clock.load - loaded)
+    state.laps.lap("other")
+    state.clock.count(state.laps)
     state.last = replace(record, train_seconds=state.clock.train)
     return state.last
 

@@ -8,8 +8,11 @@ import numpy as np
 
 STREAMS = (
     "create", "grouping", "sampler", "operator", "densifier", "after_step", "regularize",
-    "background",
+    "background", "resolution",
 )  # fmt: skip
+
+#: Those that came after 0.1, whose checkpoints lack them: they start anew.
+_LATER = frozenset({"resolution"})
 
 
 def make_streams(seed: int, rewinds: int = 0) -> dict[str, np.random.Generator]:
@@ -26,11 +29,11 @@ def restored_streams(states: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ra
     """Generators that continue from `states`.
 
     Raises:
-        KeyError: A stream is missing.
+        KeyError: A stream is missing that every version has.
         TypeError: A state is none of NumPy's.
         ValueError: Likewise.
     """
-    absent = [name for name in STREAMS if name not in states]
+    absent = [name for name in STREAMS if name not in states and name not in _LATER]
     if absent:
         raise KeyError(*absent)
     streams = {}

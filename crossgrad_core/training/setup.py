@@ -11,6 +11,9 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.exposure import Exposure, PerPhoto
+from crossgrad_core.contract.loss import Loss
+from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.sampler import Sampler
@@ -18,6 +21,7 @@ from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.training.operator_scale import OperatorScale
+from crossgrad_core.training.scaled_photos import ScaledPhotos
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,21 @@ class Setup:
         """The rasterizer."""
         return self.selection.rasterizer
 
+    @property
+    def loss(self) -> Loss:
+        """The photometric loss."""
+        return self.selection.loss
+
+    @property
+    def exposure(self) -> Exposure:
+        """What cameras do to light."""
+        return self.selection.exposure
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """What is measured of held-out views."""
+        return tuple(self.selection.metrics.values())
+
     @cached_property
     def hook(self) -> pluggy.HookRelay:
         """The hook caller of this run."""
@@ -90,6 +109,27 @@ class Setup:
     def train_views(self) -> tuple[View, ...]:
         """The training views, in the order that samplers index."""
         return self.scene.train_views
+
+    @cached_property
+    def row_of(self) -> dict[str, int]:
+        """Name of a training view -> its position."""
+        return {view.name: row for row, view in enumerate(self.train_views)}
+
+    @cached_property
+    def per_photo(self) -> Mapping[str, PerPhoto]:
+        """The parameters that every training photo has a value of."""
+        return self.exposure.per_photo(self.scene)
+
+    @cached_property
+    def scaled_photos(self) -> ScaledPhotos:
+        """Where photos of smaller sizes are kept."""
+        # At half the size they take a quarter of the memory.
+        return ScaledPhotos(max(1, self.config.reading.cache_mib // 4))
+
+    @cached_property
+    def weighs(self) -> bool:
+        """Whether any plugin weighs pixels."""
+        return bool(self.hook.crossgrad_pixel_weights.get_hookimpls())
 
     @cached_property
     def watchers(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.training import photo_parameters
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
@@ -32,7 +33,11 @@ def first_state(setup: Setup) -> TrainState:
         for name, tensor in parameters.items()
     }
     parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
-    return TrainState(parameters=parameters, adam=AdamState(), rngs=rngs)
+    state = TrainState(parameters=parameters, adam=AdamState(), rngs=rngs)
+    photos = photo_parameters.started(setup)
+    if photos is not None:
+        state.commit({photo_parameters.STATE: photos})
+    return state
 
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:

@@ -10,6 +10,7 @@ from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import PluginState
+from crossgrad_core.training.clock import Clock, Laps
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 
@@ -30,17 +31,6 @@ class Counters:
 
 
 @dataclass
-class Clock:
-    """Seconds by what they were spent on; only `train` counts as training."""
-
-    train: float = 0.0
-    compile: float = 0.0
-    load: float = 0.0
-    evaluate: float = 0.0
-    report: float = 0.0
-
-
-@dataclass
 class TrainState:
     """Everything that a step reads and writes.
 
@@ -53,6 +43,7 @@ class TrainState:
         last: Record of the last complete step.
         counters: What was done so far.
         clock: Seconds so far.
+        laps: What the step under way has spent its time on.
         rewinds: How often training went back to the last good state.
         touched: Whether a step that is not complete has begun to change parameters or moments.
     """
@@ -65,6 +56,7 @@ class TrainState:
     last: StepRecord | None = None
     counters: Counters = field(default_factory=Counters)
     clock: Clock = field(default_factory=Clock)
+    laps: Laps = field(default_factory=Laps)
     rewinds: int = 0
     touched: bool = False
 
@@ -101,7 +93,7 @@ class Mark:
             states=dict(state.states),
             streams=stream_states(state.rngs),
             counters=replace(state.counters),
-            clock=replace(state.clock),
+            clock=state.clock.copy(),
             rewinds=state.rewinds,
         )
 
@@ -112,7 +104,7 @@ class Mark:
         state.states = dict(self.states)
         state.rngs = restored_streams(self.streams)
         state.counters = replace(self.counters)
-        state.clock = replace(self.clock)
+        state.clock = self.clock.copy()
         state.rewinds = self.rewinds
 
 

@@ -2,8 +2,6 @@
 
 import sys
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,15 +16,19 @@ from crossgrad_core.contract.contexts import (
     Draw,
     SampleContext,
     Sampled,
+    ScaleContext,
+    Scaled,
     StepRecord,
 )
 from crossgrad_core.contract.topology import Edit
+from crossgrad_core.errors import UserError
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.operator_scale import Scale
+from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -34,8 +36,8 @@ from crossgrad_core.training.views import (
     Rendered,
     TensorGradients,
     add_regularization,
+    context_fields,
     joined,
-    photo_of,
     render_views,
 )
 
@@ -49,7 +51,8 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     regroup_if_due(setup, state)
     state.step += 1
     draw = _sample(setup, state)
-    rendered = render_views(setup, state, draw)
+    scales = _scales(setup, state, draw)
+    rendered = render_views(setup, state, draw, scales)
     context = _aggregate_context(setup, state, draw, rendered)
     aggregated = _aggregate(setup, state, context)
     of_step: TensorGradients = {}
@@ -58,6 +61,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     scale = setup.operator_scale.of(context)
     gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     _check_finite(state, rendered, gradients)
+    state.laps.lap("aggregation")
     counts = _finish(setup, state, rendered, gradients, scale)
     return StepRecord(
         step=state.step,
@@ -68,12 +72,13 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         primitives=state.primitives(setup),
         counts={**aggregated.counts, **counts},
         train_seconds=state.clock.train,
+        scales=scales,
     )
 
 
 def _sample(setup: Setup, state: TrainState) -> Draw:
     context = SampleContext(
-        **_common(setup, state, "sampler"),
+        **context_fields(setup, state, "sampler"),
         views_per_step=setup.selection.views_per_step,
         groups=groups_of(setup, state),
         centers=setup.scene.centers,
@@ -84,17 +89,34 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     return answer.draw
 
 
+def _scales(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
+    context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
+    answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
+    state.commit(answer.states)
+    scales = answer.scales
+    if len(scales) == len(draw.views) and all(0.0 < scale <= 1.0 for scale in scales):
+        return scales
+    raise UserError(
+        "the resolution does not give each view a scale",
+        where=f"resolution {setup.selection.names['resolution']}, step {state.step}",
+        expected=f"{len(draw.views)} numbers above 0 and at most 1",
+        found=repr(scales),
+        todo="choose another --resolution, or repair the plugin",
+    )
+
+
 def _aggregate_context(
     setup: Setup, state: TrainState, draw: Draw, rendered: Rendered
 ) -> AggregateContext:
     return AggregateContext(
-        **_common(setup, state, "operator"),
+        **context_fields(setup, state, "operator"),
         gradients=rendered.gradients,
         losses=np.array([record.loss for record in rendered.records]),
         labels=draw.labels,
         distances=setup.scene.distances[list(draw.views)],
         reference_distance=float(np.median(setup.scene.distances)),
         blocks=setup.trained_blocks,
+        scales=tuple(record.scale for record in rendered.records),
     )
 
 
@@ -111,7 +133,7 @@ def _finish(
     """Optimizer, density control and `after_step` in the order of the preset."""
     state.touched = True
     if not setup.densify_first:
-        _optimize(setup, state, gradients, scale)
+        _optimize(setup, state, rendered, gradients, scale)
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
@@ -119,22 +141,26 @@ def _finish(
         gone = set(gradients) if edited else set(edit.values)
         if state.step < setup.schedule.total:
             left = {name: g for name, g in gradients.items() if name not in gone}
-            _optimize(setup, state, left, scale)
+            _optimize(setup, state, rendered, left, scale)
     if setup.acts_after_step:
         _after_step(setup, state, edited=edited)
     return edit.counts
 
 
-def _optimize(setup: Setup, state: TrainState, gradients: TensorGradients, scale: Scale) -> None:
+def _optimize(
+    setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
+) -> None:
     progress = state.step / setup.schedule.lr_steps
+    take_photo_step(setup, state, rendered.photos, progress)
     blocks = setup.trained_blocks
     rates = {name: block.lr.at(progress) for block in blocks for name in block.tensors}
     adam_step(state.parameters, gradients, state.adam, rates, scales=scale.to_sum)
+    state.laps.lap("optimizer")
 
 
 def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit, bool]:
     context = DensifyContext(
-        **_common(setup, state, "densifier"),
+        **context_fields(setup, state, "densifier"),
         parameters=state.parameters,
         backbone=setup.backbone,
         rasterizer=setup.rasterizer,
@@ -144,12 +170,14 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
     state.commit(answer.states)
-    return answer.edit, apply_edit(setup, state, answer.edit)
+    edited = apply_edit(setup, state, answer.edit)
+    state.laps.lap("density_control")
+    return answer.edit, edited
 
 
 def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
     context = AfterStepContext(
-        **_common(setup, state, "after_step"),
+        **context_fields(setup, state, "after_step"),
         parameters=state.parameters,
         backbone=setup.backbone,
         means_lr=_means_lr(setup, state.step),
@@ -158,17 +186,6 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
     for answer in setup.hook.crossgrad_after_step(context=context):
         state.commit(answer.states)
         apply_edit(setup, state, answer.edit)
-
-
-def _common(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
-    return {
-        "step": state.step,
-        "schedule": setup.schedule,
-        "scene": setup.scene,
-        "states": state.states,
-        "rng": state.rngs[stream],
-        "photo": partial(photo_of, setup, state),
-    }
 
 
 def _means_lr(setup: Setup, step: int) -> float:

@@ -1,24 +1,32 @@
 """Rendering the K views of a step and running their backward passes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from math import isfinite
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import Draw, Model, RegularizeContext, ViewRecord
-from crossgrad_core.contract.gaussians import Gaussians, Render
+from crossgrad_core.contract.contexts import (
+    Draw,
+    Model,
+    PixelContext,
+    RegularizeContext,
+    ViewRecord,
+)
+from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.scene import View
+from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.loss.loss import photometric_loss
 from crossgrad_core.training.operator_scale import Scale
+from crossgrad_core.training.photo_parameters import Leaves, exposed, leaves_of
+from crossgrad_core.training.scaled_photos import ScaledPhoto
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -34,11 +42,13 @@ class Rendered:
         records: One record per view.
         gradients: Their gradients, apart or summed up as the operator needs them.
         regular: Sum of the gradients of the views' regularisation terms, apart from the above.
+        photos: Position of each view and the values of its photo, with their gradients.
     """
 
     records: tuple[ViewRecord, ...]
     gradients: Gradients
     regular: TensorGradients
+    photos: tuple[tuple[int, Leaves], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,66 +57,77 @@ class _Drawn:
 
     record: ViewRecord
     gaussians: Gaussians
-    render: Render
     loss: Tensor
+    leaves: Leaves
 
 
-def render_views(setup: Setup, state: TrainState, draw: Draw) -> Rendered:
-    """Renders the views of `draw` and gathers their gradients.
+def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float]) -> Rendered:
+    """Renders the views of `draw` at their scales and gathers their gradients.
 
     Raises:
         NonFiniteError: A loss is not finite.
     """
     regular: TensorGradients = {}
     if setup.joint:
-        return _render_jointly(setup, state, draw, regular)
-    records, per_view = [], []
+        return _render_jointly(setup, state, draw, scales, regular)
+    records, per_view, photos = [], [], []
     total = SummedGradients.empty(setup.trained_blocks, len(draw.views))
     _clear(state.parameters)
     for slot in range(len(draw.views)):
-        drawn = _draw_view(setup, state, draw, slot)
+        drawn = _draw_view(setup, state, draw, slot, scales[slot])
         _regularize_view(setup, state, drawn, regular)
+        state.laps.lap("loss")
         _backward(drawn.loss)
         records.append(drawn.record)
+        photos.append((drawn.record.index, drawn.leaves))
         if setup.separate:
             per_view.append(_take(state.parameters))
         else:
             total.add(_take(state.parameters))
+        state.laps.lap("backward")
     state.counters.backward_passes += len(records)
     if not setup.separate:
-        return Rendered(tuple(records), total, regular)
+        return Rendered(tuple(records), total, regular, tuple(photos))
     # Nobody looks at single views after they are combined, unless a plugin says so.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
-    return Rendered(tuple(records), apart, regular)
+    return Rendered(tuple(records), apart, regular, tuple(photos))
 
 
 def _render_jointly(
-    setup: Setup, state: TrainState, draw: Draw, regular: TensorGradients
+    setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float], regular: TensorGradients
 ) -> Rendered:
     """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
     _clear(state.parameters)
-    drawn = [_draw_view(setup, state, draw, slot) for slot in range(len(draw.views))]
+    drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     for view in drawn:
         _regularize_view(setup, state, view, regular)
+    state.laps.lap("loss")
     _backward(torch.stack([view.loss for view in drawn]).sum())
+    state.laps.lap("backward")
     state.counters.backward_passes += 1
     records = tuple(view.record for view in drawn)
     total = SummedGradients(_take(state.parameters), setup.trained_blocks, len(records))
-    return Rendered(records, total, regular)
+    photos = tuple((view.record.index, view.leaves) for view in drawn)
+    return Rendered(records, total, regular, photos)
 
 
-def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn:
+def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Drawn:
     index = draw.views[slot]
     view = setup.train_views[index]
-    target, mask = photo_of(setup, state, view)
+    target = target_at(setup, state, index, scale)
     background = background_of(setup, state)
+    state.laps.lap("photos")
     gaussians = setup.backbone.decode(
-        state.parameters, view.camera, setup.phase(state.step, training=True)
+        state.parameters, target.camera, setup.phase(state.step, training=True)
     )
+    state.laps.lap("decode")
     # Nobody reads the optional statistics once density control is over, and some cost much.
     wanted = setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
-    render = setup.rasterizer.render(gaussians, view.camera, background, wanted)
-    loss = photometric_loss(render.image, target, mask, setup.config.ssim_weight)
+    render = setup.rasterizer.render(gaussians, target.camera, background, wanted)
+    state.laps.lap("render")
+    leaves = leaves_of(setup, state, index)
+    image = setup.exposure.exposed(render.image, leaves)
+    loss = setup.loss.loss(image, target.photo, target.mask, _weights(setup, state, index, target))
     state.counters.views += 1
     value = float(loss.detach())
     if not isfinite(value):
@@ -119,8 +140,81 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int) -> _Drawn
         gaussians=gaussians.detached(),
         screen=render.screen,
         background=background,
+        camera=target.camera,
+        scale=scale,
+        image=image.detach(),
+        photo=target.photo,
+        mask=target.mask,
     )
-    return _Drawn(record, gaussians, render, loss)
+    return _Drawn(record, gaussians, loss, leaves)
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """What a render is compared with.
+
+    Attributes:
+        camera: The camera to render with.
+        scale: Its sides over those of the view's own.
+        photo: [H, W, 3] uint8.
+        mask: [H, W] bool; None where every pixel counts.
+    """
+
+    camera: Camera
+    scale: float
+    photo: Tensor
+    mask: Tensor | None
+
+
+def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> _Target:
+    """Camera and photo of a training view at a scale in (0, 1]."""
+    view = setup.train_views[index]
+    camera = camera_at(view.camera, scale)
+    if camera is view.camera:
+        photo, mask = photo_of(setup, state, view)
+    else:
+        full = partial(photo_of, setup, state)
+        small = ScaledPhoto(view, camera.width, camera.height, full)
+        photo, mask = setup.scaled_photos.get(small)
+    return _Target(camera, scale, photo, mask)
+
+
+def _weights(setup: Setup, state: TrainState, index: int, target: _Target) -> Tensor | None:
+    """[H, W], how much each pixel counts; None where all count alike."""
+    if not setup.weighs:
+        return None
+    context = PixelContext(
+        **context_fields(setup, state, "regularize"),
+        index=index,
+        view=setup.train_views[index],
+        camera=target.camera,
+        scale=target.scale,
+        target=target.photo,
+        mask=target.mask,
+    )
+    factors = setup.hook.crossgrad_pixel_weights(context=context)
+    return reduce(torch.mul, factors) if factors else None
+
+
+def camera_at(camera: Camera, scale: float) -> Camera:
+    """The camera in `scale` times its size, rounded to whole pixels; itself at scale 1."""
+    width = max(1, round(camera.width * scale))
+    height = max(1, round(camera.height * scale))
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    return camera.resized(width, height)
+
+
+def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
+    """The fields that the contexts of all hooks of a step share."""
+    return {
+        "step": state.step,
+        "schedule": setup.schedule,
+        "scene": setup.scene,
+        "states": state.states,
+        "rng": state.rngs[stream],
+        "photo": partial(photo_of, setup, state),
+    }
 
 
 def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tensor | None]:
@@ -129,7 +223,9 @@ def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tenso
     image, mask = view.photo.image(), view.photo.mask()
     image = image.to(setup.device)
     mask = None if mask is None else mask.to(setup.device)
-    state.clock.load += perf_counter() - start
+    seconds = perf_counter() - start
+    state.clock.load += seconds
+    state.laps.leave_out(seconds)
     return image, mask
 
 
@@ -159,7 +255,8 @@ def model_of(setup: Setup, state: TrainState) -> Model:
         parameters=state.parameters,
         adam=state.adam,
         background=eval_background(setup),
-        ssim_weight=setup.config.ssim_weight,
+        loss=setup.loss,
+        exposed=partial(exposed, setup, state),
         groups=setup.groups,
     )
 
@@ -178,12 +275,7 @@ def add_regularization(
 ) -> None:
     """Adds the gradients of all regularisation terms, of one view or (None) of the step."""
     context = RegularizeContext(
-        step=state.step,
-        schedule=setup.schedule,
-        scene=setup.scene,
-        states=state.states,
-        rng=state.rngs["regularize"],
-        photo=partial(photo_of, setup, state),
+        **context_fields(setup, state, "regularize"),
         parameters=state.parameters,
         backbone=setup.backbone,
         gaussians=gaussians,

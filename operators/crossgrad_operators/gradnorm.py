@@ -1,7 +1,8 @@
 """GradNorm (Chen et al. 2018), with groups of views in place of tasks."""
 
 from collections.abc import Mapping
-from typing import ClassVar, cast
+from copy import deepcopy
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,14 @@ from crossgrad_core.plugin import (
     PluginState,
     Selection,
     hookimpl,
+    octave,
 )
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._weights import weighting
 
-_Losses = dict[str, dict[str, float]]
+#: Group -> count, start and average of its losses, and the same by octave where not at full size.
+_Losses = dict[str, dict[str, Any]]
 
 
 class GradNorm(GramianOperator):
@@ -29,7 +32,7 @@ class GradNorm(GramianOperator):
     G_s = w_s |g_s| should meet mean(G) (l_s / mean l)^alpha, where l_s is the group's average loss
     over its loss at the start. log w_s takes a step of fixed size towards that, and the weights of
     the groups with a gradient are scaled to add up to their number. One weight per block and group;
-    the views of a group share it.
+    the views of a group share it. Losses at different octaves of scale are followed apart.
     """
 
     idle_at_one: ClassVar[bool] = True
@@ -75,15 +78,13 @@ class GradNorm(GramianOperator):
         return label_objections(selection)
 
     def _followed(
-        self,
-        losses: Mapping[str, Mapping[str, float]],
-        labels: tuple[str, ...],
-        context: OperatorContext,
+        self, losses: _Losses, labels: tuple[str, ...], context: OperatorContext
     ) -> _Losses:
         """The losses of all groups so far, with those of this step."""
-        followed = {label: dict(seen) for label, seen in losses.items()}
-        for label, loss in zip(labels, context.losses.tolist(), strict=True):
-            seen = followed.setdefault(label, {"count": 0, "start": 0.0, "average": loss})
+        followed = deepcopy(losses)
+        scales = context.scales or (1.0,) * len(labels)
+        for label, loss, scale in zip(labels, context.losses.tolist(), scales, strict=True):
+            seen = _at(followed.setdefault(label, _fresh(loss)), octave(scale), loss)
             seen["count"] += 1
             if seen["count"] <= self.baseline:
                 seen["start"] += (loss - seen["start"]) / seen["count"]
@@ -92,7 +93,22 @@ class GradNorm(GramianOperator):
 
     def _rates(self, losses: _Losses) -> NDArray[np.float64]:
         """[S] relative losses l_s; 1 until every group has a loss at the start."""
-        known = all(s["count"] >= self.baseline and s["start"] > 0 for s in losses.values())
+        newest = [_at(group, group.get("octave", 0), 0.0) for group in losses.values()]
+        known = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
         if not known:
             return np.ones(len(losses))
-        return np.array([s["average"] / s["start"] for s in losses.values()])
+        return np.array([s["average"] / s["start"] for s in newest])
+
+
+def _fresh(loss: float) -> dict[str, Any]:
+    return {"count": 0, "start": 0.0, "average": loss}
+
+
+def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
+    """A group's losses at one octave of scale, which becomes its newest; full size is the group."""
+    if level == 0:
+        group.pop("octave", None)
+        return group
+    group["octave"] = level
+    found: dict[str, Any] = group.setdefault("octaves", {}).setdefault(str(level), _fresh(loss))
+    return found

@@ -268,7 +268,6 @@ def test_check_refuses_what_offers_nothing(ran, package, words):
         ("plugins", "show"),
         ("eval",),
         ("render", "run", "--split", "both"),
-        ("export", "run", "--format", "obj"),
     ],
     ids=" ".join,
 )

@@ -9,6 +9,7 @@ import pytest
 from crossgrad_core import plugin
 from crossgrad_core.registry.slots import GROUPS, OFFERED
 from crossgrad_core.testing.checking import checks_of
+from crossgrad_core.wording import singular
 
 ROOT = Path(__file__).parents[2]
 GUIDE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
@@ -54,7 +55,7 @@ def test_the_shown_entry_points_are_in_groups_that_exist():
 
 @pytest.mark.parametrize("slot", list(GROUPS))
 def test_each_slot_is_listed_with_group_base_class_and_methods(slot):
-    word = slot.removesuffix("s")
+    word = singular(slot)
     row = re.search(rf"^\| {word} \| `([\w.]+)` \| `(\w+)` \| (.*) \|$", GUIDE, re.MULTILINE)
     base = getattr(plugin, row[2])
     assert row[1] == GROUPS[slot]

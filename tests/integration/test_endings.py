@@ -137,7 +137,7 @@ def test_a_photo_that_cannot_be_read_at_an_evaluation(scene, whole, tmp_path, mo
     "case",
     [
         ("save", "checkpoints"), ("write_per_view", "per_view.csv"), ("draw_curve", "curve.png"),
-        ("export_ply", "point_cloud.ply"), ("write_summary", "summary.json"),
+        ("export_scene", "point_cloud.ply"), ("write_summary", "summary.json"),
     ],
 )  # fmt: skip
 def test_no_part_of_the_end_that_fails_costs_another(

@@ -14,7 +14,7 @@ from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.ply.cloud import SplatCloud
 from crossgrad_core.registry.entries import offers
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.export import export_ply
+from crossgrad_core.run.export import export_scene
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
@@ -34,7 +34,7 @@ def exported(request, tmp_path_factory):
     for _ in range(2):
         timed_step(setup, state)
     path = tmp_path_factory.mktemp(request.param) / "point_cloud.ply"
-    count = export_ply(setup, state, path).gaussians
+    count = export_scene(setup, state, path).gaussians
     cameras = [view.camera for view in setup.train_views]
     with torch.no_grad():
         phase = setup.phase(state.step, training=False)

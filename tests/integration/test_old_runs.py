@@ -38,8 +38,8 @@ def old(scene, tmp_path):
 def test_a_run_of_0_1_is_evaluated_rendered_and_exported(old, tmp_path):
     run = cg.open(old)
     means = run.evaluate().overall
-    assert means.psnr == pytest.approx(run.summary["overall"]["psnr"], abs=1e-3)
-    assert means.psnr == pytest.approx(run.metrics["psnr"][-1], abs=1e-3)
+    assert means["psnr"] == pytest.approx(run.summary["overall"]["psnr"], abs=1e-3)
+    assert means["psnr"] == pytest.approx(run.metrics["psnr"][-1], abs=1e-3)
     image = run.render(run.scene.test_views[0].name)
     assert image.shape == (24, 32, 3) and image.std() > 0.05
     exported = run.export(tmp_path / "old.ply")

@@ -98,7 +98,7 @@ def disturbed():
 def test_a_run_does_not_depend_on_what_its_process_has_set(disturbed, scene, reference, tmp_path):
     trained = run(scene, tmp_path / "run")
     assert bits(trained.folder) == bits(reference)
-    assert trained.evaluate().overall.psnr == trained.metrics["psnr"][-1]
+    assert trained.evaluate().overall["psnr"] == trained.metrics["psnr"][-1]
     assert trained.render(trained.scene.test_views[0].camera).max() > 0.1
 
 
@@ -197,7 +197,7 @@ def test_what_a_run_answers(reference, tmp_path, capfd):
     rounded = np.rint(image * 255) / 255
     psnr = -10 * np.log10(((rounded - photo) ** 2).mean())
     result = opened.evaluate()
-    assert result.views[0].psnr == pytest.approx(psnr, abs=1e-4)
+    assert result.views[0]["psnr"] == pytest.approx(psnr, abs=1e-4)
     assert opened.export(tmp_path / "x.ply").read_bytes() == bits(reference)["ply"]
     assert capfd.readouterr().out == ""
     with pytest.raises(cg.UserError, match="no view 'nobody'"):

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import pytest
+
 
 def write_distribution(
     folder: Path,
@@ -30,3 +32,17 @@ def write_distribution(
     (info / "entry_points.txt").write_text("\n\n".join(sections) + "\n")
     for module, source in (modules or {}).items():
         (folder / f"{module}.py").write_text(source)
+
+
+def installed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, plugins: Mapping[str, Mapping[str, str]]
+) -> None:
+    """Lets a package offer plugins for the rest of a test.
+
+    Args:
+        folder: Where to write it.
+        monkeypatch: Takes it back.
+        plugins: Slot -> plugin name -> `module:Class`, importable already.
+    """
+    write_distribution(folder, "made-up", plugins)
+    monkeypatch.syspath_prepend(folder)

@@ -4,6 +4,7 @@ from typing import Any
 
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.registry.entries import build
+from crossgrad_core.wording import plural
 
 _USUAL = {
     "backbone": "vanilla",
@@ -11,13 +12,19 @@ _USUAL = {
     "operator": "sum",
     "densifier": "none",
     "rasterizer": "torch",
+    "loss": "l1-ssim",
+    "exposure": "none",
+    "resolution": "full",
+    "exporter": "ply",
 }
 
 
 def selection_of(**chosen: Any) -> Selection:
     """A selection with these fields; components that are not given are usual ones."""
     built = {
-        slot: build(f"{slot}s", name, {}) for slot, name in _USUAL.items() if slot not in chosen
+        slot: build(plural(slot), name, {}) for slot, name in _USUAL.items() if slot not in chosen
     }
     names = {**_USUAL, **chosen.pop("names", {})}
-    return Selection(**{"views_per_step": 2, "device": "cpu", **built, **chosen, "names": names})
+    return Selection(
+        **{"views_per_step": 2, "device": "cpu", "metrics": {}, **built, **chosen, "names": names}
+    )

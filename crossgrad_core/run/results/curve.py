@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crossgrad_core.run.results.metrics_csv import Row, regimes_of
+from crossgrad_core.run.results.metrics_csv import Row
 from crossgrad_core.system.files import write_atomically
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILE = "curve.png"
+_OVERALL = "overall"
 
 #: Okabe and Ito's colours, distinguishable with any colour vision; black is kept for `overall`.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -45,7 +46,8 @@ def draw_curve(
         folder: The run's folder.
         rows: Rows of metrics.csv.
         title: Title of the chart.
-        views: Number of held-out views of each regime, and of all under "overall", for the legend.
+        views: Number of held-out views of each regime, and of all under "overall"; without them
+            there are no lines by regime.
 
     Returns:
         The file.
@@ -76,8 +78,8 @@ def draw_curve(
 
 
 def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
-    lines = [_Line(_labelled("overall", "", rows[-1], views), "")]
-    regimes = regimes_of(list(rows[0]))
+    lines = [_Line(_labelled(_OVERALL, "", rows[-1], views), "")]
+    regimes = [name for name in sorted(views) if name != _OVERALL and f"psnr_{name}" in rows[0]]
     looks = zip(cycle(_COLORS), cycle(_MARKERS), cycle(_STYLES), strict=False)
     if len(regimes) > 1:  # a single one would repeat `overall`
         for name, look in zip(regimes, looks, strict=False):

@@ -103,9 +103,8 @@ def evaluation_line(report: EvaluationReport) -> str:
     """The metrics of an evaluation with those of each regime."""
     row = report.row
     parts = [_metric("PSNR", row.get("psnr"), ".2f", " dB"), _metric("SSIM", row.get("ssim"))]
-    regimes = [name.removeprefix("psnr_") for name in row if name.startswith("psnr_")]
-    if len(regimes) > 1:
-        parts += [f"PSNR {_regime(row, regime)}" for regime in regimes]
+    if len(report.regimes) > 1:
+        parts += [f"PSNR {_regime(row, regime)}" for regime in report.regimes]
     parts.append(f"{_number(row.get('train_seconds'), '.1f')} s training")
     return f"evaluated at step {report.step}: " + ", ".join(parts)
 

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.evaluation import EvaluationResult
+from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.text_files import parse_number, read_rows
@@ -20,25 +21,16 @@ FILE = "metrics.csv"
 Row: TypeAlias = dict[str, int | float | None]
 
 _FIRST = ("step", "views", "backward_passes", "train_seconds")
-_METRICS = ("psnr", "ssim", "ssim_skimage", "lpips")
 _LAST = ("primitives", "peak_memory_mib", "loss")
 _MILLISECONDS = 3
 _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 
 
-def columns_for(regimes: Sequence[str]) -> tuple[str, ...]:
+def columns_for(regimes: Sequence[str], figures: Sequence[Figure]) -> tuple[str, ...]:
     """The columns of a run whose test views fall into these regimes."""
-    split = [f"{metric}_{regime}" for regime in sorted(regimes) for metric in ("psnr", "ssim")]
-    return (*_FIRST, *_METRICS, *split, *_LAST)
-
-
-def regimes_of(columns: Sequence[str]) -> tuple[str, ...]:
-    """The regimes that a table's columns tell apart."""
-    return tuple(
-        name.removeprefix("psnr_")
-        for name in columns
-        if name.startswith("psnr_") and f"ssim_{name.removeprefix('psnr_')}" in columns
-    )
+    split = [figure for figure in figures if figure.per_regime]
+    of_regimes = [figure.column(regime) for regime in sorted(regimes) for figure in split]
+    return (*_FIRST, *(figure.name for figure in figures), *of_regimes, *_LAST)
 
 
 def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
@@ -47,11 +39,10 @@ def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
     row["train_seconds"] = round(totals.train_seconds, _MILLISECONDS)
     peak = totals.peak_memory_mib
     row["peak_memory_mib"] = None if peak is None else round(peak, 1)
-    row |= {metric: getattr(result.overall, metric) for metric in _METRICS}
+    row |= result.overall.values
     for regime, means in result.regimes.items():
-        row[f"psnr_{regime}"] = means.psnr
-        row[f"ssim_{regime}"] = means.ssim
-    return {name: row[name] for name in columns_for(list(result.regimes))}
+        row |= {each.column(regime): means[each.name] for each in result.figures}
+    return {name: row[name] for name in columns_for(list(result.regimes), result.figures)}
 
 
 @dataclass(frozen=True)
@@ -67,14 +58,14 @@ class MetricsCsv:
     columns: tuple[str, ...]
 
     @classmethod
-    def create(cls, folder: Path, regimes: Sequence[str]) -> "MetricsCsv":
+    def create(cls, folder: Path, columns: tuple[str, ...]) -> "MetricsCsv":
         """A new table with its header and no row."""
-        table = cls(folder / FILE, columns_for(regimes))
+        table = cls(folder / FILE, columns)
         table.rewrite(())
         return table
 
     @classmethod
-    def resume(cls, folder: Path, regimes: Sequence[str], step: int) -> "MetricsCsv":
+    def resume(cls, folder: Path, columns: tuple[str, ...], step: int) -> "MetricsCsv":
         """The table of a run that continues after `step`: rows beyond it are dropped.
 
         Raises:
@@ -82,8 +73,8 @@ class MetricsCsv:
         """
         path = folder / FILE
         if not path.is_file():
-            return cls.create(folder, regimes)
-        table = cls(path, columns_for(regimes))
+            return cls.create(folder, columns)
+        table = cls(path, columns)
         lines = _lines(path)
         if not lines or tuple(lines[0]) != table.columns:
             raise UserError(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import View
-from crossgrad_core.evaluation.evaluation import Evaluated, ViewMetrics
+from crossgrad_core.evaluation.evaluation import Evaluated
+from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.panel_names import chosen_views, flat_names
 from crossgrad_core.system.files import write_atomically
 
@@ -60,7 +61,7 @@ class PanelWriter:
         Raises:
             UserError: The disk is full.
         """
-        file = self.files.get(evaluated.view.name)
+        file = self.files.get(evaluated.compared.view.name)
         if file is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -119,8 +120,15 @@ def draw_panel(evaluated: Evaluated, step: int) -> "Image":
     """Photo | render | error with labels, a colour legend and masked pixels hatched."""
     from PIL import Image, ImageDraw
 
-    photo, render = _enlarged(evaluated.photo.numpy()), _enlarged(evaluated.render.numpy())
-    mask = None if evaluated.mask is None else _enlarged(evaluated.mask.byte().numpy())
+    photo, render = (
+        _enlarged(evaluated.compared.photo.numpy()),
+        _enlarged(evaluated.compared.render.numpy()),
+    )
+    mask = (
+        None
+        if evaluated.compared.mask is None
+        else _enlarged(evaluated.compared.mask.byte().numpy())
+    )
     layout = _Layout.of(photo)
     canvas = Image.new("RGB", layout.canvas, _PAPER)
     pictures = (photo, render, _hatched(error_map(photo, render), mask, layout.font))
@@ -183,7 +191,10 @@ def _label(draw: "ImageDraw", layout: _Layout, metrics: ViewMetrics, step: int) 
     draw.text((after, line), text, fill=_FAINT, font=font, anchor="ls")
     figures = [
         f"{name} {value:{form}}"
-        for name, value, form in (("PSNR", metrics.psnr, ".2f"), ("SSIM", metrics.ssim, ".3f"))
+        for name, value, form in (
+            ("PSNR", metrics.values.get("psnr"), ".2f"),
+            ("SSIM", metrics.values.get("ssim"), ".3f"),
+        )
         if value is not None
     ]
     render = f"render: {', '.join(figures)}" if figures else "render"

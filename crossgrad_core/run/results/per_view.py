@@ -2,10 +2,9 @@
 
 import csv
 import io
-from dataclasses import asdict, fields
 from pathlib import Path
 
-from crossgrad_core.evaluation.evaluation import EvaluationResult, ViewMetrics
+from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.system.files import write_atomically
 
 FILE = "per_view.csv"
@@ -18,8 +17,10 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = FILE) -> 
         UserError: The disk is full.
     """
     text = io.StringIO()
-    columns = [field.name for field in fields(ViewMetrics)]
+    columns = ["name", "regime", *(figure.name for figure in result.figures)]
     table = csv.DictWriter(text, columns, lineterminator="\n")
     table.writeheader()
-    table.writerows(asdict(view) for view in result.views)
+    table.writerows(
+        {"name": view.name, "regime": view.regime, **view.values} for view in result.views
+    )
     write_atomically(folder / name, text.getvalue().encode())

@@ -5,27 +5,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.evaluation import EvaluationResult
+from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.metrics_csv import Row
-from crossgrad_core.run.results.totals import Seconds, Totals
+from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.text_files import read_json
+from crossgrad_core.training.clock import Clock
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.state import Json
 
 FILE = "summary.json"
 
 Status = Literal["finished", "stopped", "failed"]
 
-#: How the metrics are defined; they compare only with figures of the same definition.
-DEFINITIONS: Mapping[str, str] = {
-    "psnr": "dB; 20 log10(1 / sqrt(mse)) per image over all channels, mean over images",
-    "ssim": "3DGS form: 11 x 11 window, sigma 1.5, zero padding, mean over images",
-    "ssim_skimage": "scikit-image: gaussian_weights, sigma 1.5, use_sample_covariance off",
-    "renders": "rounded to 8 bits per channel before comparison; masked pixels do not count",
-}
+#: What holds for every metric; figures compare only with those of the same definition.
+RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class Summary:
         totals: Steps, views, backward passes, training seconds, primitives, memory.
         result: The last evaluation; None where there was none.
         rows: All rows of metrics.csv, to find the best one.
-        seconds: Wall-clock seconds by what they were spent on.
+        seconds: Wall-clock seconds by what they were spent on, those of training by phase too.
         config: The resolved configuration as plain data, the seed included.
         environment: Machine and versions.
         ply: What is in the PLY; None where none was written.
@@ -51,10 +49,10 @@ class Summary:
     totals: Totals
     result: EvaluationResult | None
     rows: Sequence[Row]
-    seconds: Seconds
+    seconds: Clock
     config: Mapping[str, Any]
-    environment: Mapping[str, Json]
-    ply: Mapping[str, Json] | None = None
+    environment: "Mapping[str, Json]"
+    ply: "Mapping[str, Json] | None" = None
     notes: Sequence[str] = ()
     error: str | None = None
 
@@ -118,7 +116,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seconds": asdict(summary.seconds),
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
-        "definitions": dict(DEFINITIONS),
+        "definitions": _definitions(summary.result),
         "environment": dict(summary.environment),
         "config": dict(summary.config),
     }
@@ -128,10 +126,16 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     if result is None:
         return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation took place"}}
     return {
-        "overall": asdict(result.overall),
-        "regimes": {name: asdict(means) for name, means in result.regimes.items()},
+        "overall": result.overall.as_data(),
+        "regimes": {name: means.as_data() for name, means in result.regimes.items()},
         "null": dict(result.reasons),
     }
+
+
+def _definitions(result: EvaluationResult | None) -> dict[str, str]:
+    figures = () if result is None else result.figures
+    stated = {figure.name: figure.definition for figure in figures if figure.definition}
+    return {**stated, "renders": RENDERS}
 
 
 def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
@@ -141,7 +145,7 @@ def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
     if not valid:
         return None
     _, best = max(valid, key=lambda pair: pair[0])
-    return {name: best[name] for name in ("step", "train_seconds", "psnr", "ssim")}
+    return {name: best.get(name) for name in ("step", "train_seconds", "psnr", "ssim")}
 
 
 def _finite(value: object) -> object:

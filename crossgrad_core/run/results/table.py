@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from crossgrad_core.evaluation.evaluation import EvaluationResult, Means
+from crossgrad_core.contract.figure import Figure
+from crossgrad_core.evaluation.result import EvaluationResult, Means
 from crossgrad_core.run.results.totals import Totals
 
-_HEADER = ("", "views", "PSNR", "SSIM", "SSIM (skimage)", "LPIPS")
 _NULL = "-"
 
 
@@ -29,24 +29,19 @@ def cost_line(totals: Totals) -> str:
 
 
 def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
-    rows = [_HEADER, _row("overall", result.overall)]
+    # What is not defined for these views has no column.
+    shown = [each for each in result.figures if result.reasons.get(each.name) != each.undefined]
+    header = ("", "views", *(figure.label for figure in shown))
+    rows = [header, _row("overall", result.overall, shown)]
     # A single regime would only repeat the first row.
     if len(result.regimes) > 1:
-        rows += [_row(name, means) for name, means in result.regimes.items()]
-    # LPIPS has a column only where it was measured.
-    width = len(_HEADER) - (result.overall.lpips is None)
-    return [row[:width] for row in rows]
+        rows += [_row(name, means, shown) for name, means in result.regimes.items()]
+    return rows
 
 
-def _row(name: str, means: Means) -> tuple[str, ...]:
-    return (
-        name,
-        str(means.views),
-        _number(means.psnr, ".2f"),
-        _number(means.ssim, ".4f"),
-        _number(means.ssim_skimage, ".4f"),
-        _number(means.lpips, ".4f"),
-    )
+def _row(name: str, means: Means, figures: Sequence[Figure]) -> tuple[str, ...]:
+    cells = (_number(means[figure.name], figure.form) for figure in figures)
+    return (name, str(means.views), *cells)
 
 
 def _number(value: float | None, form: str) -> str:
@@ -54,8 +49,9 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Why PSNR and SSIM are missing; that LPIPS was not asked for is no news."""
-    return [(metric, why) for metric, why in result.reasons.items() if metric in {"psnr", "ssim"}]
+    """Why the figures that are told by regime are missing; of others that is no news."""
+    told = [figure.name for figure in result.figures if figure.per_regime]
+    return [(name, why) for name, why in result.reasons.items() if name in told]
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:

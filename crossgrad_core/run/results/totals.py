@@ -24,14 +24,3 @@ class Totals:
     primitives: int
     peak_memory_mib: float | None
     loss: float | None
-
-
-@dataclass(frozen=True)
-class Seconds:
-    """Wall-clock seconds of a run by what they were spent on; only `train` counts as training."""
-
-    train: float = 0.0
-    compile: float = 0.0
-    load: float = 0.0
-    evaluate: float = 0.0
-    report: float = 0.0

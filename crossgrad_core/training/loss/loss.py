@@ -11,18 +11,23 @@ from crossgrad_core.training.loss.reference import l1_ssim_loss
 
 
 def photometric_loss(
-    image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """(1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
 
     On the CPU in float32 value and gradient come from one fused pass (the gradient is first order
-    only); every other device and type takes the differentiable torch path.
+    only); every other device and type, and weights, take the differentiable torch path.
 
     Args:
         image: [H, W, 3] floating point, the render.
         target: [H, W, 3] floating point or uint8, the photo, on the same device.
         mask: [H, W] bool, True where the pixel counts; None keeps all.
         ssim_weight: w in [0, 1].
+        weights: [H, W] floating point, not negative; None weighs all pixels alike.
 
     Returns:
         Scalar of the image's type.
@@ -31,6 +36,9 @@ def photometric_loss(
         ValueError: If the shapes do not fit.
     """
     _check(image, target, mask)
+    if weights is not None:
+        _check_weights(image, weights)
+        return l1_ssim_loss(image, target, mask, ssim_weight, weights)
     on_cpu = all(t is None or t.device.type == "cpu" for t in (image, target, mask))
     if on_cpu and image.dtype == torch.float32:
         loss: Tensor = _FusedLoss.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
@@ -81,3 +89,10 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
         found = f"{list(mask.shape)} {mask.dtype}"
         raise ValueError(f"`mask` must be [H, W] bool; found {found} for {list(image.shape)}")
+
+
+def _check_weights(image: Tensor, weights: Tensor) -> None:
+    if weights.shape != image.shape[:2] or not weights.is_floating_point():
+        found = f"{list(weights.shape)} {weights.dtype}"
+        message = f"`weights` must be [H, W] floats; found {found} for {list(image.shape)}"
+        raise ValueError(message)

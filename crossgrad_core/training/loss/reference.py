@@ -22,7 +22,11 @@ def gaussian_window() -> Tensor:
 
 
 def l1_ssim_loss(
-    image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """(1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
 
@@ -34,6 +38,8 @@ def l1_ssim_loss(
         target: [H, W, C] floating point, or uint8 (then 255 means 1).
         mask: [H, W] bool, True where the pixel counts; None keeps all.
         ssim_weight: w in [0, 1].
+        weights: [H, W] floating point, not negative: a pixel's share in both means. Windows of SSIM
+            are summed as ever. None weighs all pixels alike.
 
     Returns:
         Scalar of the image's type.
@@ -43,6 +49,8 @@ def l1_ssim_loss(
     image, target = masked(image, mask), masked(unit_range(target, image.dtype), mask)
     absolute = (image - target).abs()
     dissimilarity = 1 - ssim_map(image, target)
+    if weights is not None:
+        return _weighted((1 - ssim_weight) * absolute + ssim_weight * dissimilarity, mask, weights)
     if mask is None:
         count = image.new_tensor(max(image.numel(), 1))
     else:
@@ -50,6 +58,14 @@ def l1_ssim_loss(
         count = (mask.sum() * image.shape[-1]).clamp(min=1)
     loss: Tensor = (1 - ssim_weight) * absolute.sum() + ssim_weight * dissimilarity.sum()
     return loss / count
+
+
+def _weighted(values: Tensor, mask: Tensor | None, weights: Tensor) -> Tensor:
+    """The mean of [H, W, C] over the kept pixels by weight; 0 where no weight is kept."""
+    share = masked(weights.to(values.dtype).unsqueeze(-1), mask)  # [H, W, 1]
+    total = share.sum() * values.shape[-1]
+    # Where nothing counts the sum is 0 already; what it is divided by must not be.
+    return (masked(values, mask) * share).sum() / torch.where(total > 0, total, 1.0)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,
     inconsistency,
-    ndc_directions,
     plane_scores,
 )
 from crossgrad_plugins.densifiers.split_position import split_positions
@@ -38,7 +37,8 @@ class DirectionalConsistency(CloneSplit):
         zeros = totals["renders"].new_zeros(totals["renders"].shape[0], PLANES)
         totals["planes"] = state.per_primitive.get("planes", zeros).clone()
         for record in context.views:
-            seen, bins = screen_statistics.visible(record), ndc_directions(record)
+            seen = screen_statistics.visible(record)
+            bins = screen_statistics.directions(record)
             norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
             screen_statistics.add(record, totals["gradient"], norms * seen)
             screen_statistics.add(record, totals["inconsistency"], inconsistency(bins.sum(dim=0)))

@@ -3,23 +3,8 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.plugin import ViewRecord, screen_statistics
-
 #: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5
-
-
-def ndc_directions(record: ViewRecord) -> Tensor:
-    """[6, 5, N] `Screen.directions` with the absolute gradients per NDC unit; bins, then fields.
-
-    With the Gaussians last, sums over bins are sums of whole rows: much faster on the CPU.
-    """
-    directions = record.screen.directions
-    if directions is None:
-        raise RuntimeError("densification statistics were read before the backward pass")
-    bins = directions.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
-    bins[:, 2:4] *= screen_statistics.half_size(record, bins)[:, None]
-    return bins
 
 
 def inconsistency(sums: Tensor) -> Tensor:
@@ -44,7 +29,7 @@ def plane_scores(bins: Tensor) -> Tensor:
     """[5, N] mean of the inconsistencies on both sides of each plane.
 
     Args:
-        bins: [6, 5, N] from `ndc_directions`.
+        bins: [6, 5, N] from `screen_statistics.directions`.
     """
     left, right = [bins[0]], [bins[-1]]
     for plane in range(1, PLANES):

@@ -16,6 +16,7 @@ from crossgrad_core.plugin import (
     Sampler,
     StepRecord,
     ViewCounts,
+    octave,
 )
 from crossgrad_plugins.samplers.draws import training_views
 from crossgrad_plugins.samplers.groups import drawn, groups_of
@@ -28,7 +29,8 @@ class Active(Sampler):
 
     The partner is drawn among the `top` views of the other group with the largest
     |loss - loss of the first view|, by a softmax whose temperature is the standard deviation of
-    these differences. Losses are running means per view. Views that were never rendered have none:
+    these differences. Losses are running means per view, which begin anew where the
+    octave of its scale changes. Views that were never rendered have none:
     they are drawn first, in either place.
 
     Source: the paper, active loss-disparity pairing; top, temperature and decay are ours, for the
@@ -47,25 +49,39 @@ class Active(Sampler):
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
-        losses = self._running_losses(context.last, state)
+        losses, octaves = self._running_losses(context.last, state)
         groups = groups_of(context, "active", 2)
         views = training_views(context)
         first = _uniform(_never_rendered(views, losses) or views, context.rng)
         others = next(pool for pool in groups.values() if first not in pool)
         second = self._partner(first, others, losses, context.rng)
         values: dict[str, Json] = {"losses": cast("dict[str, Json]", losses)}
+        if octaves:
+            values["octaves"] = cast("dict[str, Json]", octaves)
         return drawn((first, second), context), PluginState(values)
 
-    def _running_losses(self, last: StepRecord | None, state: PluginState) -> dict[str, float]:
-        """View (as text, for JSON) -> running loss, the last step included."""
+    def _running_losses(
+        self, last: StepRecord | None, state: PluginState
+    ) -> tuple[dict[str, float], dict[str, int]]:
+        """View (as text, for JSON) -> running loss, the last step included, and -> its octave.
+
+        A view's running loss begins anew where it is rendered at another octave of scale; views
+        at full size have no entry among the octaves.
+        """
         losses = dict(cast("Mapping[str, float]", state.values.get("losses", {})))
+        octaves = dict(cast("Mapping[str, int]", state.values.get("octaves", {})))
         if last is None:
-            return losses
-        for view, loss in zip(last.views, last.losses, strict=True):
-            if isfinite(loss):
-                old = losses.get(str(view), loss)
-                losses[str(view)] = self.decay * old + (1.0 - self.decay) * loss
-        return losses
+            return losses, octaves
+        scales = last.scales or (1.0,) * len(last.views)
+        for index, loss, scale in zip(last.views, last.losses, scales, strict=True):
+            if not isfinite(loss):
+                continue
+            view, level = str(index), octave(scale)
+            old = losses.get(view, loss) if octaves.pop(view, 0) == level else loss
+            losses[view] = self.decay * old + (1.0 - self.decay) * loss
+            if level:
+                octaves[view] = level
+        return losses, octaves
 
     def _partner(
         self,

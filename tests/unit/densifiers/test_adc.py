@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.mip import MipSplatting
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
+from crossgrad_core.testing.records import view_record
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 
 SCHEDULE = Schedule.for_run(30_000)
@@ -40,7 +41,7 @@ def record(gradient, radii, origin=None):
     gaussians = Gaussians(torch.zeros(n, 3), torch.zeros(n, 4), torch.ones(n, 3), torch.ones(n))
     screen = Screen(torch.tensor(radii, dtype=torch.int32), mean_gradient=torch.tensor(gradient))
     view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
-    return ViewRecord(0, view, None, 0.1, replace(gaussians, origin=origin), screen, torch.zeros(3))
+    return view_record(view, replace(gaussians, origin=origin), screen)
 
 
 def context(views, *, step, params=None, room=100, rng=0, backbone=None):

@@ -16,12 +16,13 @@ from crossgrad_backbones.anchors.growth.cells import (
 )
 from crossgrad_backbones.anchors.growth.control import AnchorControl
 from crossgrad_backbones.scaffold import Scaffold
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_parameters
+from crossgrad_core.testing.records import view_record
 
 SCHEDULE = AnchorControl().window(Schedule.for_run(30_000))
 CAMERA = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.eye(4, dtype=torch.float64))
@@ -78,7 +79,7 @@ def record(anchors, decoded, origin, slot, drawn):
     radii = torch.tensor(radii, dtype=torch.int32)
     screen = Screen(radii, mean_gradient=torch.tensor(gradients).float().reshape(number, 2))
     view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
-    return ViewRecord(0, view, None, 0.1, gaussians, screen, torch.zeros(3))
+    return view_record(view, gaussians, screen)
 
 
 def drawn_records(anchors, views, seed=0):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.state import PluginState
@@ -18,6 +18,7 @@ from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
+from crossgrad_core.testing.records import view_record
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.dc4gs import DirectionalConsistency
@@ -72,7 +73,7 @@ def record(lists, radii=None, origin=None):
     zeros = torch.zeros(number, 3)
     gaussians = Gaussians(zeros, torch.zeros(number, 4), zeros, torch.ones(number), origin=origin)
     view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
-    return ViewRecord(0, view, None, 0.1, gaussians, screen, torch.zeros(3))
+    return view_record(view, gaussians, screen)
 
 
 def parameters(number, largest=0.05, opacity=0.5, seed=0):

@@ -13,12 +13,13 @@ from crossgrad_backbones.levels.octree_control import OctreeControl
 from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
 from crossgrad_backbones.octree import Octree
 from crossgrad_core.contract.blocks import primitives_of
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.records import view_record
 
 ORIGIN, ROOT, FORK, DISTANCE = -1.1, 0.5, 2, 4.0
 THRESHOLDS = Thresholds(2e-4, 2**0.2)
@@ -169,7 +170,7 @@ def context(tensors, backbone, *, step=2000, room=1000, gradient=1e-4):
         parameters=tensors,
         backbone=backbone,
         rasterizer=None,
-        views=(ViewRecord(0, view, None, 0.1, drawn, screen, torch.zeros(3)),),
+        views=(view_record(view, drawn, screen),),
         means_lr=0.0,
         room=room,
     )

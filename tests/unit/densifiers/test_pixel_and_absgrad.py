@@ -9,12 +9,13 @@ import torch
 from support.gaussians import posed_camera
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT
+from crossgrad_core.testing.records import view_record
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl, quantile
 from crossgrad_plugins.densifiers.pixel import PixelDensityControl
 
@@ -48,7 +49,7 @@ def record(rng, means):
     )
     gaussians = Gaussians(means, torch.zeros(n, 4), torch.ones(n, 3), torch.ones(n))
     view = View("a.jpg", CAMERA, None, "near", np.zeros(0, np.int64))
-    return ViewRecord(0, view, None, 0.1, gaussians, screen, torch.zeros(3))
+    return view_record(view, gaussians, screen)
 
 
 def context(step, params, views):

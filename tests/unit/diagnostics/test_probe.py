@@ -41,7 +41,7 @@ def model():
         parameters=parameters,
         adam=adam,
         background=torch.zeros(3),
-        ssim_weight=0.2,
+        loss=build("losses", "l1-ssim", {}),
         groups=None,
     )
 
@@ -52,7 +52,7 @@ def gradients(model, view):
     leaves = {n: t.detach().clone().requires_grad_() for n, t in model.parameters.items()}
     gaussians = model.backbone.decode(leaves, one.camera, model.phase)
     image = model.rasterizer.render(gaussians, one.camera, model.background).image
-    photometric_loss(image, one.photo.image(), None, model.ssim_weight).backward()
+    photometric_loss(image, one.photo.image(), None, 0.2).backward()
     return {name: tensor.grad for name, tensor in leaves.items()}
 
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from support.figures import FIGURES, of
 
 from crossgrad_core.contract.scene import Camera, View
-from crossgrad_core.evaluation.evaluation import EvaluationResult, ViewMetrics, summarised
+from crossgrad_core.evaluation.result import EvaluationResult, summarised
 from crossgrad_core.run.results.totals import Totals
 
 
@@ -39,16 +40,17 @@ def _make_view():
 def _result() -> EvaluationResult:
     return summarised(
         [
-            ViewMetrics("near/1.jpg", "near", 20.0, 0.5, 0.6, None),
-            ViewMetrics("near/2.jpg", "near", 22.0, 0.7, 0.8, None),
-            ViewMetrics("far/1.jpg", "far", 30.0, 0.9, 0.95, None),
-        ]
+            of("near/1.jpg", "near", 20.0, 0.5, 0.6, None),
+            of("near/2.jpg", "near", 22.0, 0.7, 0.8, None),
+            of("far/1.jpg", "far", 30.0, 0.9, 0.95, None),
+        ],
+        FIGURES,
     )
 
 
 @pytest.fixture(name="empty")
 def _empty() -> EvaluationResult:
-    return summarised([])
+    return summarised([], FIGURES)
 
 
 @pytest.fixture(name="totals")

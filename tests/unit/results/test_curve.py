@@ -58,14 +58,14 @@ def test_draws_psnr_and_ssim_overall_and_per_regime(tmp_path: Path, figures, cou
 
 
 def test_lines_differ_in_more_than_colour(tmp_path: Path, figures):
-    draw_curve(tmp_path, make_rows(5, ("a", "b", "c")), "title")
+    draw_curve(tmp_path, make_rows(5, ("a", "b", "c")), "title", {"a": 1, "b": 1, "c": 1})
     lines = figures[0].axes[0].get_lines()
     assert len({line.get_color() for line in lines}) == 4
     assert len({line.get_marker() for line in lines}) == 4
 
 
 def test_rendered_views_stand_where_they_were_reached(tmp_path: Path, figures):
-    draw_curve(tmp_path, make_rows(10), "title")
+    draw_curve(tmp_path, make_rows(10), "title", {"far": 1, "near": 1})
     above = figures[0].axes[0].child_axes[0]
     ticks = {
         tick.get_text(): place
@@ -77,7 +77,7 @@ def test_rendered_views_stand_where_they_were_reached(tmp_path: Path, figures):
 
 
 def test_one_regime_is_not_drawn_twice(tmp_path: Path, figures):
-    draw_curve(tmp_path, make_rows(3, ("far",)), "title")
+    draw_curve(tmp_path, make_rows(3, ("far",)), "title", {"far": 1})
     assert len(figures[0].axes[0].get_lines()) == 1
 
 
@@ -95,6 +95,6 @@ def test_nothing_to_draw_is_no_error(tmp_path: Path, rows: list[Row]):
 
 
 def test_names_are_shown_as_they_are(tmp_path: Path, figures):
-    draw_curve(tmp_path, make_rows(2, ("_raw", "a$b$")), "scene $x_1$")
+    draw_curve(tmp_path, make_rows(2, ("_raw", "a$b$")), "scene $x_1$", {"_raw": 1, "a$b$": 1})
     labels = [text.get_text().split(":")[0] for text in figures[0].legends[0].get_texts()]
-    assert labels == ["overall", "'_raw'", r"a\$b\$"]
+    assert labels == ["overall", "'_raw' (1 view)", r"a\$b\$ (1 view)"]

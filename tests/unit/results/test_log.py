@@ -52,21 +52,28 @@ def test_last_evaluation_is_remembered():
 
 
 @pytest.mark.parametrize(
-    ("row", "expected"),
+    ("row", "regimes", "expected"),
     [
         (
             {"psnr": 21.5, "ssim": 0.7, "psnr_far": 20.0, "psnr_near": 23.0, "train_seconds": 3.0},
+            ("far", "near"),
             "PSNR 21.50 dB, SSIM 0.7000, PSNR far 20.00, PSNR near 23.00, 3.0 s training",
         ),
         (
             {"psnr": 21.5, "ssim": 0.7, "psnr_far": 21.5, "train_seconds": 3.0},
+            ("far",),
             "PSNR 21.50 dB, SSIM 0.7000, 3.0 s training",
         ),
-        ({"psnr": None, "ssim": None, "train_seconds": 3}, "no PSNR, no SSIM, 3.0 s training"),
+        (
+            {"psnr": 21.5, "ssim": 0.7, "psnr_cc": 22.0, "psnr_x": 1.0, "train_seconds": 3.0},
+            (),
+            "PSNR 21.50 dB, SSIM 0.7000, 3.0 s training",
+        ),
+        ({"psnr": None, "ssim": None, "train_seconds": 3}, (), "no PSNR, no SSIM, 3.0 s training"),
     ],
 )
-def test_evaluation_line(row: dict[str, float | None], expected: str):
-    assert evaluation_line(EvaluationReport(7, row)) == f"evaluated at step 7: {expected}"
+def test_evaluation_line(row: dict[str, float | None], regimes: tuple[str, ...], expected: str):
+    assert evaluation_line(EvaluationReport(7, row, regimes)) == f"evaluated at step 7: {expected}"
 
 
 @pytest.mark.parametrize(

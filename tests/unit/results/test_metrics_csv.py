@@ -6,14 +6,13 @@ from io import FileIO
 from pathlib import Path
 
 import pytest
+from support.figures import columns
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.metrics_csv import (
     MetricsCsv,
-    columns_for,
     metrics_row,
     read_metrics,
-    regimes_of,
 )
 
 HEADER = (
@@ -23,13 +22,11 @@ HEADER = (
 
 
 def test_columns_of_a_run_with_regimes():
-    assert ",".join(columns_for(["near", "far"])) == HEADER
-    assert regimes_of(columns_for(["near", "far"])) == ("far", "near")
-    assert regimes_of(columns_for([])) == ()
+    assert ",".join(columns(["near", "far"])) == HEADER
 
 
 def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(totals, result))
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
     assert lines == [
@@ -41,13 +38,13 @@ def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
 
 def test_numbers_come_back_exactly(tmp_path: Path, result, totals):
     row = metrics_row(totals, result)
-    MetricsCsv.create(tmp_path, ["near", "far"]).append(row)
+    MetricsCsv.create(tmp_path, columns(["near", "far"])).append(row)
     assert read_metrics(tmp_path) == (row,)
     assert row["lpips"] is None
 
 
 def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
-    table = MetricsCsv.create(tmp_path, [])
+    table = MetricsCsv.create(tmp_path, columns([]))
     table.append(metrics_row(totals, empty))
     assert (
         (tmp_path / "metrics.csv")
@@ -59,14 +56,14 @@ def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
 
 def test_an_unknown_column_is_a_mistake(tmp_path: Path):
     with pytest.raises(ValueError, match="typo"):
-        MetricsCsv.create(tmp_path, []).append({"typo": 1})
+        MetricsCsv.create(tmp_path, columns([])).append({"typo": 1})
 
 
 def test_resuming_drops_rows_beyond_the_step(tmp_path: Path, result, totals):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     for step in (100, 200, 300):
         table.append(metrics_row(replace(totals, step=step), result))
-    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+    resumed = MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=200)
     resumed.append(metrics_row(replace(totals, step=300, loss=0.5), result))
     assert [(row["step"], row["loss"]) for row in read_metrics(tmp_path)] == [
         (100, totals.loss),
@@ -76,17 +73,17 @@ def test_resuming_drops_rows_beyond_the_step(tmp_path: Path, result, totals):
 
 
 def test_resuming_drops_a_row_that_a_crash_cut_short(tmp_path: Path, result, totals):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(replace(totals, step=100), result))
     with table.path.open("a") as file:
         file.write("200,400,40")
-    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+    resumed = MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=200)
     resumed.append(metrics_row(replace(totals, step=300), result))
     assert [row["step"] for row in read_metrics(tmp_path)] == [100, 300]
 
 
 def test_resuming_without_a_table_starts_one(tmp_path: Path):
-    MetricsCsv.resume(tmp_path, [], step=5)
+    MetricsCsv.resume(tmp_path, columns([]), step=5)
     assert read_metrics(tmp_path) == ()
 
 
@@ -94,14 +91,14 @@ def test_resuming_without_a_table_starts_one(tmp_path: Path):
 def test_the_table_of_another_run_is_refused(tmp_path: Path, text: str):
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(UserError, match="another run"):
-        MetricsCsv.resume(tmp_path, ["near", "far"], step=5)
+        MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=5)
     assert (tmp_path / "metrics.csv").read_text() == text
 
 
 def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
     regimes = {'a,"b"': result.regimes["far"], "c": result.regimes["near"]}
     odd = replace(result, regimes=regimes)
-    MetricsCsv.create(tmp_path, list(regimes)).append(metrics_row(totals, odd))
+    MetricsCsv.create(tmp_path, columns(list(regimes))).append(metrics_row(totals, odd))
     assert read_metrics(tmp_path)[0]['psnr_a,"b"'] == 30.0
 
 
@@ -134,11 +131,11 @@ def test_unreadable_tables_are_explained(tmp_path: Path, content: bytes):
 def test_a_damaged_table_is_refused_when_the_run_resumes_and_not_when_it_ends(
     tmp_path: Path, totals, result, cell: str, column: str
 ):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append({**metrics_row(replace(totals, step=100), result), column: cell})
     before = table.path.read_bytes()
     with pytest.raises(UserError, match=r"unreadable metrics\.csv"):
-        MetricsCsv.resume(tmp_path, ["near", "far"], step=200)
+        MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=200)
     assert table.path.read_bytes() == before
 
 
@@ -155,7 +152,7 @@ def test_a_missing_table_is_explained(tmp_path: Path):
 
 
 def test_a_row_that_was_cut_within_its_last_number_is_dropped(tmp_path: Path, result, totals):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(totals, result))
     whole = table.path.read_bytes()
     table.append(metrics_row(replace(totals, step=800), result))
@@ -163,7 +160,7 @@ def test_a_row_that_was_cut_within_its_last_number_is_dropped(tmp_path: Path, re
     assert cut.count(b",") == table.path.read_bytes().count(b",")
     table.path.write_bytes(cut)
     assert [row["step"] for row in read_metrics(tmp_path)] == [totals.step]
-    resumed = MetricsCsv.resume(tmp_path, ["near", "far"], step=800)
+    resumed = MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=800)
     assert resumed.path.read_bytes() == whole
 
 
@@ -194,7 +191,7 @@ class Nearly:
 def test_a_full_disk_leaves_no_half_of_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, *, result, totals
 ):
-    table = MetricsCsv.create(tmp_path, ["near", "far"])
+    table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(totals, result))
     before = table.path.read_bytes()
     opened = Path.open

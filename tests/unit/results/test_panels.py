@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.figures import of
 
-from crossgrad_core.evaluation.evaluation import Evaluated, ViewMetrics
+from crossgrad_core.contract.metric import Compared
+from crossgrad_core.evaluation.evaluation import Evaluated
 from crossgrad_core.run.results.panel_names import chosen_views, flat_names
 from crossgrad_core.run.results.panels import PanelWriter, draw_panel, error_map
 
@@ -42,8 +44,8 @@ def test_views_are_spread_over_regimes_and_within_them(make_view):
 
 
 def make_evaluated(view, render: torch.Tensor, mask: torch.Tensor | None = None) -> Evaluated:
-    metrics = ViewMetrics(view.name, view.regime, 24.3, 0.812, None, None)
-    return Evaluated(view, render, view.photo.image(), mask, metrics)
+    metrics = of(view.name, view.regime, 24.3, 0.812, None, None)
+    return Evaluated(Compared(view, render, view.photo.image(), mask), metrics)
 
 
 def find_image(canvas: np.ndarray, image: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ from crossgrad_core.run.results.metrics_csv import metrics_row
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import Summary, read_summary, write_summary
 from crossgrad_core.run.results.table import final_table
-from crossgrad_core.run.results.totals import Seconds
+from crossgrad_core.training.clock import Clock
 
 
 @pytest.fixture(name="summary")
@@ -31,7 +31,7 @@ def _summary(result, totals) -> Summary:
         totals=totals,
         result=result,
         rows=rows,
-        seconds=Seconds(train=38.2, compile=9.1, load=1.5, evaluate=3.0, report=0.8),
+        seconds=Clock(train=38.2, compile=9.1, load=1.5, evaluate=3.0, report=0.8),
         config={"seed": 7, "scene": Path("scenes/boruszyn"), "lr": float("nan")},
         environment={"crossgrad": "0.1.0"},
         notes=("no grouping: one distance",),
@@ -154,7 +154,8 @@ def test_final_table_shows_one_regime_once_and_lpips_where_measured(result, tota
     one = replace(
         result,
         regimes={"far": result.regimes["far"]},
-        overall=replace(result.overall, lpips=0.12345),
+        overall=replace(result.overall, values={**result.overall.values, "lpips": 0.12345}),
+        reasons={},
     )
     lines = final_table(one, totals).splitlines()
     assert [line.split()[0] for line in lines[:2]] == ["views", "overall"]

@@ -19,8 +19,8 @@ from crossgrad_core.training.budget import (
     caught_up,
     lengthened,
 )
+from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.schedules import growth_note
-from crossgrad_core.training.state import Clock
 
 
 class Hook:

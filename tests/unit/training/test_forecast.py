@@ -11,7 +11,7 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.forecast import LOOK_STEPS, Forecast
 from crossgrad_core.run.results.lines import roughly
 from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
-from crossgrad_core.training.state import Clock
+from crossgrad_core.training.clock import Clock
 
 RUN = make_dataclass(
     "Run", ["config", "densifier", "selection", "schedule", "hook", "notes"], frozen=True

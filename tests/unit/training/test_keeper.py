@@ -80,6 +80,9 @@ BEFORE, WHILE, AFTERWARDS = FAILS_IN - 1, FAILS_IN - FAILS_IN % SAVE_EVERY, FAIL
 HOOKS = [
     ("sample_views", before, BEFORE),
     ("sample_views", after, BEFORE),
+    ("choose_scales", before, BEFORE),
+    ("choose_scales", after, BEFORE),
+    ("pixel_weights", of_context, BEFORE),
     ("regularize", of_context, BEFORE),
     ("aggregate_gradients", before, BEFORE),
     ("aggregate_gradients", after, BEFORE),

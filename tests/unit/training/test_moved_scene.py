@@ -53,7 +53,7 @@ def psnr(scene, seed=None):
         state.parameters["means"] = aside(state.parameters["means"].detach(), seed)
     for _ in range(STEPS):
         timed_step(setup, state)
-    return evaluate(scene.test_views, renderer(setup, state)).overall.psnr
+    return evaluate(scene.test_views, renderer(setup, state), setup.metrics).overall["psnr"]
 
 
 def aside(means, seed):

@@ -5,7 +5,7 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.export import export_ply
+from crossgrad_core.run.export import export_scene
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
 from crossgrad_core.training.budget import lengthened
@@ -22,7 +22,7 @@ def trained(tmp_path_factory):
     for _ in range(3):
         timed_step(setup, state)
     path = tmp_path_factory.mktemp("start") / "point_cloud.ply"
-    export_ply(setup, state, path)
+    export_scene(setup, state, path)
     return setup, state, path
 
 

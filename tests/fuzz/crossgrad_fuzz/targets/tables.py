@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results import metrics_csv, summary
 from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
@@ -19,8 +20,14 @@ _METRICS, _SUMMARY, _TABLE = metrics_csv.FILE, summary.FILE, "table.csv"
 _REGIMES = ("far", "near")
 
 
+def _columns() -> tuple[str, ...]:
+    names = ("psnr", "ssim", "ssim_skimage", "lpips")
+    figures = [Figure(name, name, per_regime=name in {"psnr", "ssim"}) for name in names]
+    return metrics_csv.columns_for(_REGIMES, figures)
+
+
 def _metrics() -> bytes:
-    columns = metrics_csv.columns_for(_REGIMES)
+    columns = _columns()
     rows = [
         [str(100 * (i + 1)), "200", "200", "1.234", "21.5", "0.8", "0.81", *[""] * 8]
         for i in range(2)
@@ -32,14 +39,14 @@ def _parse_metrics(folder: Path) -> None:
     if not (folder / _METRICS).is_file():
         with suppress(UserError):
             read_metrics(folder)
-        MetricsCsv.resume(folder, _REGIMES, 100)
+        MetricsCsv.resume(folder, _columns(), 100)
         return
     rows = read_metrics(folder)
     assert all(row.keys() == rows[0].keys() for row in rows)
     assert all(
         value is None or isinstance(value, int | float) for row in rows for value in row.values()
     )
-    MetricsCsv.resume(folder, _REGIMES, 100)
+    MetricsCsv.resume(folder, _columns(), 100)
     again = read_metrics(folder)
     assert all(0 <= (row["step"] or 0) <= 100 for row in again)
 
@@ -67,7 +74,7 @@ METRICS = Target(
     parse=_parse_metrics,
     parser={
         text_files: ("read_json",),
-        metrics_csv: ("metrics_row", "MetricsCsv.append", "_append", "regimes_of"),
+        metrics_csv: ("metrics_row", "MetricsCsv.append", "_append"),
     },
     words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),

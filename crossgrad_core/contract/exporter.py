@@ -1,0 +1,44 @@
+"""The exporter slot: the trained Gaussians -> a file that other programs open."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.scene import Similarity
+
+
+class Exporter(Component):
+    """Writes Gaussians to a file of one format.
+
+    Attributes:
+        suffix: Suffix of its files, without the dot.
+    """
+
+    slot: ClassVar[str] = "exporters"
+    suffix: ClassVar[str]
+
+    @abstractmethod
+    def write(
+        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
+    ) -> tuple[str, ...]:
+        """Writes the file; it appears complete or not at all.
+
+        Args:
+            gaussians: Gaussians of the local frame that do not depend on a view, without a graph.
+            similarity: Maps the local frame back to the input frame, in which files are written.
+            path: The file.
+            comments: Lines of plain text about the file, for formats that can hold them.
+
+        Returns:
+            What the user should know about the file, one sentence each; usually nothing.
+
+        Raises:
+            UserError: The disk is full or the folder may not be written to.
+        """
+
+    def stored(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians as whoever reads the file has them, local frame; by default unchanged."""
+        return gaussians

@@ -1,0 +1,43 @@
+"""The metric slot: a figure of merit of each held-out view."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.figure import Figure
+from crossgrad_core.contract.scene import View
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A held-out view beside its photo, as results compare them. Nothing in it may be changed.
+
+    Attributes:
+        view: The view.
+        render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
+        photo: [H, W, 3] uint8.
+        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+    """
+
+    view: View
+    render: Tensor
+    photo: Tensor
+    mask: Tensor | None
+
+
+class Metric(Component):
+    """Measures one figure of every held-out view.
+
+    Attributes:
+        figure: What the figure is called and how it is shown.
+    """
+
+    slot: ClassVar[str] = "metrics"
+    figure: ClassVar[Figure]
+
+    @abstractmethod
+    def measure(self, compared: Compared) -> float | None:
+        """The figure of one view; None where there is none, such as without a pixel that counts."""

@@ -1,0 +1,93 @@
+"""What an evaluation found: figures per view, means overall and per regime. Imports no torch."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import fsum
+
+from crossgrad_core.contract.figure import Figure
+
+NO_VIEWS = "no held-out views: the split keeps every view for training"
+ALL_MASKED = "every pixel is masked"
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """The figures of one view.
+
+    Attributes:
+        name: Name of the view.
+        regime: Its regime.
+        values: Name of a figure -> value; None where there is none.
+        masked: Whether no pixel of it counts.
+    """
+
+    name: str
+    regime: str
+    values: Mapping[str, float | None]
+    masked: bool = False
+
+    def __getitem__(self, figure: str) -> float | None:
+        return self.values[figure]
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over `views` views; None where no view has the figure."""
+
+    views: int
+    values: Mapping[str, float | None]
+
+    def __getitem__(self, figure: str) -> float | None:
+        return self.values[figure]
+
+    def as_data(self) -> dict[str, float | int | None]:
+        """The number of views and the figures by name."""
+        return {"views": self.views, **self.values}
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """What an evaluation found.
+
+    Attributes:
+        figures: What was measured, in the order of all tables.
+        views: Figures of each view, in the order of the scene.
+        overall: Means over all views.
+        regimes: Regime -> means over its views, sorted by name.
+        reasons: Name of a figure -> why it is null.
+    """
+
+    figures: tuple[Figure, ...]
+    views: tuple[ViewMetrics, ...]
+    overall: Means
+    regimes: Mapping[str, Means]
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+
+def summarised(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> EvaluationResult:
+    """Means overall and per regime of views that were measured."""
+    names = sorted({view.regime for view in views})
+    regimes = {
+        name: _means([view for view in views if view.regime == name], figures) for name in names
+    }
+    overall = _means(views, figures)
+    reasons = {
+        figure.name: _reason(figure, views) for figure in figures if overall[figure.name] is None
+    }
+    return EvaluationResult(tuple(figures), tuple(views), overall, regimes, reasons)
+
+
+def _means(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> Means:
+    means = {figure.name: _mean([view[figure.name] for view in views]) for figure in figures}
+    return Means(len(views), means)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fsum(known) / len(known) if known else None
+
+
+def _reason(figure: Figure, views: Sequence[ViewMetrics]) -> str:
+    if not views:
+        return NO_VIEWS
+    return ALL_MASKED if all(view.masked for view in views) else figure.undefined

@@ -1,0 +1,66 @@
+"""What runs wrote, read back to be compared: configuration, metrics.csv, summary.json.
+
+Imports no torch, so that a table of many runs is there at once.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from crossgrad_core.run.results.config_file import FILE as CONFIG
+from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.summary import FILE as SUMMARY
+from crossgrad_core.run.results.summary import read_summary
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """What a run's folder says.
+
+    Attributes:
+        folder: The folder.
+        config: The resolved configuration as plain data.
+        rows: The rows of metrics.csv in order.
+        summary: The content of summary.json; None of a run that has not ended yet.
+    """
+
+    folder: Path
+    config: Mapping[str, Any]
+    rows: tuple[Row, ...]
+    summary: Mapping[str, Any] | None
+
+    @cached_property
+    def regimes(self) -> tuple[str, ...]:
+        """The regimes of the held-out views by name; none before the run has ended."""
+        return tuple((self.summary or {}).get("regimes") or ())
+
+    def figure(self, name: str, regime: str | None = None) -> float | None:
+        """A figure of the last evaluation, overall or of one regime; None where there is none."""
+        summary = self.summary or {}
+        of = summary.get("overall") if regime is None else summary.get("regimes", {}).get(regime)
+        value = (of or {}).get(name)
+        return float(value) if isinstance(value, int | float) else None
+
+    def curve(self, name: str, regime: str | None = None) -> list[tuple[float, float]]:
+        """Training seconds and a figure of every evaluation that has it."""
+        column = name if regime is None else f"{name}_{regime}"
+        points = [(row.get("train_seconds"), row.get(column)) for row in self.rows]
+        return [(float(x), float(y)) for x, y in points if x is not None and y is not None]
+
+
+def read_run(folder: Path) -> RunResults:
+    """The results of one run; it may be training meanwhile.
+
+    Raises:
+        UserError: It is not the folder of a run, or one of its files is damaged.
+    """
+    summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
+    return RunResults(folder, read_config(folder), read_metrics(folder), summary)
+
+
+def find_runs(root: Path) -> tuple[Path, ...]:
+    """The folders of runs at or below a folder, sorted."""
+    return tuple(sorted(path.parent for path in root.rglob(CONFIG)))

@@ -1,0 +1,119 @@
+"""Contract checks of exposures."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.exposure import Exposure
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
+from crossgrad_core.testing.fixtures import sample_scene
+
+#: How far a second projection may move what was projected already.
+_ROUNDING = 1e-5
+
+
+def every_photo_has_a_start(make: Make[Exposure]) -> None:
+    """Each parameter starts with one finite float32 row for each training photo, and learns."""
+    for name, each in make().per_photo(sample_scene()).items():
+        _require_rows(f"the start of {name}", each.start)
+        require(each.lr.initial > 0, f"the learning rate of {name} is {each.lr.initial}")
+
+
+def an_image_stays_an_image(make: Make[Exposure]) -> None:
+    """Of any size and outside [0, 1], it stays finite, of its shape and type, and untouched."""
+    exposure, values = make(), _first(_starts(make()))
+    for image in (_image(), _image()[:5, :9], 3.0 * _image() - 1.0, torch.zeros(4, 4, 3)):
+        kept = image.clone()
+        taken = exposure.exposed(image, values)
+        require(taken.shape == image.shape, f"{list(image.shape)} became {list(taken.shape)}")
+        require(taken.dtype == image.dtype, f"{image.dtype} became {taken.dtype}")
+        require(taken.isfinite().all(), "the image as taken is not finite")
+        require(torch.equal(image, kept), "the exposure changes the render that it was given")
+
+
+def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
+    """The image as taken is differentiable in the render and in every value."""
+    exposure = make()
+    values = {name: row.clone().requires_grad_() for name, row in _first(_starts(exposure)).items()}
+    image = _image().requires_grad_()
+    taken = exposure.exposed(image, values)
+    weights = torch.rand(taken.shape, generator=torch.Generator().manual_seed(4))
+    inputs = {"the render": image, **values}
+    found = torch.autograd.grad((taken * weights).sum(), list(inputs.values()), allow_unused=True)
+    for name, gradient in zip(inputs, found, strict=True):
+        require(gradient is not None, f"{name} gets no gradient")
+        good = gradient is not None and gradient.isfinite().all()
+        require(good, f"the gradient of {name} is not finite")
+
+
+def projected_values_stay_projected(make: Make[Exposure]) -> None:
+    """The projection keeps names and shapes, leaves its input as it is, and is done once."""
+    exposure = make()
+    values = {name: each + _noise(each) for name, each in _starts(exposure).items()}
+    if not values:
+        raise cannot_tell("it has no parameters")
+    kept = {name: each.clone() for name, each in values.items()}
+    once = exposure.projected(values)
+    require(once.keys() == values.keys(), f"{sorted(values)} became {sorted(once)}")
+    for name, each in once.items():
+        _require_rows(f"the projected {name}", each)
+        require(torch.equal(values[name], kept[name]), f"the projection changes {name} in place")
+        again = exposure.projected(once)[name]
+        close = torch.allclose(again, each, rtol=_ROUNDING, atol=_ROUNDING)
+        require(close, f"a second projection moves {name} on")
+
+
+def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
+    """Held-out views get finite values of the shape that training photos have."""
+    exposure, scene = make(), sample_scene()
+    starts = _starts(exposure)
+    for view in scene.test_views:
+        values = exposure.unseen(view, scene, starts)
+        require(values.keys() == starts.keys(), f"a held-out view gets {sorted(values)}")
+        for name, value in values.items():
+            right = value.shape == starts[name].shape[1:] and value.isfinite().all()
+            require(right, f"a held-out view's {name} is {value!r}")
+
+
+def same_input_same_bits(make: Make[Exposure]) -> None:
+    """The image as taken depends on the render and the values alone."""
+    values = _first(_starts(make()))
+    one, two = (make().exposed(_image(), values) for _ in range(2))
+    require(torch.equal(one, two), "two calls give different images")
+
+
+def _starts(exposure: Exposure) -> dict[str, Tensor]:
+    return {name: each.start for name, each in exposure.per_photo(sample_scene()).items()}
+
+
+def _first(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: each[0] for name, each in values.items()}
+
+
+def _require_rows(what: str, value: Tensor) -> None:
+    photos = len(sample_scene().train_views)
+    right = value.ndim > 0 and value.shape[0] == photos and value.dtype == torch.float32
+    found = f"{value.dtype} of shape {list(value.shape)}"
+    require(right, f"{what} is {found}; expected float32 with {photos} rows, one for each photo")
+    require(value.isfinite().all(), f"{what} is not finite")
+
+
+def _image() -> Tensor:
+    return torch.rand(12, 16, 3, generator=torch.Generator().manual_seed(6))
+
+
+def _noise(like: Tensor) -> Tensor:
+    return 0.1 * torch.randn(like.shape, generator=torch.Generator().manual_seed(7))
+
+
+EXPOSURE_CHECKS: tuple[Check[Exposure], ...] = (
+    *COMPONENT_CHECKS,
+    every_photo_has_a_start,
+    an_image_stays_an_image,
+    gradients_reach_render_and_values,
+    projected_values_stay_projected,
+    a_view_that_was_not_seen_has_values,
+    same_input_same_bits,
+)

@@ -1,0 +1,80 @@
+"""Contract checks of metrics."""
+
+from math import isfinite
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.figure import Figure
+from crossgrad_core.contract.metric import Compared, Metric
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, Make, require
+from crossgrad_core.testing.fixtures import sample_scene
+
+
+def names_its_figure(make: Make[Metric]) -> None:
+    """`figure` has a name that can be a column, a label, and a form that formats a number."""
+    figure = getattr(make(), "figure", None)
+    require(isinstance(figure, Figure), f"figure is {figure!r}, not a Figure")
+    name, label = make().figure.name, make().figure.label
+    require(name.isidentifier() and name == name.lower(), f"{name!r} is no name of a column")
+    require(label, "the figure has no label")
+    require(format(0.5, make().figure.form), f"the form {make().figure.form!r} shows nothing")
+
+
+def measures_a_finite_number(make: Make[Metric]) -> None:
+    """Of every view there is a finite number, or None; also of a render that is the photo."""
+    photo = sample_scene().test_views[0].photo.image()
+    for render in (_render(), photo, torch.zeros_like(photo)):
+        _require_number(make().measure(_compared(render)))
+
+
+def an_empty_mask_is_no_error(make: Make[Metric]) -> None:
+    """Where no pixel counts there is None or a finite number, and no error."""
+    nothing = torch.zeros(_render().shape[:2], dtype=torch.bool)
+    _require_number(make().measure(_compared(_render(), nothing)))
+
+
+def masked_pixels_do_not_count(make: Make[Metric]) -> None:
+    """What the render holds where the mask is False makes no difference."""
+    mask = torch.ones(_render().shape[:2], dtype=torch.bool)
+    mask[2:6, 3:12] = False
+    other = _render()
+    other[~mask] = 255 - other[~mask]
+    one, two = (make().measure(_compared(render, mask)) for render in (_render(), other))
+    require(one == two, f"pixels that do not count change the figure from {one} to {two}")
+
+
+def same_input_same_figure(make: Make[Metric]) -> None:
+    """The figure depends on what is compared alone, which stays as it is."""
+    compared = _compared(_render())
+    one, two = make().measure(compared), make().measure(compared)
+    require(one == two, f"two looks at one render give {one} and {two}")
+    require(torch.equal(compared.render, _render()), "the metric changes the render")
+
+
+def _require_number(value: object) -> None:
+    number = isinstance(value, int | float) and isfinite(value)
+    require(value is None or number, f"measure() answers {value!r}; None or a finite number")
+
+
+def _compared(render: Tensor, mask: Tensor | None = None) -> Compared:
+    view = sample_scene().test_views[0]
+    return Compared(view, render, view.photo.image(), mask)
+
+
+def _render() -> Tensor:
+    view = sample_scene().test_views[0]
+    generator = torch.Generator().manual_seed(5)
+    noise = torch.randint(-40, 40, view.photo.image().shape, generator=generator)
+    return (view.photo.image() + noise).clamp(0, 255).to(torch.uint8)
+
+
+METRIC_CHECKS: tuple[Check[Metric], ...] = (
+    *COMPONENT_CHECKS,
+    names_its_figure,
+    measures_a_finite_number,
+    an_empty_mask_is_no_error,
+    masked_pixels_do_not_count,
+    same_input_same_figure,
+)

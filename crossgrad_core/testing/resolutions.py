@@ -1,0 +1,101 @@
+"""Contract checks of resolutions."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from crossgrad_core.contract.contexts import Draw, ScaleContext, StepRecord
+from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    global_randomness_untouched,
+    require,
+    revived,
+    same_state,
+)
+from crossgrad_core.testing.fixtures import STEPS, sample_scene, step_fields
+
+#: Steps that are looked at, spread over a run of the published length.
+_STEPS = tuple(range(1, STEPS + 1, STEPS // 40))
+_BREAK = 20
+
+
+@dataclass
+class _Run:
+    """Asks a resolution step by step, as a training run does."""
+
+    resolution: Resolution
+    state: PluginState = EMPTY_STATE
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    last: StepRecord | None = None
+
+    def take_step(self, step: int) -> tuple[float, ...]:
+        draw = _draw(step)
+        context = ScaleContext(**{**step_fields(step), "rng": self.rng}, draw=draw, last=self.last)
+        scales, self.state = self.resolution.scales(context, self.state)
+        names = tuple(view.name for view in context.views)
+        losses = (0.2,) * len(names)
+        self.last = StepRecord(step, draw.views, names, None, losses, 40, {}, 0.01 * step, scales)
+        return scales
+
+
+def _draw(step: int) -> Draw:
+    count = len(sample_scene().train)
+    return Draw(tuple((step + 3 * slot) % count for slot in range(1 + step % 4)))
+
+
+def every_view_has_a_scale(make: Make[Resolution]) -> None:
+    """For each drawn view, however many there are, there is a number above 0 and at most 1."""
+    run = _Run(make())
+    for step in _STEPS:
+        scales = run.take_step(step)
+        views = len(_draw(step).views)
+        good = isinstance(scales, tuple) and all(isinstance(scale, float) for scale in scales)
+        require(good, f"scales() answers {scales!r}, not a tuple of floats")
+        require(len(scales) == views, f"{views} views were drawn and get {len(scales)} scales")
+        require(all(0.0 < scale <= 1.0 for scale in scales), f"scales {scales} are not in (0, 1]")
+
+
+def same_seed_same_scales(make: Make[Resolution]) -> None:
+    """The scales depend on the arguments alone, and randomness comes from `context.rng`."""
+    with global_randomness_untouched():
+        one, other = (
+            [run.take_step(step) for step in _STEPS] for run in (_Run(make()), _Run(make()))
+        )
+    require(one == other, "two runs with one seed have different scales")
+
+
+def resumes_exactly(make: Make[Resolution]) -> None:
+    """A run that continues from a checkpoint has the scales of an uninterrupted run."""
+    whole, broken = _Run(make()), _Run(make())
+    for number, step in enumerate(_STEPS):
+        if number == _BREAK:
+            broken.resolution, broken.state = make(), revived(broken.state)
+        one, other = whole.take_step(step), broken.take_step(step)
+        require(
+            one == other,
+            f"step {step}: an uninterrupted run has the scales {one}, a resumed one {other}; keep "
+            "everything that is remembered in the returned state",
+        )
+
+
+def old_states_stay_untouched(make: Make[Resolution]) -> None:
+    """`scales` returns a new state and leaves the old one as it was."""
+    run = _Run(make())
+    for step in _STEPS:
+        old = run.state
+        kept = revived(old)
+        run.take_step(step)
+        require(same_state(old, kept), "scales changes the state that it was given")
+
+
+RESOLUTION_CHECKS: tuple[Check[Resolution], ...] = (
+    *COMPONENT_CHECKS,
+    every_view_has_a_scale,
+    same_seed_same_scales,
+    resumes_exactly,
+    old_states_stay_untouched,
+)

@@ -1,0 +1,19 @@
+"""Small photos first."""
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Field, PluginState, Resolution, ScaleContext
+
+
+class CoarseFirst(Resolution):
+    """Renders and compares at a smaller scale in the first part of the run."""
+
+    scale: float = Field(0.5, gt=0, le=1, description="scale of the first part")
+    share: float = Field(0.25, ge=0, le=1, description="share of the steps that it takes")
+
+    @override
+    def scales(
+        self, context: ScaleContext, state: PluginState
+    ) -> tuple[tuple[float, ...], PluginState]:
+        first = context.step <= self.share * context.schedule.total
+        return (self.scale if first else 1.0,) * len(context.draw.views), state

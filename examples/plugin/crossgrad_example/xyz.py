@@ -1,0 +1,25 @@
+"""Centres as lines of text."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Exporter, Gaussians, Similarity
+
+
+class Xyz(Exporter):
+    """Writes the centres alone, one `x y z` per line, for programs that know points only."""
+
+    suffix: ClassVar[str] = "xyz"
+
+    @override
+    def write(
+        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
+    ) -> tuple[str, ...]:
+        centres = similarity.to_input(gaussians.means.detach().cpu().double().numpy())
+        part = path.with_name(f".{path.name}.part")
+        part.write_text("".join(f"{x} {y} {z}\n" for x, y, z in centres), encoding="utf-8")
+        part.replace(path)
+        return (f"{path.name}: the centres of the Gaussians alone",)

@@ -1,0 +1,25 @@
+"""The PLY file of 3DGS, which every viewer of Gaussians opens."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Exporter, Gaussians, Similarity, SplatCloud, write_ply
+
+
+class Ply(Exporter):
+    """The standard PLY of 3DGS: spherical harmonics, log scales, logits of opacities."""
+
+    suffix: ClassVar[str] = "ply"
+
+    @override
+    def write(
+        self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
+    ) -> tuple[str, ...]:
+        return write_ply(path, SplatCloud.from_gaussians(gaussians), similarity, comments)
+
+    @override
+    def stored(self, gaussians: Gaussians) -> Gaussians:
+        return SplatCloud.from_gaussians(gaussians).to_gaussians()

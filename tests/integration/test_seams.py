@@ -1,0 +1,222 @@
+"""Plugins of the smaller seams in short runs: each does what it says, also stopped and resumed."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.distributions import installed
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Observer, hookimpl
+from crossgrad_core.registry.entries import load as load_plugin
+from crossgrad_core.run import app, assemble
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.testing.checking import checks_of
+from crossgrad_core.training.clock import PHASES
+
+PLUGINS = {
+    "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
+    "exposures": {"gain": "support.seam_plugins:GainPerPhoto"},
+    "losses": {"centre": "support.seam_plugins:CentreWeighted"},
+    "metrics": {"brightness": "support.seam_plugins:BrightnessError"},
+}
+#: Two edits and a reset in a few steps.
+GROWTH = {"densify_from": 4, "densify_until": 22, "densify_every": 6, "reset_every": 13}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    return write_tiny_scene(folder, views=5, folders=("near", "far"))
+
+
+@pytest.fixture(autouse=True)
+def _plugins(tmp_path, monkeypatch):
+    installed(tmp_path / "plugins", monkeypatch, PLUGINS)
+
+
+def run(scene, out, **settings):
+    given = {"scene": str(scene), "out": str(out), "steps": 24, "eval_every": 12, "threads": 1}
+    reading = {"max_size": 40}
+    return app.run({**given, "reading": reading, **GROWTH, **settings}, verbosity=-1)
+
+
+def resumed(scene, out, **settings):
+    assert run(scene, out, stop_after=11, **settings) == 0
+    return app.run({}, resume=out, verbosity=-1)
+
+
+def state_of(out):
+    """Everything by which two runs may differ but clocks."""
+    found = load(latest(out))
+    last = {name: value for name, value in found.scalars["last"].items() if "seconds" not in name}
+    states = {name: (state.values, state.tensors) for name, state in found.plugins.items()}
+    return {**found.parameters, **{f"m {k}": v for k, v in found.exp_avg.items()}}, last, states
+
+
+def same(one, other):
+    (tensors, last, states), (tensors_b, last_b, states_b) = state_of(one), state_of(other)
+    assert tensors.keys() == tensors_b.keys()
+    assert all(torch.equal(tensors[name], tensors_b[name]) for name in tensors)
+    assert last == last_b
+    assert states.keys() == states_b.keys()
+    for name, (values, kept) in states.items():
+        assert values == states_b[name][0]
+        assert all(torch.equal(kept[key], states_b[name][1][key]) for key in kept)
+
+
+def rows(out):
+    with (out / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+CHECKS = [
+    pytest.param(slot, name, check, id=f"{name}-{check.__name__}")
+    for slot, names in PLUGINS.items()
+    for name in names
+    for check in checks_of(slot)
+]
+
+
+@pytest.mark.parametrize(("slot", "name", "check"), CHECKS)
+def test_each_plugin_keeps_the_contract_of_its_slot(slot, name, check):
+    check(load_plugin(slot, name))
+
+
+ALTOGETHER = {
+    "resolution": {"name": "near-at-half"},
+    "exposure": {"name": "gain"},
+    "loss": {"name": "centre"},
+    "metrics": [{"name": "psnr"}, {"name": "brightness"}],
+}
+CASES = {
+    "sampler and operator that follow losses": {
+        "sampler": {"name": "active"}, "operator": {"name": "gradnorm"}
+    },
+    "anchors": {
+        "backbone": {"name": "scaffold"}, "sampler": {"name": "near-far"}, "reset_every": None
+    },
+    "pixel statistics": {"densifier": {"name": "pixel"}, "views": 3},
+    "joint backward": {"backward": "joint", "densifier": {"name": "dc4gs"}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(scene, tmp_path, case):
+    settings = {**ALTOGETHER, **CASES[case]}
+    assert run(scene, tmp_path / "whole", **settings) == 0
+    assert resumed(scene, tmp_path / "broken", **settings) == 0
+    same(tmp_path / "whole", tmp_path / "broken")
+
+
+def test_the_record_of_a_step_has_the_scales(scene, tmp_path):
+    assert run(scene, tmp_path / "run", **ALTOGETHER, sampler={"name": "near-far"}, views=2) == 0
+    last = load(latest(tmp_path / "run")).scalars["last"]
+    expected = [0.5 if name.startswith("near") else 1.0 for name in last["names"]]
+    assert sorted(last["scales"]) == [0.5, 1.0]
+    assert last["scales"] == expected
+
+
+class Quarter(Observer):
+    """Wraps the seam of the scales: everything at a quarter."""
+
+    @hookimpl(wrapper=True)
+    def crossgrad_choose_scales(self, context):
+        answer = yield
+        return replace(answer, scales=tuple(0.25 for _ in answer.scales))
+
+
+def test_the_seam_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
+    build = assemble.make_manager
+    monkeypatch.setattr(
+        assemble, "make_manager", lambda plugins: build({**plugins, "quarter": Quarter()})
+    )
+    assert run(scene, tmp_path / "run", views=2) == 0
+    assert load(latest(tmp_path / "run")).scalars["last"]["scales"] == [0.25, 0.25]
+
+
+def test_a_metric_has_its_column_and_no_regime_is_made_of_its_name(scene, tmp_path):
+    assert run(scene, tmp_path / "run", **ALTOGETHER) == 0
+    columns = list(rows(tmp_path / "run")[0])
+    assert columns[4:10] == [
+        "psnr", "psnr_cc", "psnr_far", "psnr_cc_far", "psnr_near", "psnr_cc_near",
+    ]  # fmt: skip
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert list(summary["regimes"]) == ["far", "near"]
+    assert summary["overall"].keys() == {"views", "psnr", "psnr_cc"}
+    assert summary["definitions"]["psnr_cc"] == "mean error"
+
+
+def dimmed(scene, folder, stops):
+    """The scene with every other photo that many stops darker."""
+    shutil.copytree(scene, folder)
+    for path in sorted(folder.glob("images/*/*.png"))[::2]:
+        photo = np.asarray(Image.open(path), dtype=np.float64)
+        Image.fromarray((photo * 2.0**-stops).round().astype(np.uint8)).save(path)
+    return folder
+
+
+def stops_of(out):
+    state = load(latest(out)).plugins["photos"]
+    return dict(zip(state.values["photos"], state.tensors["value.stops"].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
+def test_gains_per_photo_find_the_photos_that_are_darker(scene, tmp_path, views, backbone):
+    dark = dimmed(scene, tmp_path / "dark", 1.0)
+    settings = {"steps": 90 // views, "views": views, "reset_every": None}
+    exposure = {"name": "gain", "lr": 0.1}
+    chosen = {"backbone": {"name": backbone}, "operator": {"name": "mean"}, "exposure": exposure}
+    assert run(dark, tmp_path / "run", **settings, **chosen) == 0
+    stops = stops_of(tmp_path / "run")
+    names = sorted(path.relative_to(dark / "images").as_posix() for path in dark.rglob("*.png"))
+    dim = [stops[name] for name in names[::2] if name in stops]
+    bright = [stops[name] for name in names[1::2] if name in stops]
+    assert max(dim) < min(bright)
+    assert sum(stops.values()) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_photos_that_a_step_did_not_draw_move_by_the_projection_only(scene, tmp_path):
+    assert run(scene, tmp_path / "run", steps=1, exposure={"name": "gain"}, views=1) == 0
+    stops = stops_of(tmp_path / "run")
+    drawn = load(latest(tmp_path / "run")).scalars["last"]["names"]
+    rest = {value for name, value in stops.items() if name not in drawn}
+    assert len(drawn) == 1 and len(rest) == 1
+    # One step of Adam is as long as its rate; the projection takes a share of it from all.
+    assert abs(stops[drawn[0]] - rest.pop()) == pytest.approx(0.05, rel=1e-4)
+
+
+def test_without_an_exposure_nothing_is_kept_per_photo(scene, tmp_path):
+    assert run(scene, tmp_path / "run", steps=2) == 0
+    assert "photos" not in load(latest(tmp_path / "run")).plugins
+
+
+def test_training_seconds_are_told_by_phase(scene, tmp_path):
+    assert resumed(scene, tmp_path / "run", **ALTOGETHER) == 0
+    seconds = json.loads((tmp_path / "run" / "summary.json").read_text())["seconds"]
+    assert list(seconds["phases"]) == list(PHASES)
+    assert sum(seconds["phases"].values()) == pytest.approx(seconds["train"], rel=1e-9)
+    assert all(seconds["phases"][phase] > 0 for phase in PHASES)
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene", views=4, folders=("cc", "far"))
+    with pytest.raises(UserError, match="psnr_cc") as caught:
+        run(scene, tmp_path / "run", **ALTOGETHER)
+    assert "rename the folder" in caught.value.todo
+    assert not (tmp_path / "run").exists()
+
+
+def test_scales_out_of_bounds_end_the_run_by_name(scene, tmp_path, monkeypatch, capsys):
+    from support.seam_plugins import NearAtHalf
+
+    monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))
+    with pytest.raises(UserError, match="does not give each view a scale"):
+        run(scene, tmp_path / "run", resolution={"name": "near-at-half"})
