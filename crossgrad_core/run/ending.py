@@ -117,7 +117,13 @@ class Course:
         with self.stopper.interruptible():
             if self.stopper.at_once:
                 raise KeyboardInterrupt
-            write()
+            try:
+                write()
+            except Exception as error:
+                # Compiled code makes an error of its own of an interrupt that it was met by.
+                if self.stopper.at_once:
+                    raise KeyboardInterrupt from error
+                raise
 
     def _summarise(self) -> None:
         ending = self.ending

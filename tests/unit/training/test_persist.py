@@ -15,7 +15,13 @@ from crossgrad_core.training.state import TrainState
 
 MEANS = Block("means", ("means",), True, "geometry", LearningRate(0.1))
 LEVELS = Block("levels", ("levels",), True, "geometry", LearningRate(0.0))
-SETUP = SimpleNamespace(blocks=(MEANS, LEVELS), trained_blocks=(MEANS,), device=torch.device("cpu"))
+SETUP = SimpleNamespace(
+    blocks=(MEANS, LEVELS),
+    trained_blocks=(MEANS,),
+    device=torch.device("cpu"),
+    config=SimpleNamespace(seed=0),
+    per_photo=False,
+)
 
 
 def checkpoint():

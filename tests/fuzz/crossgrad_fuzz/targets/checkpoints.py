@@ -4,7 +4,7 @@ import hashlib
 import json
 import random
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -46,7 +46,13 @@ _BLOCKS = (
 #: As much of a run as a checkpoint is held against.
 _SETUP = cast(
     "Any",
-    SimpleNamespace(blocks=_BLOCKS, trained_blocks=_BLOCKS[:1], device=torch.device("cpu")),
+    SimpleNamespace(
+        blocks=_BLOCKS,
+        trained_blocks=_BLOCKS[:1],
+        device=torch.device("cpu"),
+        config=SimpleNamespace(seed=0),
+        per_photo=False,
+    ),
 )
 
 
@@ -95,8 +101,14 @@ def _parse(folder: Path) -> None:
     state = from_checkpoint(_SETUP, found)
     assert state.step == found.step >= 0
     assert state.parameters["means"].shape[0] == state.parameters["scales"].shape[0]
-    assert all(isinstance(value, int | float) for value in vars(state.clock).values())
+    assert all(isinstance(value, int | float) for value in _seconds(state))
     assert all(0 <= rng.random() < 1 for rng in state.rngs.values())
+
+
+def _seconds(state: TrainState) -> Iterator[object]:
+    """Every number of the clock, those of its phases included."""
+    for value in vars(state.clock).values():
+        yield from value.values() if isinstance(value, dict) else (value,)
 
 
 def _say_what_is_missing(folder: Path) -> None:
