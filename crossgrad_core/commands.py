@@ -223,9 +223,9 @@ def open_run(
 
 def model_of(setup: "Setup", state: "TrainState") -> "Model":
     """The model of a run as plugins see it, for drawing views and for gradients."""
-    from crossgrad_core.training import views
+    from crossgrad_core.training import model
 
-    return views.model_of(setup, state)
+    return model.model_of(setup, state)
 
 
 def view_gradients(model: "Model", view: "View", tensors: Sequence[str]) -> "dict[str, Tensor]":

@@ -2,15 +2,16 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
-from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
 from crossgrad_core.contract.gradients import Gradients, SeparateGradients
 from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
@@ -108,6 +109,76 @@ PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
 def decoded(view: View) -> tuple[Tensor, Tensor | None]:
     """The photo and the mask of a view, decoded off any clock."""
     return view.photo.image(), view.photo.mask()
+
+
+@dataclass(frozen=True, eq=False)
+class RequestedRender:
+    """A training view as it was rendered on request, through the run's exposure and loss.
+
+    Attributes:
+        view: The view.
+        camera: The camera that it was rendered with.
+        scale: Sides of the render over those of the photo as trained.
+        gaussians: What the backbone decoded.
+        render: What the rasterizer made of it.
+        image: [H, W, 3] the render after exposure.
+        photo: [H, W, 3] uint8 the photo in the size of the render.
+        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+        measure: Works out `loss`.
+    """
+
+    view: View
+    camera: Camera
+    scale: float
+    gaussians: Gaussians
+    render: Render
+    image: Tensor
+    photo: Tensor
+    mask: Tensor | None
+    measure: Callable[[], Tensor]
+
+    @cached_property
+    def loss(self) -> Tensor:
+        """The run's photometric loss, pixel weights included; worked out when it is asked for."""
+        return self.measure()
+
+
+class RenderOnRequest(Protocol):
+    """Renders training views with the parameters as they are now."""
+
+    def __call__(
+        self,
+        view: int,
+        scale: float = 1.0,
+        outputs: frozenset[str] = frozenset(),
+        background: Tensor | None = None,
+    ) -> RequestedRender:
+        """The view as rendered.
+
+        The render is part of a graph where gradients are on (`torch.enable_grad()`); a densifier
+        that needs none asks under `torch.no_grad()`.
+
+        Args:
+            view: Position in `scene.train_views`.
+            scale: In (0, 1]: sides of the render over those of the photo.
+            outputs: Optional outputs of the rasterizer.
+            background: [3] RGB; None takes that of evaluated views.
+        """
+        ...
+
+
+class NoRenders:
+    """Stands where nothing can be rendered: a context that belongs to no run."""
+
+    def __call__(
+        self,
+        view: int,
+        scale: float = 1.0,
+        outputs: frozenset[str] = frozenset(),
+        background: Tensor | None = None,
+    ) -> RequestedRender:
+        """Raises RuntimeError."""
+        raise RuntimeError("this context belongs to no run: there is nothing to render views with")
 
 
 #: A view and its render [H, W, 3] -> the image as the view's camera would have taken it.
@@ -266,6 +337,8 @@ class DensifyContext(StepContext):
         views: The rendered views of the step with their screen statistics.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
+        render: Renders a training view of the densifier's choice: on the training clock, and
+            counted among the rendered views.
     """
 
     parameters: Parameters
@@ -274,6 +347,7 @@ class DensifyContext(StepContext):
     views: tuple[ViewRecord, ...]
     means_lr: float
     room: int
+    render: RenderOnRequest = field(default_factory=NoRenders, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,6 +456,7 @@ class Model:
         groups: Group label of each training view, or None.
         exposed: What the run's exposure makes of a render [H, W, 3] of a view; it goes before the
             loss.
+        render: Renders a training view of the observer's choice; off the clock, and not counted.
     """
 
     phase: Phase
@@ -394,6 +469,7 @@ class Model:
     loss: "Loss"
     groups: tuple[str, ...] | None
     exposed: ExposedBy = field(default=unexposed)
+    render: RenderOnRequest = field(default_factory=NoRenders)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,17 @@ def objections_to(selection: Selection) -> list[str]:
 
 def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
     """Numbers of views for which the operator, named as the selection's, means nothing."""
-    if operator.views.admits(selection.views_per_step):
+    name, views = selection.names["operator"], selection.views_per_step
+    if not operator.views.admits(views):
+        return [f"operator {name} needs {operator.views} (--views); K is {views}"]
+    counts = sorted(selection.sampler.counts(views))
+    if all(map(operator.views.admits, counts)):
         return []
-    name = selection.names["operator"]
-    return [f"operator {name} needs {operator.views} (--views); K is {selection.views_per_step}"]
+    listed = ", ".join(map(str, counts))
+    return [
+        f"operator {name} needs {operator.views}; with sampler {selection.names['sampler']} steps "
+        f"have {listed} views"
+    ]
 
 
 def _of_the_sampler(selection: Selection) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The rasterizer slot: Gaussians x Camera -> Render, differentiable."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 from pydantic import Field
@@ -57,3 +58,15 @@ class Rasterizer(Component):
         Image, alpha and (where asked for) depth are differentiable in all tensors of `gaussians`;
         the backward pass fills `Render.screen`. `outputs` names the optional outputs to compute.
         """
+
+    def render_views(
+        self,
+        views: Sequence[tuple[Gaussians, Camera]],
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> list[Render]:
+        """Draws several views, each with its own Gaussians; by default one after the other.
+
+        The renders are those of `render`; a rasterizer for a GPU may draw them together.
+        """
+        return [self.render(gaussians, camera, background, outputs) for gaussians, camera in views]

@@ -42,6 +42,14 @@ class Sampler(Component):
         """K where the user names none."""
         return self.default_views
 
+    def counts(self, views: int) -> frozenset[int]:
+        """How many views a step of a run with K = `views` may have; by default always K.
+
+        A sampler whose steps differ names all numbers: an operator that has no meaning for one of
+        them is refused.
+        """
+        return frozenset({views})
+
     @abstractmethod
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
         """The views of this step and the new state. Random numbers come from `context.rng`."""

@@ -32,6 +32,7 @@ from crossgrad_core.testing.contract import (
 )
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
 from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.renders import renders_of
 
 #: Steps of the published schedule around its second and third edit, at 600 and 700.
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
@@ -78,14 +79,18 @@ class DensifierRun:
     def context(self, step: int, room: int = _ROOM) -> DensifyContext:
         """What the densifier is offered at a step in which two views were rendered."""
         fields = {**step_fields(step), "rng": self.rng}
+        rasterizer = cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {}))
         return DensifyContext(
             **fields,
             parameters=self.parameters,
             backbone=self.backbone,
-            rasterizer=cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {})),
+            rasterizer=rasterizer,
             views=tuple(self._rendered(index, step) for index in (step % 4, 4 + step % 5)),
             means_lr=1e-4,
             room=room,
+            render=renders_of(
+                sample_scene(), sample_phase(step), self.backbone, rasterizer, self.parameters
+            ),
         )
 
     def take_step(self, step: int, room: int = _ROOM) -> Edit:

@@ -61,17 +61,18 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
         for _ in range(_AFTER):
             # Looked at before the run takes it, which needs a good one.
             draw, _ = sampler.sample(run.context(), run.state)
-            _require_good(draw, views, len(run.scene.train))
+            _require_good(draw, sampler.counts(views), len(run.scene.train))
             run.draw()
 
 
-def _require_good(draw: Draw, views: int, available: int) -> None:
+def _require_good(draw: Draw, counts: frozenset[int], available: int) -> None:
     require(isinstance(draw, Draw), f"the sampler answers {draw!r}, not a Draw and a state")
     require(
         isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
         f"the drawn views {draw.views!r} are not a tuple of plain integers",
     )
-    require(len(draw.views) == views, f"K = {views}, but {len(draw.views)} views were drawn")
+    views = len(draw.views)
+    require(views in counts, f"{views} views were drawn; `counts` says {sorted(counts)}")
     require(
         all(0 <= view < available for view in draw.views),
         f"the drawn views {draw.views} are not all positions in 0 .. {available - 1}",

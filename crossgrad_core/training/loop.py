@@ -11,11 +11,11 @@ from crossgrad_core.training.checks import are_parameters_finite, check_dropped,
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.keeper import Keeper
+from crossgrad_core.training.model import model_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.stopper import Stopper
-from crossgrad_core.training.views import model_of
 
 #: Why the loop came back.
 Ending = Literal["finished", "stopped", "paused"]

@@ -3,9 +3,9 @@
 from crossgrad_core.contract import sampler
 from crossgrad_core.contract.grouping import Regrouping
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.training.model import model_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import model_of
 
 #: Name of the state that holds the labels, and of their stream of random numbers.
 STATE = "grouping"

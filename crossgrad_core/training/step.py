@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
+from crossgrad_core.training.on_request import render_counted
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
@@ -40,6 +42,7 @@ from crossgrad_core.training.views import (
     joined,
     render_views,
 )
+from crossgrad_core.wording import listed
 
 
 def take_step(setup: Setup, state: TrainState) -> StepRecord:
@@ -86,7 +89,16 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     )
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
     state.commit(answer.states)
-    return answer.draw
+    counts = setup.sampler.counts(setup.selection.views_per_step)
+    if len(answer.draw.views) in counts:
+        return answer.draw
+    raise UserError(
+        "the sampler draws another number of views than it says",
+        where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
+        expected=f"{listed(map(str, sorted(counts)))} views",
+        found=f"{len(answer.draw.views)} views",
+        todo="choose another --sampler, or let the plugin's `counts` name every number",
+    )
 
 
 def _scales(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
@@ -167,6 +179,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         views=rendered.records,
         means_lr=_means_lr(setup, state.step),
         room=_room(setup, state, rendered) if setup.schedule.densifies(state.step) else 0,
+        render=partial(render_counted, setup, state),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
     state.commit(answer.states)

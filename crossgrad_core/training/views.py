@@ -13,7 +13,6 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import (
     Draw,
-    Model,
     PixelContext,
     RegularizeContext,
     ViewRecord,
@@ -25,7 +24,7 @@ from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.operator_scale import Scale
-from crossgrad_core.training.photo_parameters import Leaves, exposed, leaves_of
+from crossgrad_core.training.photo_parameters import Leaves, leaves_of
 from crossgrad_core.training.scaled_photos import ScaledPhoto
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -127,7 +126,8 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
     state.laps.lap("render")
     leaves = leaves_of(setup, state, index)
     image = setup.exposure.exposed(render.image, leaves)
-    loss = setup.loss.loss(image, target.photo, target.mask, _weights(setup, state, index, target))
+    weights = weights_of(setup, state, index, target)
+    loss = setup.loss.loss(image, target.photo, target.mask, weights)
     state.counters.views += 1
     value = float(loss.detach())
     if not isfinite(value):
@@ -150,8 +150,8 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
 
 
 @dataclass(frozen=True, eq=False)
-class _Target:
-    """What a render is compared with.
+class Target:
+    """What a render of a view is made with and compared with.
 
     Attributes:
         camera: The camera to render with.
@@ -166,7 +166,7 @@ class _Target:
     mask: Tensor | None
 
 
-def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> _Target:
+def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> Target:
     """Camera and photo of a training view at a scale in (0, 1]."""
     view = setup.train_views[index]
     camera = camera_at(view.camera, scale)
@@ -176,10 +176,10 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> _Tar
         full = partial(photo_of, setup, state)
         small = ScaledPhoto(view, camera.width, camera.height, full)
         photo, mask = setup.scaled_photos.get(small)
-    return _Target(camera, scale, photo, mask)
+    return Target(camera, scale, photo, mask)
 
 
-def _weights(setup: Setup, state: TrainState, index: int, target: _Target) -> Tensor | None:
+def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> Tensor | None:
     """[H, W], how much each pixel counts; None where all count alike."""
     if not setup.weighs:
         return None
@@ -243,22 +243,6 @@ def eval_background(setup: Setup) -> Tensor:
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
     return torch.tensor(rgb, dtype=torch.float32, device=setup.device)
-
-
-def model_of(setup: Setup, state: TrainState) -> Model:
-    """The model as it is after the last step, shared, not copied."""
-    return Model(
-        phase=setup.phase(state.step, training=True),
-        scene=setup.scene,
-        backbone=setup.backbone,
-        rasterizer=setup.rasterizer,
-        parameters=state.parameters,
-        adam=state.adam,
-        background=eval_background(setup),
-        loss=setup.loss,
-        exposed=partial(exposed, setup, state),
-        groups=setup.groups,
-    )
 
 
 def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: TensorGradients) -> None:

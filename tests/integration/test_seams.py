@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,17 +12,22 @@ import torch
 from PIL import Image
 from support.distributions import installed
 from support.scenes import write_tiny_scene
+from support.selections import selection_of
 
+from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.errors import UserError
-from crossgrad_core.plugin import Observer, hookimpl
+from crossgrad_core.plugin import Aggregated, Observer, Operator, ViewCounts, hookimpl
 from crossgrad_core.registry.entries import load as load_plugin
 from crossgrad_core.run import app, assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.training.clock import PHASES
+from crossgrad_core.training.on_request import render_uncounted
 
 PLUGINS = {
     "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
+    "densifiers": {"unseen": "support.seam_plugins:PrunesTheUnseen"},
+    "samplers": {"one-then-two": "support.seam_plugins:OneThenTwo"},
     "exposures": {"gain": "support.seam_plugins:GainPerPhoto"},
     "losses": {"centre": "support.seam_plugins:CentreWeighted"},
     "metrics": {"brightness": "support.seam_plugins:BrightnessError"},
@@ -103,6 +109,11 @@ CASES = {
         "backbone": {"name": "scaffold"}, "sampler": {"name": "near-far"}, "reset_every": None
     },
     "pixel statistics": {"densifier": {"name": "pixel"}, "views": 3},
+    "extra renders and a K that changes": {
+        "densifier": {"name": "unseen"}, "sampler": {"name": "one-then-two"}, "views": 2,
+        "operator": {"name": "pcgrad"},
+    },
+    "a K that changes, summed up": {"sampler": {"name": "one-then-two"}, "views": 3},
     "joint backward": {"backward": "joint", "densifier": {"name": "dc4gs"}},
 }  # fmt: skip
 
@@ -121,6 +132,61 @@ def test_the_record_of_a_step_has_the_scales(scene, tmp_path):
     expected = [0.5 if name.startswith("near") else 1.0 for name in last["names"]]
     assert sorted(last["scales"]) == [0.5, 1.0]
     assert last["scales"] == expected
+
+
+def test_extra_renders_count_and_take_training_time(scene, tmp_path):
+    settings = {**ALTOGETHER, "densifier": {"name": "unseen"}, "sampler": {"name": "one-then-two"}}
+    assert run(scene, tmp_path / "run", **settings, reset_every=None) == 0
+    edits = load(latest(tmp_path / "run")).plugins["densifier"].values["losses"]
+    # 12 steps of one view, 12 of two, and two extra renders at each edit.
+    assert [len(losses) for losses in edits] == [2] * len(edits)
+    assert len(edits) >= 2
+    assert rows(tmp_path / "run")[-1]["views"] == str(36 + 2 * len(edits))
+    assert all(0.0 < loss < 1.0 for losses in edits for loss in losses)
+
+
+def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
+    asked = []
+
+    class Asks(Observer):
+        @hookimpl
+        def crossgrad_model(self, model):
+            drawn = model.render(1, 0.5, frozenset({"depth"}))
+            assert drawn.render.depth.shape == drawn.photo.shape[:2] == drawn.image.shape[:2]
+            expected = model.loss.loss(drawn.image, drawn.photo, drawn.mask, None)
+            found = drawn.loss
+            asked.append((float(found.detach()), float(expected.detach()), found.requires_grad))
+
+    build = assemble.make_manager
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assemble, "make_manager", lambda plugins: build({**plugins, "asks": Asks()}))
+        assert run(scene, tmp_path / "run", steps=3, exposure={"name": "gain"}) == 0
+    assert len(asked) == 3
+    assert all(loss == expected and differentiable for loss, expected, differentiable in asked)
+    assert rows(tmp_path / "run")[-1]["views"] == "6"
+
+
+@pytest.mark.parametrize(("view", "scale"), [(-1, 1.0), (99, 1.0), (0, 0.0), (0, 1.5)])
+def test_a_render_that_there_cannot_be_is_refused(view, scale):
+    setup = SimpleNamespace(train_views=(None,) * 3)
+    with pytest.raises(UserError, match="asked for a render"):
+        render_uncounted(setup, None, view, scale)
+
+
+class PairOnly(Operator):
+    """Means something for two views only."""
+
+    views = ViewCounts(2, 2)
+
+    def aggregate(self, context, state):
+        return Aggregated(context.gradients.total()), state
+
+
+def test_an_operator_without_a_meaning_for_some_step_is_refused():
+    selection = selection_of(
+        sampler=load_plugin("samplers", "one-then-two")(), operator=PairOnly(), views_per_step=2
+    )
+    assert any("steps have 1, 2 views" in reason for reason in objections_to(selection))
 
 
 class Quarter(Observer):

@@ -3,7 +3,11 @@
 import torch
 
 from crossgrad_core.plugin import (
+    NO_EDIT,
     Compared,
+    Densifier,
+    Draw,
+    Edit,
     Exposure,
     Field,
     Figure,
@@ -12,7 +16,9 @@ from crossgrad_core.plugin import (
     Metric,
     PerPhoto,
     PixelContext,
+    PluginState,
     Resolution,
+    Sampler,
     hookimpl,
     photometric_loss,
 )
@@ -53,6 +59,39 @@ class CentreWeighted(Loss):
         rows = torch.linspace(-1, 1, context.camera.height)[:, None]
         columns = torch.linspace(-1, 1, context.camera.width)[None, :]
         return torch.exp(-(rows**2 + columns**2))
+
+
+class PrunesTheUnseen(Densifier):
+    """At each edit, prunes what no pixel of two extra renders shows; half of it at most."""
+
+    def densify(self, context, state):
+        if not context.schedule.densifies(context.step):
+            return NO_EDIT, state
+        seen = torch.zeros(context.parameters["means"].shape[0], dtype=torch.bool)
+        views = context.rng.choice(len(context.scene.train_views), 2, replace=False)
+        losses = []
+        for view in views:
+            with torch.no_grad():
+                drawn = context.render(int(view), 0.5, frozenset({"pixels"}))
+            seen |= drawn.render.screen.pixels > 0
+            losses.append(float(drawn.loss))
+        kept = seen | (torch.arange(len(seen)) % 2 == 0)
+        told = [*state.values.get("losses", []), losses]
+        return Edit(source=kept.nonzero().squeeze(1)), PluginState({"losses": told})
+
+
+class OneThenTwo(Sampler):
+    """One view in every odd step, two in every even one."""
+
+    default_views = 2
+
+    def counts(self, views):
+        return frozenset({1, views})
+
+    def sample(self, context, state):
+        count = context.views_per_step if context.step % 2 == 0 else 1
+        drawn = context.rng.choice(len(context.centers), count, replace=False)
+        return Draw(tuple(int(view) for view in drawn)), state
 
 
 class BrightnessError(Metric):

@@ -8,15 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.plugin import (
-    DensifyContext,
-    Gaussians,
-    Phase,
-    View,
-    masked,
-    ssim_map,
-    unit_range,
-)
+from crossgrad_core.plugin import Camera, DensifyContext, Gaussians, masked, ssim_map, unit_range
 
 ErrorKind = Literal["ssim", "l1"]
 
@@ -32,29 +24,25 @@ def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
 def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKind) -> Tensor:
     """[P] the largest share that each primitive has in the error of any of the views, pixels.
 
-    The views are drawn with the current parameters; the whole costs two renders and one backward
-    pass per view.
+    The views are drawn with the current parameters, through the exposure; the whole costs two
+    renders and one backward pass per view.
 
     Args:
         context: With the parameters and the rasterizer.
         views: Positions in `scene.train_views`.
         kind: What the error of a pixel is.
     """
-    phase = Phase(context.step, training=True, schedule=context.schedule)
     blocks = context.backbone.blocks()
     name = next(block.tensors[0] for block in blocks if block.per_primitive)
     like = context.parameters[name].detach()
     largest = torch.zeros(like.shape[0], device=like.device)
-    background = torch.zeros(3, device=like.device)
-    if context.views:
-        background = context.views[-1].background
+    background = context.views[-1].background if context.views else None
     for index in views:
-        view = context.scene.train_views[index]
         with torch.no_grad():
-            gaussians = context.backbone.decode(context.parameters, view.camera, phase)
-            image = context.rasterizer.render(gaussians, view.camera, background).image
-            error = pixel_error(image, context.photo(view), kind)
-        shares = _shares(context, gaussians.detached(), view, error)
+            drawn = context.render(index, background=background)
+            gaussians = drawn.gaussians
+            error = pixel_error(drawn.image, (drawn.photo, drawn.mask), kind)
+        shares = _shares(context, gaussians.detached(), drawn.camera, error)
         if gaussians.origin is not None:
             shares = torch.zeros_like(largest).index_add_(0, gaussians.origin, shares)
         largest = torch.maximum(largest, shares)
@@ -76,7 +64,7 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
     return masked(error, mask).mean(-1)
 
 
-def _shares(context: DensifyContext, gaussians: Gaussians, view: View, error: Tensor) -> Tensor:
+def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error: Tensor) -> Tensor:
     """[N] sum over pixels of the Gaussian's blending weight times the pixel's error.
 
     A pixel is the sum of weight times colour, so this is the gradient by the colour (of one
@@ -86,6 +74,6 @@ def _shares(context: DensifyContext, gaussians: Gaussians, view: View, error: Te
     plain = replace(gaussians, colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)
     with torch.enable_grad():
         black = torch.zeros(3, device=error.device)
-        image = context.rasterizer.render(plain, view.camera, black).image
+        image = context.rasterizer.render(plain, camera, black).image
         (gradient,) = torch.autograd.grad((image[..., 0] * error).sum(), colors)
     return gradient[:, 0]

@@ -20,6 +20,7 @@ from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene, step_fields
+from crossgrad_core.testing.renders import renders_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.error_share import largest_shares, pixel_error, spread_views
@@ -69,11 +70,14 @@ def context(*, backbone=None, step=600, room=10**6, rasterizer="torch", mask=Non
         params["scales"] += torch.from_numpy(rng.normal(1.0, 0.5, (40, 3))).float()
         params["opacities"][:] = torch.from_numpy(rng.normal(0.0, 2.0, 40)).float()
     fields = {**step_fields(step), "scene": scene_of(mask)}
+    rasterizer = build("rasterizers", rasterizer, {})
+    phase = Phase(step, training=True, schedule=fields["schedule"])
     return DensifyContext(
         **fields,
         parameters=params,
         backbone=backbone,
-        rasterizer=build("rasterizers", rasterizer, {}),
+        rasterizer=rasterizer,
+        render=renders_of(fields["scene"], phase, backbone, rasterizer, params),
         views=(),
         means_lr=1e-4,
         room=room,

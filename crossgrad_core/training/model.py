@@ -1,0 +1,27 @@
+"""The model between two steps, as it is shown to observers."""
+
+from functools import partial
+
+from crossgrad_core.contract.contexts import Model
+from crossgrad_core.training.on_request import render_uncounted
+from crossgrad_core.training.photo_parameters import exposed
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import eval_background
+
+
+def model_of(setup: Setup, state: TrainState) -> Model:
+    """The model as it is after the last step, shared, not copied."""
+    return Model(
+        phase=setup.phase(state.step, training=True),
+        scene=setup.scene,
+        backbone=setup.backbone,
+        rasterizer=setup.rasterizer,
+        parameters=state.parameters,
+        adam=state.adam,
+        background=eval_background(setup),
+        loss=setup.loss,
+        exposed=partial(exposed, setup, state),
+        render=partial(render_uncounted, setup, state),
+        groups=setup.groups,
+    )

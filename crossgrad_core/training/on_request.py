@@ -1,0 +1,75 @@
+"""Renders of training views that a plugin asks for."""
+
+from torch import Tensor
+
+from crossgrad_core.contract.contexts import RequestedRender
+from crossgrad_core.errors import UserError
+from crossgrad_core.training.photo_parameters import exposed
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import eval_background, target_at, weights_of
+
+
+def render_counted(
+    setup: Setup,
+    state: TrainState,
+    view: int,
+    scale: float = 1.0,
+    outputs: frozenset[str] = frozenset(),
+    background: Tensor | None = None,
+) -> RequestedRender:
+    """See `RenderOnRequest`; counted among the rendered views."""
+    state.counters.views += 1
+    return render_uncounted(setup, state, view, scale, outputs, background)
+
+
+def render_uncounted(
+    setup: Setup,
+    state: TrainState,
+    view: int,
+    scale: float = 1.0,
+    outputs: frozenset[str] = frozenset(),
+    background: Tensor | None = None,
+) -> RequestedRender:
+    """See `RenderOnRequest`.
+
+    Raises:
+        UserError: There is no such view, or the scale is out of bounds.
+    """
+    _check(setup, view, scale)
+    target = target_at(setup, state, view, scale)
+    gaussians = setup.backbone.decode(
+        state.parameters, target.camera, setup.phase(state.step, training=True)
+    )
+    if background is None:
+        background = eval_background(setup)
+    render = setup.rasterizer.render(gaussians, target.camera, background, outputs)
+    image = exposed(setup, state, setup.train_views[view], render.image)
+
+    def measure() -> Tensor:
+        weights = weights_of(setup, state, view, target)
+        return setup.loss.loss(image, target.photo, target.mask, weights)
+
+    return RequestedRender(
+        view=setup.train_views[view],
+        camera=target.camera,
+        scale=scale,
+        gaussians=gaussians,
+        render=render,
+        image=image,
+        photo=target.photo,
+        mask=target.mask,
+        measure=measure,
+    )
+
+
+def _check(setup: Setup, view: int, scale: float) -> None:
+    count = len(setup.train_views)
+    if 0 <= view < count and 0.0 < scale <= 1.0:
+        return
+    raise UserError(
+        "a plugin asked for a render that there cannot be",
+        expected=f"a training view from 0 to {count - 1}, and a scale above 0 and at most 1",
+        found=f"view {view}, scale {scale}",
+        todo="repair the plugin that asks",
+    )
