@@ -24,6 +24,7 @@ from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.writability import check_file, check_folder
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from torch import Tensor
 
     from crossgrad_core.config import ComponentChoice, RunConfig
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from crossgrad_core.contract.contexts import Model
     from crossgrad_core.contract.gradients import SeparateGradients
     from crossgrad_core.contract.scene import Scene, View
+    from crossgrad_core.run.results.reading import RunResults
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
@@ -43,6 +45,7 @@ __all__ = [
     "NonFiniteError",
     "Progress",
     "RunConfig",
+    "RunResults",
     "Setup",
     "TrainState",
     "TrainingFailedError",
@@ -56,11 +59,15 @@ __all__ = [
     "check_folder",
     "configured",
     "disk_errors",
+    "find_runs",
     "gathered",
     "model_of",
     "names",
     "open_run",
+    "panels_of",
     "parse_number",
+    "read_panel",
+    "read_results",
     "read_rows",
     "read_scene",
     "take_steps",
@@ -77,6 +84,7 @@ _CLASSES: Final = {
     "ComponentChoice": "crossgrad_core.config",
     "NonFiniteError": "crossgrad_core.training.failure",
     "RunConfig": "crossgrad_core.config",
+    "RunResults": "crossgrad_core.run.results.reading",
     "Setup": "crossgrad_core.training.setup",
     "TrainState": "crossgrad_core.training.state",
     "TrainingFailedError": "crossgrad_core.training.failure",
@@ -257,6 +265,48 @@ def gathered(
     from crossgrad_core.gradients.separate import DenseGradients
 
     return DenseGradients(per_view, blocks)
+
+
+def find_runs(root: Path) -> tuple[Path, ...]:
+    """The folders of runs at or below a folder, sorted; imports no torch."""
+    from crossgrad_core.run.results import reading
+
+    return reading.find_runs(root)
+
+
+def read_results(folder: Path) -> "RunResults":
+    """What a run wrote, of any version; it may be training meanwhile. Imports no torch.
+
+    Raises:
+        UserError: It is not the folder of a run, or one of its files is damaged.
+    """
+    from crossgrad_core.run.results import reading
+
+    return reading.read_run(folder)
+
+
+def panels_of(run: Path, step: int, views: Sequence[str]) -> dict[str, Path]:
+    """View name -> picture of its photo, render and error, of those held-out views that have one.
+
+    Args:
+        run: The run's folder.
+        step: The step of the evaluation.
+        views: Names of all held-out views, in the order of per_view.csv.
+    """
+    from crossgrad_core.run.results import panel_layout
+
+    return panel_layout.panels_of(run, step, views)
+
+
+def read_panel(path: Path) -> "dict[str, Image]":
+    """The images in such a picture by name: `photo`, `render` and `error`.
+
+    Raises:
+        UserError: It is no such picture.
+    """
+    from crossgrad_core.run.results import panel_layout
+
+    return panel_layout.read_panel(path)
 
 
 class _NoFolder:

@@ -29,7 +29,7 @@ from crossgrad_core.run.results.folder import (
 )
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
-from crossgrad_core.run.results.panels import FOLDER as RENDERS
+from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.run.results.table import final_table

@@ -3,8 +3,10 @@
 import re
 from collections.abc import Sequence
 from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
 
-from crossgrad_core.contract.scene import View
+if TYPE_CHECKING:
+    from crossgrad_core.contract.scene import View
 
 _UNSAFE = re.compile(r"[^\w.+-]+")
 _LONGEST = 120
@@ -30,7 +32,7 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
     return flat
 
 
-def chosen_views(views: Sequence[View], count: int) -> tuple[View, ...]:
+def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
     """At most `count` views: every regime in turn, evenly spread over each regime's views."""
     regimes = sorted({view.regime for view in views})
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
@@ -43,6 +45,6 @@ def chosen_views(views: Sequence[View], count: int) -> tuple[View, ...]:
     return tuple(view for view in views if view.name in chosen)
 
 
-def _spread(group: Sequence[View], wanted: int) -> list[View]:
+def _spread(group: "Sequence[View]", wanted: int) -> "list[View]":
     wanted = min(wanted, len(group))
     return [group[(2 * i + 1) * len(group) // (2 * wanted)] for i in range(wanted)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from crossgrad_core.contract.scene import View
 from crossgrad_core.evaluation.evaluation import Evaluated
 from crossgrad_core.evaluation.result import ViewMetrics
+from crossgrad_core.run.results.panel_layout import Layout, enlargement, folder_of
 from crossgrad_core.run.results.panel_names import chosen_views, flat_names
 from crossgrad_core.system.files import write_atomically
 
@@ -20,14 +21,10 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
-FOLDER = "renders"
-
 #: Errors of this size and above have the last colour; fixed, so that panels compare.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
-#: Smaller images are enlarged by a whole factor, so that the labels fit.
-_NARROWEST = 360
 _PAPER, _INK, _FAINT = (255, 255, 255), (20, 20, 20), (105, 105, 105)
 _HATCH = ((188, 188, 188), (150, 150, 150))
 
@@ -53,7 +50,7 @@ class PanelWriter:
         """For at most `count` of these views, spread over the regimes."""
         names = flat_names([view.name for view in views])
         chosen = {view.name: names[view.name] for view in chosen_views(views, count)}
-        return cls(run / FOLDER / f"{step:06d}", chosen, step)
+        return cls(folder_of(run, step), chosen, step)
 
     def write(self, evaluated: Evaluated) -> None:
         """Writes the panel of a view, if it gets one.
@@ -70,52 +67,6 @@ class PanelWriter:
         write_atomically(self.folder / f"{file}.png", picture.getvalue())
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Sizes in pixels, all derived from the size of the (enlarged) image."""
-
-    width: int
-    height: int
-    font: int
-
-    @classmethod
-    def of(cls, image: Pixels) -> "_Layout":
-        height, width = image.shape[:2]
-        return cls(width, height, int(np.clip(width / 38, 12, 26)))
-
-    @property
-    def margin(self) -> int:
-        return self.font
-
-    @property
-    def gap(self) -> int:
-        return max(4, self.font // 2)
-
-    @property
-    def top(self) -> int:
-        return self.margin + round(3.2 * self.font)
-
-    @property
-    def captions(self) -> int:
-        """Base line of the captions above the images."""
-        return self.top - self.font // 2
-
-    @property
-    def bar(self) -> int:
-        """Width of the colour bar."""
-        return max(10, self.font)
-
-    @property
-    def canvas(self) -> tuple[int, int]:
-        legend = self.gap + self.bar + 5 * self.font
-        width = 2 * self.margin + 3 * self.width + 2 * self.gap + legend
-        return width, self.top + self.height + self.margin
-
-    def left(self, column: int) -> int:
-        """Left edge of the photo (0), render (1), error (2) and colour bar (3)."""
-        return self.margin + column * (self.width + self.gap)
-
-
 def draw_panel(evaluated: Evaluated, step: int) -> "Image":
     """Photo | render | error with labels, a colour legend and masked pixels hatched."""
     from PIL import Image, ImageDraw
@@ -129,7 +80,7 @@ def draw_panel(evaluated: Evaluated, step: int) -> "Image":
         if evaluated.compared.mask is None
         else _enlarged(evaluated.compared.mask.byte().numpy())
     )
-    layout = _Layout.of(photo)
+    layout = Layout(photo.shape[1], photo.shape[0])
     canvas = Image.new("RGB", layout.canvas, _PAPER)
     pictures = (photo, render, _hatched(error_map(photo, render), mask, layout.font))
     for column, picture in enumerate(pictures):
@@ -159,7 +110,7 @@ def _colored(values: NDArray[np.float64]) -> Pixels:
 
 
 def _enlarged(image: Pixels) -> Pixels:
-    factor = -(-_NARROWEST // image.shape[1])
+    factor = enlargement(image.shape[1])
     enlarged: Pixels = image.repeat(factor, axis=0).repeat(factor, axis=1)
     return enlarged
 
@@ -182,7 +133,7 @@ def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
     return ImageFont.truetype(str(Path(get_data_path(), "fonts", "ttf", file)), size)
 
 
-def _label(draw: "ImageDraw", layout: _Layout, metrics: ViewMetrics, step: int) -> None:
+def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -> None:
     bold, font = _font(layout.font, bold=True), _font(layout.font)
     line = layout.margin + layout.font  # base line of the title
     draw.text((layout.margin, line), metrics.name, fill=_INK, font=bold, anchor="ls")
@@ -203,7 +154,7 @@ def _label(draw: "ImageDraw", layout: _Layout, metrics: ViewMetrics, step: int) 
         draw.text(place, caption, fill=_INK, font=font, anchor="ls")
 
 
-def _color_bar(canvas: "Image", draw: "ImageDraw", layout: _Layout) -> None:
+def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
     """The colours of the error map right of it, as shares of the full scale."""
     from PIL import Image
 
@@ -219,7 +170,7 @@ def _color_bar(canvas: "Image", draw: "ImageDraw", layout: _Layout) -> None:
         draw.text(place, text, fill=_FAINT, font=font, anchor="lm")
 
 
-def _mask_key(canvas: "Image", draw: "ImageDraw", layout: _Layout) -> None:
+def _mask_key(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
     """What the hatching means, right-aligned above the error map."""
     from PIL import Image
 

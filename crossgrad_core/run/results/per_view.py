@@ -4,10 +4,14 @@ import csv
 import io
 from pathlib import Path
 
-from crossgrad_core.evaluation.result import EvaluationResult
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import parse_number, read_rows
 
 FILE = "per_view.csv"
+_NAMES = ("name", "regime")
+_TODO = "restore the file, or write it again: crossgrad eval RUN"
 
 
 def write_per_view(folder: Path, result: EvaluationResult, name: str = FILE) -> None:
@@ -17,10 +21,44 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = FILE) -> 
         UserError: The disk is full.
     """
     text = io.StringIO()
-    columns = ["name", "regime", *(figure.name for figure in result.figures)]
+    columns = [*_NAMES, *(figure.name for figure in result.figures)]
     table = csv.DictWriter(text, columns, lineterminator="\n")
     table.writeheader()
     table.writerows(
         {"name": view.name, "regime": view.regime, **view.values} for view in result.views
     )
     write_atomically(folder / name, text.getvalue().encode())
+
+
+def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
+    """The figures of every held-out view of a run, in the order of the scene.
+
+    Returns:
+        The views; none where there is no such file, as before the first evaluation.
+
+    Raises:
+        UserError: The file is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return ()
+    header, *lines = read_rows(path, FILE, _TODO) or [[]]
+    if tuple(header[:2]) != _NAMES or len(set(header)) < len(header):
+        raise UserError(
+            f"unreadable {FILE}",
+            where=path,
+            expected=f"a first line that begins with {','.join(_NAMES)}",
+            found=",".join(header) or "an empty file",
+            todo=_TODO,
+        )
+    return tuple(_view(path, header, line) for line in lines)
+
+
+def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
+    try:
+        cells = dict(zip(header[2:], line[2:], strict=True))
+        values = {name: float(parse_number(cell)) if cell else None for name, cell in cells.items()}
+        name, regime = line[:2]
+    except ValueError as error:
+        raise UserError(f"unreadable {FILE}", where=path, found=str(error), todo=_TODO) from error
+    return ViewMetrics(name, regime, values)

@@ -1,4 +1,4 @@
-"""What runs wrote, read back to be compared: configuration, metrics.csv, summary.json.
+"""What runs wrote, read back to be compared: configuration, metrics.csv, summary.json, views.
 
 Imports no torch, so that a table of many runs is there at once.
 """
@@ -9,9 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.per_view import read_per_view
 from crossgrad_core.run.results.summary import FILE as SUMMARY
 from crossgrad_core.run.results.summary import read_summary
 
@@ -25,12 +27,14 @@ class RunResults:
         config: The resolved configuration as plain data.
         rows: The rows of metrics.csv in order.
         summary: The content of summary.json; None of a run that has not ended yet.
+        views: The figures of each held-out view; none before the run has ended.
     """
 
     folder: Path
     config: Mapping[str, Any]
     rows: tuple[Row, ...]
     summary: Mapping[str, Any] | None
+    views: tuple[ViewMetrics, ...] = ()
 
     @cached_property
     def regimes(self) -> tuple[str, ...]:
@@ -44,10 +48,12 @@ class RunResults:
         value = (of or {}).get(name)
         return float(value) if isinstance(value, int | float) else None
 
-    def curve(self, name: str, regime: str | None = None) -> list[tuple[float, float]]:
-        """Training seconds and a figure of every evaluation that has it."""
+    def curve(
+        self, name: str, regime: str | None = None, over: str = "train_seconds"
+    ) -> list[tuple[float, float]]:
+        """Another column, training seconds, and a figure of every evaluation that has both."""
         column = name if regime is None else f"{name}_{regime}"
-        points = [(row.get("train_seconds"), row.get(column)) for row in self.rows]
+        points = [(row.get(over), row.get(column)) for row in self.rows]
         return [(float(x), float(y)) for x, y in points if x is not None and y is not None]
 
 
@@ -58,7 +64,8 @@ def read_run(folder: Path) -> RunResults:
         UserError: It is not the folder of a run, or one of its files is damaged.
     """
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
-    return RunResults(folder, read_config(folder), read_metrics(folder), summary)
+    views = () if summary is None else read_per_view(folder)
+    return RunResults(folder, read_config(folder), read_metrics(folder), summary, views)
 
 
 def find_runs(root: Path) -> tuple[Path, ...]:

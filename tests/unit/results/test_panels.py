@@ -9,7 +9,14 @@ from PIL import Image
 from support.figures import of
 
 from crossgrad_core.contract.metric import Compared
+from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import Evaluated
+from crossgrad_core.run.results.panel_layout import (
+    enlargement,
+    folder_of,
+    panels_of,
+    read_panel,
+)
 from crossgrad_core.run.results.panel_names import chosen_views, flat_names
 from crossgrad_core.run.results.panels import PanelWriter, draw_panel, error_map
 
@@ -102,3 +109,31 @@ def test_writer_writes_the_chosen_views_only(tmp_path: Path, make_view):
     assert written == ["renders/000700/a__2.png", "renders/000700/b__1.png"]
     with Image.open(tmp_path / written[0]) as image:
         assert image.mode == "RGB"
+
+
+@pytest.mark.parametrize(("width", "height"), [(400, 60), (24, 16), (989, 3), (1300, 700), (1, 1)])
+def test_photo_render_and_error_are_found_again_in_a_panel(
+    make_view, tmp_path: Path, width: int, height: int
+):
+    view = make_view("a/b.jpg", "all", width, height)
+    render = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
+    names = ["a/b.jpg", "a__b.jpg"]
+    PanelWriter(folder_of(tmp_path, 7), flat_names(names), 7).write(make_evaluated(view, render))
+    paths = panels_of(tmp_path, 7, names)
+    assert list(paths) == ["a/b.jpg"]
+    factor = enlargement(width)
+    photo = view.photo.image().numpy()
+    wanted = {"photo": photo, "render": render.numpy(), "error": error_map(photo, render.numpy())}
+    for name, image in read_panel(paths["a/b.jpg"]).items():
+        enlarged = wanted[name].repeat(factor, axis=0).repeat(factor, axis=1)
+        assert np.array_equal(np.asarray(image), enlarged), name
+
+
+@pytest.mark.parametrize("content", [b"no picture", None], ids=["no picture", "another size"])
+def test_another_file_is_no_panel(tmp_path: Path, content: bytes | None):
+    path = tmp_path / "a.png"
+    Image.new("RGB", (200, 10)).save(path)
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match="unreadable panel"):
+        read_panel(path)

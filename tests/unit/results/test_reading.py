@@ -14,6 +14,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.config_file import write_config
 from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row
+from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.reading import find_runs, read_run
 from crossgrad_core.run.results.summary import Summary, write_summary
 from crossgrad_core.training.clock import PHASES, Clock, Laps
@@ -23,6 +24,7 @@ PROGRAM = """
 import sys, time
 from pathlib import Path
 start = time.process_time()
+from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.reading import find_runs, read_run
 runs = [read_run(folder) for folder in find_runs(Path(sys.argv[1]))]
 assert all(run.regimes == ("far", "near") for run in runs)
@@ -45,6 +47,7 @@ def _folder(tmp_path: Path, result, totals) -> Path:
     data = config.model_dump(mode="json")
     summary = Summary("finished", "scene", totals, result, rows, Clock(train=3.0), data, {})
     write_summary(folder, summary)
+    write_per_view(folder, result)
     return folder
 
 
@@ -70,6 +73,26 @@ def test_a_run_by_figure_and_regime(folder: Path, result):
     assert run.figure("lpips") is None
     assert run.figure("psnr", "nowhere") is None
     assert run.curve("ssim", "far") == [(38.21, 0.9)] * 30
+    assert run.curve("psnr", "near", over="step") == [(step, 21.0) for step in range(10, 310, 10)]
+    assert run.views == result.views
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("", "an empty file"),
+        ("name,psnr\n", "name,psnr"),
+        ("name,regime,psnr,psnr\n", "name,regime,psnr,psnr"),
+        ("name,regime,psnr\na,b\n", "shorter"),
+        ("name,regime,psnr\na,b,high\n", "not a number"),
+    ],
+)
+def test_a_damaged_table_of_views_is_named(folder: Path, content: str, found: str):
+    (folder / "per_view.csv").write_text(content)
+    with pytest.raises(UserError, match=r"unreadable per_view.csv") as error:
+        read_run(folder)
+    assert found in error.value.found
+    assert str(folder) in error.value.where
 
 
 def test_regimes_come_by_name_and_not_from_columns(folder: Path):
