@@ -37,8 +37,8 @@ faults:  ## Kill, starve and interrupt runs, a hundred times each, and look at w
 
 fuzz: install  ## Ten minutes of mutated files for each parser; findings go to fuzz-findings/
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[test]"
-	PYTHONPATH=tests/fuzz $(BIN)/python -m crossgrad_fuzz defects
-	PYTHONPATH=tests/fuzz $(BIN)/python -m crossgrad_fuzz run --seconds $(FUZZ_SECONDS) \
+	PYTHONPATH=tests:tests/fuzz $(BIN)/python -m crossgrad_fuzz defects
+	PYTHONPATH=tests:tests/fuzz $(BIN)/python -m crossgrad_fuzz run --seconds $(FUZZ_SECONDS) \
 	    --executions $(FUZZ_EXECUTIONS) --seed $(FUZZ_SEED) --least 0.95
 
 lint: install  ## ruff and mypy

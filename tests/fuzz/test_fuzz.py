@@ -3,7 +3,12 @@
 The long searches are `make fuzz`.
 """
 
+import os
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from crossgrad_fuzz.defects import DEFECTS
@@ -12,6 +17,7 @@ from crossgrad_fuzz.loop import Budget, search
 from crossgrad_fuzz.regressions import REGRESSIONS, known_of
 from crossgrad_fuzz.targets import TARGETS
 
+MAKEFILE = Path(__file__).parents[2] / "Makefile"
 #: Executions of each short search: about ten seconds for all parsers.
 SHORT = 50
 #: Of a search for a defect that begins with the inputs on which parsers once failed.
@@ -51,3 +57,10 @@ def test_a_defect_that_is_put_back_is_found(name, tmp_path):
         budget = Budget(executions=DIRECT, findings=1, shrinking=0)
         found = search(target, bench, budget, 0, known_of(target.name))
     assert found.findings
+
+
+def test_the_makefile_finds_the_search():
+    (path,) = set(re.findall(r"PYTHONPATH=(\S+) .*-m crossgrad_fuzz", MAKEFILE.read_text()))
+    arguments = [sys.executable, "-m", "crossgrad_fuzz", "--help"]
+    environment = os.environ | {"PYTHONPATH": path}
+    subprocess.run(arguments, cwd=MAKEFILE.parent, env=environment, check=True)
