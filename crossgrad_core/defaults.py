@@ -13,7 +13,7 @@ LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"
 RESOLUTION: Final = "full"
 EXPORTER: Final = "ply"
-METRICS: Final = "psnr+ssim+ssim-skimage+lpips"
+METRICS: Final = "psnr+ssim+ssim-skimage+psnr-cc+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
 #: The reader that says what is missing in a folder that no reader accepts.

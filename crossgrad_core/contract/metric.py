@@ -38,6 +38,13 @@ class Metric(Component):
     slot: ClassVar[str] = "metrics"
     figure: ClassVar[Figure]
 
+    def described(self) -> Figure:
+        """The figure as the metric measures it with its options; by default `figure`.
+
+        Its definition and the reason why there is none may depend on them, its name may not.
+        """
+        return self.figure
+
     @abstractmethod
     def measure(self, compared: Compared) -> float | None:
         """The figure of one view; None where there is none, such as without a pixel that counts."""

@@ -45,7 +45,7 @@ def evaluate(
             measured.append(found)
             if on_view is not None:
                 on_view(Evaluated(compared, found))
-    return summarised(measured, [metric.figure for metric in metrics])
+    return summarised(measured, [metric.described() for metric in metrics])
 
 
 def compare(view: View, render: Tensor) -> Compared:

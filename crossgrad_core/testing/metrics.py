@@ -20,6 +20,8 @@ def names_its_figure(make: Make[Metric]) -> None:
     require(name.isidentifier() and name == name.lower(), f"{name!r} is no name of a column")
     require(label, "the figure has no label")
     require(format(0.5, make().figure.form), f"the form {make().figure.form!r} shows nothing")
+    told = make().described().name
+    require(told == name, f"described() calls the figure {told!r}, figure calls it {name!r}")
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:

@@ -1,11 +1,10 @@
-"""The figures that a run measures by default."""
+"""Figures of several kinds that a run may measure: by regime or not, null or not."""
 
-from crossgrad_core.config import RunConfig
 from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.results.metrics_csv import columns_for
 
-METRICS = tuple(build("metrics", choice.name, {}) for choice in RunConfig().metrics)
+METRICS = tuple(build("metrics", name, {}) for name in ("psnr", "ssim", "ssim-skimage", "lpips"))
 FIGURES = tuple(metric.figure for metric in METRICS)
 
 

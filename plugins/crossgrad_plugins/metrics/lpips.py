@@ -1,25 +1,22 @@
-"""The place of LPIPS in the results."""
+"""LPIPS with AlexNet."""
 
 from typing import ClassVar
 
+from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import Compared, Figure, Metric
+from crossgrad_core.plugin import Figure
+from crossgrad_plugins.metrics.perceptual.metric import IN_FULL_RANGE, Perceptual, figure_of
+from crossgrad_plugins.metrics.perceptual.trunks import ALEXNET, Trunk
 
 
-class LPIPS(Metric):
-    """Learned perceptual similarity: null, because no package brings the weights of its network.
+class LPIPS(Perceptual):
+    """Learned perceptual similarity with AlexNet, images in [-1, 1]; lower is better."""
 
-    The column is there for those who fill it.
-    """
-
-    figure: ClassVar[Figure] = Figure(
-        name="lpips",
-        label="LPIPS",
-        undefined="LPIPS needs the pretrained AlexNet or VGG trunk, which no Python package ships; "
-        "it is not computed",
-    )
+    net: ClassVar[Trunk] = ALEXNET
+    entry: ClassVar[str] = "lpips"
+    figure: ClassVar[Figure] = figure_of("lpips", "LPIPS", ALEXNET, entry, IN_FULL_RANGE)
 
     @override
-    def measure(self, compared: Compared) -> float | None:
-        return None
+    def entering(self, image: Tensor) -> Tensor:
+        return 2 * image - 1

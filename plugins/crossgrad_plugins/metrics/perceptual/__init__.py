@@ -1,0 +1,1 @@
+"""LPIPS: the networks, their weights and the distance."""

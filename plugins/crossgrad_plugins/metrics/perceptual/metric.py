@@ -1,0 +1,105 @@
+"""What all LPIPS figures do: they need files of weights, and are null without."""
+
+from abc import abstractmethod
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, Final
+
+import torch
+from pydantic import field_validator
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import Compared, Field, Figure, Metric, Selection, hookimpl, masked
+from crossgrad_plugins.metrics.perceptual.distance import distance
+from crossgrad_plugins.metrics.perceptual.trunks import Trunk
+from crossgrad_plugins.metrics.perceptual.weights import Weights, read_weights
+
+#: How images enter the network, for summary.json.
+IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
+IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
+
+
+def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Figure:
+    """The figure of a metric without weights; `described` adds which weights it has."""
+    return Figure(
+        name=name,
+        label=label,
+        definition=f"LPIPS 0.1 with {net.name}, {scaling}; masked pixels are black in both images",
+        undefined=f"LPIPS needs the pretrained {net.name}, which no Python package ships: "
+        f"--set metrics.{entry}.trunk=FILE names it, for example {net.published} of torchvision",
+    )
+
+
+class Perceptual(Metric):
+    """Learned perceptual similarity (LPIPS 0.1) with the weights that the user names.
+
+    Null without a trunk, which no package ships; nothing is ever downloaded.
+
+    Attributes:
+        net: The network.
+        entry: The name of the metric, for messages.
+    """
+
+    net: ClassVar[Trunk]
+    entry: ClassVar[str]
+
+    trunk: Path | None = Field(
+        None,
+        description="file with the network's weights as torchvision publishes them "
+        "(.pth or .safetensors); null without",
+    )
+    heads: Path | None = Field(
+        None,
+        description="file with the linear heads of LPIPS 0.1; those of an installed torchmetrics "
+        "or lpips package by default",
+    )
+
+    @field_validator("trunk", "heads")
+    @classmethod
+    def _from_anywhere(cls, path: Path | None) -> Path | None:
+        """config.yaml repeats the run from any folder."""
+        return None if path is None else path.expanduser().absolute()
+
+    @hookimpl
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Reads the weights before anything is trained."""
+        if self.trunk is not None:
+            self._weights(self.trunk)
+        elif self.heads is not None:
+            place = f"metrics.{self.entry}"
+            return [f"{place}.heads does nothing without a network: --set {place}.trunk=FILE"]
+        return []
+
+    @override
+    def described(self) -> Figure:
+        if self.trunk is None:
+            return self.figure
+        least = f"{self.net.name} needs images of at least {self.net.smallest} pixels a side"
+        definition = f"{self.figure.definition}; {self._weights(self.trunk).source}"
+        return replace(self.figure, definition=definition, undefined=least)
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        mask = compared.mask
+        small = min(compared.render.shape[:2]) < self.net.smallest
+        if self.trunk is None or small or (mask is not None and not bool(mask.any())):
+            return None
+        render, photo = (
+            self.entering(masked(image.to(torch.float32) / 255, mask))
+            for image in (compared.render, compared.photo)
+        )
+        return distance(self.net, self._weights(self.trunk), render, photo)
+
+    @abstractmethod
+    def entering(self, image: Tensor) -> Tensor:
+        """An image [H, W, 3] in [0, 1] as it enters the network."""
+
+    def _weights(self, trunk: Path) -> Weights:
+        return _kept(self.net, trunk, self.heads, f"metrics.{self.entry}")
+
+
+@lru_cache(maxsize=4)
+def _kept(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> Weights:
+    return read_weights(net, trunk, heads, setting)

@@ -1,0 +1,112 @@
+"""The networks whose features LPIPS compares, as far as it needs them.
+
+Layers and numbering are those of torchvision's `alexnet` and `vgg16` (`features`), so that its
+files of weights fit; Krizhevsky 2014 (arXiv 1404.5997) and Simonyan and Zisserman 2015 (1409.1556).
+"""
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A convolution that a ReLU follows.
+
+    Attributes:
+        layer: Its number in `features`.
+        shape: (channels out, channels in, height, width) of its weights.
+        stride: Pixels.
+        padding: Pixels.
+        pools: Whether a maximum over windows comes before it.
+        compared: Whether LPIPS compares what it gives.
+    """
+
+    layer: int
+    shape: tuple[int, int, int, int]
+    stride: int = 1
+    padding: int = 1
+    pools: bool = False
+    compared: bool = True
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """A network without its classifier.
+
+    Attributes:
+        name: What users know it as.
+        model: Its name in torchvision.
+        heads: What the file of its linear heads is called.
+        published: Name of the file of weights that LPIPS was fitted on; its last part is the
+            beginning of the file's SHA-256.
+        window: Side of the windows that maxima are taken over, pixels; they are 2 apart.
+        smallest: Images need at least so many pixels on either side.
+        layers: Its convolutions in order.
+    """
+
+    name: str
+    model: str
+    heads: str
+    published: str
+    window: int
+    smallest: int
+    layers: tuple[Convolution, ...]
+
+    @property
+    def compared(self) -> tuple[Convolution, ...]:
+        """The convolutions whose output LPIPS compares, in order."""
+        return tuple(layer for layer in self.layers if layer.compared)
+
+    @property
+    def digest(self) -> str:
+        """How the SHA-256 of the published file begins."""
+        return self.published.rpartition("-")[2].partition(".")[0]
+
+
+def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
+    """Stages of (convolutions, channels); a maximum between stages, the last of each compared."""
+    layers: list[Convolution] = []
+    number, channels_in = 0, 3
+    widths = [(stage, width) for stage, (count, width) in enumerate(stages) for _ in range(count)]
+    for stage, group in groupby(widths, key=lambda each: each[0]):
+        members = list(group)
+        for place, (_, width) in enumerate(members):
+            layers.append(
+                Convolution(
+                    layer=number,
+                    shape=(width, channels_in, 3, 3),
+                    pools=stage > 0 and place == 0,
+                    compared=place == len(members) - 1,
+                )
+            )
+            number, channels_in = number + 2, width
+        number += 1  # The maximum has a number of its own.
+    return tuple(layers)
+
+
+ALEXNET: Final = Trunk(
+    name="AlexNet",
+    model="alexnet",
+    heads="alex.pth",
+    published="alexnet-owt-7be5be79.pth",
+    window=3,
+    smallest=31,
+    layers=(
+        Convolution(0, (64, 3, 11, 11), stride=4, padding=2),
+        Convolution(3, (192, 64, 5, 5), padding=2, pools=True),
+        Convolution(6, (384, 192, 3, 3), pools=True),
+        Convolution(8, (256, 384, 3, 3)),
+        Convolution(10, (256, 256, 3, 3)),
+    ),
+)
+
+VGG16: Final = Trunk(
+    name="VGG-16",
+    model="vgg16",
+    heads="vgg.pth",
+    published="vgg16-397923af.pth",
+    window=2,
+    smallest=16,
+    layers=_vgg(((2, 64), (2, 128), (3, 256), (3, 512), (3, 512))),
+)
