@@ -16,13 +16,19 @@ class SceneOptions(BaseModel):
     max_size: Annotated[int | None, Flag("PIXELS", SCENE)] = Field(
         None, ge=16, description="Longest image side; larger photos are resized."
     )
-    split: Annotated[Literal["auto", "every", "none"], Flag("auto|every|none", SCENE)] = Field(
+    split: Annotated[
+        Literal["auto", "every", "stratified", "none"],
+        Flag("auto|every|stratified|none", SCENE),
+    ] = Field(
         "auto",
-        description="auto: train_list.txt and test_list.txt where present, else every; every: hold "
-        "out each n-th image of each folder; none: train on all. Default: auto.",
+        description="every: hold out each n-th image of each folder; stratified: each n-th of each "
+        "regime; none: train on all; auto: train_list.txt and test_list.txt where present, else "
+        "every, or stratified where only that holds out two of a regime. Default: auto.",
     )
     test_every: Annotated[int, Flag("N", SCENE)] = Field(
-        8, ge=2, description="Each N-th image of a folder, by name, is held out. Default: 8."
+        8,
+        ge=2,
+        description="Each N-th image of a folder or regime, by name, is held out. Default: 8.",
     )
     init: Annotated[str, Flag("points|random|PLY", SCENE)] = Field(
         "points",

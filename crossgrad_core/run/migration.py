@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
+from crossgrad_core.scene.split import has_lists
 from crossgrad_core.system.version import VERSION
 
 #: The key that says which version wrote a configuration, and the version of this one.
@@ -48,7 +49,16 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
     rest = {name: value for name, value in settings.items() if name != KEY}
     if version == _FIRST and "operator" in rest:
         rest["operator"] = _operators(rest["operator"])
+    if version == _FIRST and "reading" in rest:
+        rest["reading"] = _reading(rest["reading"], rest.get("scene"))
     return rest
+
+
+def _reading(value: object, scene: object) -> object:
+    """How 0.1 read a scene: what it called `auto` held out each n-th photo wherever no list did."""
+    if not isinstance(value, dict) or value.get("split") != "auto" or not isinstance(scene, str):
+        return value
+    return value if has_lists(Path(scene)) else {**value, "split": "every"}
 
 
 def _operators(value: object) -> object:

@@ -1,7 +1,7 @@
 """From what a reader found to a `Scene`: checks, photos, split, local frame, regimes."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +14,14 @@ from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
 from crossgrad_core.scene.raw import RawScene, RawView
-from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
+from crossgrad_core.scene.raw_checks import (
+    CheckedPoints,
+    check_distances,
+    check_points,
+    check_views,
+)
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
-from crossgrad_core.scene.split import split_views
+from crossgrad_core.scene.split import Label, split_views
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
@@ -32,7 +37,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     check_views(raw)
     points, point_notes = check_points(raw, options)
     photos = choose_photos(raw, options)
-    split = split_views(sorted(photos.sources), options, raw.root, raw.split)
+    label = _labels(raw, photos, points)
+    split = split_views(sorted(photos.sources), options, raw.root, raw.split, label)
     split = without_blank_photos(split, photos.sources, raw.root)
     listed = {*split.train, *split.test}
     used = sorted((v for v in raw.views if v.name in listed), key=lambda view: view.name)
@@ -45,7 +51,10 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     cameras = [_localize(view, photos, frame) for view in used]
     seen = [points.rows(view.seen) for view in used]
     by_folder = label_by_folder([view.name for view in used])
-    regimes = by_folder or label_by_footprint(cameras, seen, local, train)
+    if split.regimes is not None:
+        regimes = tuple(split.regimes[view.name] for view in used)
+    else:
+        regimes = by_folder or label_by_footprint(cameras, seen, local, train)
     cache: PhotoCache[PhotoSource] = PhotoCache(options.cache_mib)
     return Scene(
         name=raw.root.resolve().name or "scene",
@@ -68,6 +77,25 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
             _note_regimes(regimes, train, "image folder" if by_folder else "footprint"),
         ),
     )
+
+
+def _labels(raw: RawScene, photos: ChosenPhotos, points: CheckedPoints) -> Label:
+    """Tells regimes before the split, when the local frame can only be that of all cameras."""
+    views = sorted((v for v in raw.views if v.name in photos.sources), key=lambda view: view.name)
+    names = [view.name for view in views]
+
+    def label(train: Sequence[str]) -> Mapping[str, str]:
+        if by_folder := label_by_folder(names):
+            return dict(zip(names, by_folder, strict=True))
+        poses = np.stack([view.world_to_camera for view in views])
+        frame = make_frame(camera_centers(poses), points.xyz)
+        cameras = [_localize(view, photos, frame) for view in views]
+        seen = [points.rows(view.seen) for view in views]
+        local, rows = frame.points(points.xyz), _positions(views, train)
+        labels = label_by_footprint(cameras, seen, local, rows)
+        return dict(zip(names, labels, strict=True))
+
+    return label
 
 
 def _positions(views: Sequence[RawView], names: Sequence[str]) -> tuple[int, ...]:

@@ -1,9 +1,10 @@
 """Which views are trained on and which are held out."""
 
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Final, TypeAlias
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
@@ -12,14 +13,28 @@ from crossgrad_core.scene.wording import count, name_some
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
+#: Names of training views -> regime of every view; where no folder tells, the median is theirs.
+Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
+
+#: A mean over fewer held-out views says little about a regime.
+_FEWEST: Final = 2
+
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the training and of the held-out views, both sorted, and how they were chosen."""
+    """Names of the training and of the held-out views, both sorted, and how they were chosen.
+
+    Attributes:
+        train: Trained on.
+        test: Held out.
+        notes: How they were chosen.
+        regimes: Regime of every view, where the views were chosen by it.
+    """
 
     train: tuple[str, ...]
     test: tuple[str, ...]
     notes: tuple[str, ...]
+    regimes: Mapping[str, str] | None = None
 
 
 def split_views(
@@ -27,14 +42,19 @@ def split_views(
     options: SceneOptions,
     root: Path,
     given: tuple[frozenset[str], frozenset[str]] | None = None,
+    label: Label = lambda _: {},
 ) -> Split:
     """Splits views by the option `split`; there is always at least one training view.
+
+    By itself it takes each n-th photo of each folder, or each n-th of each regime where only that
+    holds out two photos or more of one.
 
     Args:
         names: Names of all usable views.
         options: Says how.
         root: Folder with `train_list.txt` and `test_list.txt`, if any.
         given: Training and test names that the input itself prescribes.
+        label: Tells the regimes; by default there are none.
 
     Raises:
         UserError: The lists contradict each other, match no view or leave no training view.
@@ -45,23 +65,58 @@ def split_views(
         listed = given or _read_lists(root, names)
         if listed:
             return _split_by_lists(names, listed, root, "by lists" if not given else "as given")
-    return _split_every(names, options.test_every)
+    every = _split_every(names, options.test_every)
+    return every if options.split == "every" else _by_regime(every, names, options, label)
+
+
+def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
+    """The stratified split, or by itself `every` where the other gains no regime a second view."""
+    regimes = label(names)
+    stratified = _split_stratified(names, options.test_every, regimes)
+    if options.split == "stratified":
+        return stratified
+    few, most = _held_out(every, label(every.train)), _held_out(stratified, regimes)
+    gained = sorted(name for name, held_out in most.items() if few[name] < _FEWEST <= held_out)
+    if not gained:
+        return every
+    found = ", ".join(f"{count(few[name], 'photo')} of {name}" for name in gained)
+    why = f"split: by regime, since 1 in {options.test_every} by name would hold out {found}"
+    return replace(stratified, notes=(*stratified.notes, why))
 
 
 def _split_every(names: Sequence[str], every: int) -> Split:
-    """Each n-th view by name of each folder; folders of a single view are taken together."""
-    folders = defaultdict(list)
-    for name in sorted(names):
-        folders[str(PurePosixPath(name).parent)].append(name)
-    groups = [group for group in folders.values() if len(group) > 1]
-    groups.append([name for group in folders.values() if len(group) == 1 for name in group])
-    test = {name for group in groups if len(group) > 1 for name in group[::every]}
-    train = tuple(name for name in sorted(names) if name not in test)
-    how = f"1 in {every} by name" + (" of each folder" if len(folders) > 1 else "")
-    note = f"split: {len(train)} train, {len(test)} test ({how})"
+    """Each n-th view by name of each folder."""
+    folders = {name: str(PurePosixPath(name).parent) for name in names}
+    how = " of each folder" if len(set(folders.values())) > 1 else ""
+    return _split_each(folders, every, how)
+
+
+def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
+    """Each n-th view by name of each regime; the regimes are those of all views."""
+    return replace(
+        _split_each({name: regimes.get(name, "") for name in names}, every, " of each regime"),
+        regimes=regimes,
+    )
+
+
+def _split_each(groups: Mapping[str, str], every: int, how: str) -> Split:
+    """Each n-th view by name of each group; groups of a single view are taken together."""
+    members = defaultdict(list)
+    for name in sorted(groups):
+        members[groups[name]].append(name)
+    parts = [group for group in members.values() if len(group) > 1]
+    parts.append([name for group in members.values() if len(group) == 1 for name in group])
+    test = {name for group in parts if len(group) > 1 for name in group[::every]}
+    train = tuple(name for name in sorted(groups) if name not in test)
+    note = f"split: {len(train)} train, {len(test)} test (1 in {every} by name{how})"
     if not test:
         note = f"split: {len(train)} train, none held out: too few views"
     return Split(train, tuple(sorted(test)), (note,))
+
+
+def _held_out(split: Split, regimes: Mapping[str, str]) -> Counter[str]:
+    """Regime -> its held-out views."""
+    return Counter(regimes[name] for name in split.test if name in regimes)
 
 
 def _split_by_lists(
@@ -107,6 +162,11 @@ def _matches_nothing(
         found=name_some(sorted(listed)) if listed else "no name",
         todo="mend the lists, or use --split every",
     )
+
+
+def has_lists(root: Path) -> bool:
+    """Whether there is a list of training or of held-out views in a scene's folder."""
+    return any((root / name).is_file() for name in (TRAIN_LIST, TEST_LIST))
 
 
 def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], frozenset[str]] | None:

@@ -62,6 +62,21 @@ def test_the_configuration_of_a_run_of_0_1_repeats_it(old, scene, tmp_path):
     assert written == {**again.summary["config"]}
 
 
+def test_a_run_of_0_1_keeps_the_photos_that_it_held_out(tmp_path):
+    def split(**more):
+        return migrated({"scene": str(tmp_path), **more}, FILE).get("reading")
+
+    whole = {"split": "auto", "test_every": 8}
+    assert split(reading=whole) == {"split": "every", "test_every": 8}
+    assert split(crossgrad="0.2", reading=whole) == whole
+    assert split(reading={"split": "none"}) == {"split": "none"}
+    # A file by hand that does not say how has the way of this version.
+    assert split(reading={"max_size": 99}) == {"max_size": 99}
+    assert split() is None
+    (tmp_path / "test_list.txt").write_text("a.jpg\n")
+    assert split(reading=whole) == whole
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -10,6 +10,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 
@@ -176,6 +177,29 @@ class TestReading:
             "(1.1 x largest distance from their mean)",
             "regimes by footprint: far 4 views (3 train, 1 test), near 4 views (4 train, 0 test)",
         )
+
+    @pytest.mark.parametrize("scale", [1.0, 1000.0])
+    def test_stratified_takes_the_regimes_of_all_views(self, tmp_path, scale):
+        path = write_tiny_scene(tmp_path, views=20, width=24, height=16, scale=scale)
+        scene = read(path, split="stratified")
+        assert (
+            "regimes by footprint: far 10 views (8 train, 2 test), near 10 views (8 train, 2 test)"
+            in scene.notes
+        )
+        seen = {v.name: np.sort(v.camera.local(scene.points[v.seen])[:, 2]) for v in scene.views}
+        depths = {name: np.median(depth[depth > 0]) for name, depth in seen.items()}
+        middle = np.median(list(depths.values()))
+        for view in scene.views:
+            assert view.regime == ("near" if depths[view.name] <= middle else "far")
+        for regime in ("near", "far"):
+            names = [view.name for view in scene.views if view.regime == regime]
+            held_out = [view.name for view in scene.test_views if view.regime == regime]
+            assert held_out == names[::8]
+
+    def test_the_bundled_photos_keep_their_split(self):
+        scene = read(bundled_scene(), max_size=100)
+        assert len(scene.test_views) == 4
+        assert "split: 24 train, 4 test (1 in 8 by name)" in scene.notes
 
     @pytest.mark.parametrize(
         ("scale", "offset"),

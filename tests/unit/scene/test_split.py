@@ -47,6 +47,70 @@ def test_few_views_always_leave_one_to_train_on(names, test, tmp_path):
     assert sorted(result.train + result.test) == sorted(names)
 
 
+def by_parity(_train):
+    """Two regimes that take turns: each eighth of all is always of the even one."""
+    return {name: ("even", "odd")[k % 2] for k, name in enumerate(NAMES)}
+
+
+def test_stratified_takes_every_eighth_of_each_regime(tmp_path):
+    result = split_views(NAMES, SceneOptions(split="stratified"), tmp_path, label=by_parity)
+    assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
+    assert len(result.train) == 24 and result.regimes == by_parity(())
+    assert result.notes == ("split: 24 train, 4 test (1 in 8 by name of each regime)",)
+    fourth = SceneOptions(split="stratified", test_every=4)
+    assert len(split_views(NAMES, fourth, tmp_path, label=by_parity).test) == 8
+
+
+def test_by_itself_it_is_stratified_where_only_that_holds_out_two_of_a_regime(tmp_path):
+    result = split_views(NAMES, SceneOptions(), tmp_path, label=by_parity)
+    assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
+    assert result.notes[1] == (
+        "split: by regime, since 1 in 8 by name would hold out 0 photos of odd"
+    )
+    assert split_views(NAMES, SceneOptions(split="every"), tmp_path, label=by_parity).test == (
+        ("00.jpg", "08.jpg", "16.jpg", "24.jpg")
+    )
+
+
+def test_regimes_that_keep_two_by_themselves_leave_the_split_as_it_is(tmp_path):
+    def halves(_train):
+        return {name: "first" if name < "14.jpg" else "last" for name in NAMES}
+
+    result = split_views(NAMES, SceneOptions(), tmp_path, label=halves)
+    assert (result.test, result.regimes) == (("00.jpg", "08.jpg", "16.jpg", "24.jpg"), None)
+
+
+def test_regimes_too_small_for_two_leave_the_split_as_it_is(tmp_path):
+    def few(_train):
+        return {name: "few" if k in range(20, 28) else "many" for k, name in enumerate(NAMES)}
+
+    # Eight photos of a regime give one held-out photo either way.
+    assert split_views(NAMES, SceneOptions(), tmp_path, label=few).regimes is None
+    half = SceneOptions(test_every=100)
+    assert split_views(NAMES, half, tmp_path, label=by_parity).regimes is None
+
+
+def test_the_regimes_of_each_eighth_are_those_of_its_training_views(tmp_path):
+    asked = []
+
+    def label(train):
+        asked.append(len(train))
+        return dict.fromkeys(NAMES, "all")
+
+    split_views(NAMES, SceneOptions(), tmp_path, label=label)
+    assert sorted(set(asked)) == [24, 28]
+
+
+def test_lists_and_other_ways_ask_for_no_regime(tmp_path):
+    def label(_train):
+        raise AssertionError
+
+    for way in ("every", "none"):
+        split_views(NAMES, SceneOptions(split=way), tmp_path, label=label)
+    (tmp_path / "test_list.txt").write_text("05.jpg\n")
+    assert split_views(NAMES, SceneOptions(), tmp_path, label=label).test == ("05.jpg",)
+
+
 def test_none_trains_on_all(tmp_path):
     assert split(NAMES, tmp_path, split="none").train == tuple(NAMES)
 
