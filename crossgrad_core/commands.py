@@ -15,13 +15,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.commands import load_command, summary
+from crossgrad_core.registry.entries import Entry, entries, load_entry, offers
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce
 from crossgrad_core.system.tables import write_table
 from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder
+from crossgrad_core.wording import did_you_mean, listed, plural, sentences, singular
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,8 +44,15 @@ if TYPE_CHECKING:
     from crossgrad_core.training.state import TrainState
 
 __all__ = [
+    "COMMANDS",
     "FAILED",
+    "GROUPS",
+    "LISTS",
+    "OFFERED",
+    "OWN_COMMANDS",
+    "VERSION",
     "ComponentChoice",
+    "Entry",
     "GroupedCommand",
     "NonFiniteError",
     "Progress",
@@ -58,18 +70,28 @@ __all__ = [
     "check_file",
     "check_folder",
     "configured",
+    "did_you_mean",
     "disk_errors",
+    "entries",
     "find_runs",
     "gathered",
+    "listed",
+    "load_command",
+    "load_entry",
     "model_of",
     "names",
+    "offers",
     "open_run",
     "panels_of",
     "parse_number",
+    "plural",
     "read_panel",
     "read_results",
     "read_rows",
     "read_scene",
+    "sentences",
+    "singular",
+    "summary",
     "take_steps",
     "view_gradients",
     "with_steps",

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from typer.main import get_command
 
-from crossgrad_core.cli import evaluate, export, plugins, render, run
+from crossgrad_core.cli import evaluate, export, render, run
 from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
@@ -56,7 +56,6 @@ app.command("run", cls=GroupedCommand)(run.run)
 app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
 app.command("render", cls=GroupedCommand)(render.render)
 app.command("export", cls=GroupedCommand)(export.export)
-app.add_typer(plugins.app, name="plugins")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

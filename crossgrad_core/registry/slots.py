@@ -28,4 +28,4 @@ COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
 #: The core's own commands, which no plugin replaces.
-OWN_COMMANDS: Final = ("run", "eval", "render", "export", "plugins")
+OWN_COMMANDS: Final = ("run", "eval", "render", "export")

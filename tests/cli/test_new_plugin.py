@@ -11,11 +11,11 @@ from PIL import Image
 from support.distributions import write_distribution
 
 from crossgrad_core.cli.main import main
-from crossgrad_core.cli.new import slots
-from crossgrad_core.cli.templates.observers import Template
-from crossgrad_core.cli.templates.readers import Template as PosesReader
 from crossgrad_core.plugin import SceneOptions, StepRecord
 from crossgrad_core.registry.slots import COMMANDS, OFFERED
+from crossgrad_plugins.authoring.new import slots
+from crossgrad_plugins.authoring.templates.observers import Template
+from crossgrad_plugins.authoring.templates.readers import Template as PosesReader
 
 #: What every package may import.
 DOORS = ("crossgrad_core.plugin", "crossgrad_core.numerics", "crossgrad_core.testing")

@@ -222,7 +222,7 @@ def test_check_finds_what_is_slow_or_without_help(ran, tmp_path, monkeypatch):
 def test_ours_are_commands_of_plugins():
     ours = {name for name, entry in registry.entries(COMMANDS).items()
             if entry.distribution == "crossgrad"}  # fmt: skip
-    assert {"diagnose", "stress"} <= ours
+    assert {"diagnose", "plugins", "stress"} <= ours
 
 
 def test_the_core_s_own_names_are_all_of_its_commands():

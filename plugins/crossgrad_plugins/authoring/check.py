@@ -3,11 +3,17 @@
 from collections.abc import Sequence
 from textwrap import fill
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import GROUPS, OFFERED
+from crossgrad_core.commands import (
+    GROUPS,
+    OFFERED,
+    Entry,
+    UserError,
+    did_you_mean,
+    offers,
+    sentences,
+    singular,
+)
 from crossgrad_core.testing.checking import Result, check_entry
-from crossgrad_core.wording import did_you_mean, sentences, singular
 
 _WIDTH = 80
 _INDENT = " " * 6
@@ -40,13 +46,13 @@ def check_package(package: str) -> tuple[str, bool]:
     return "\n".join(lines), failed == 0
 
 
-def _entries_of(package: str) -> list[registry.Entry]:
+def _entries_of(package: str) -> list[Entry]:
     """The plugins of a package by slot and name.
 
     Raises:
         UserError: See `check_package`.
     """
-    offered = [entry for slot in OFFERED for entry in registry.offers(slot)]
+    offered = [entry for slot in OFFERED for entry in offers(slot)]
     found = [entry for entry in offered if package in _names_of(entry)]
     found = found or [
         entry for entry in offered if _normalized(package) == _normalized(entry.distribution)
@@ -67,7 +73,7 @@ def _entries_of(package: str) -> list[registry.Entry]:
     )
 
 
-def _names_of(entry: registry.Entry) -> tuple[str, str]:
+def _names_of(entry: Entry) -> tuple[str, str]:
     """Distribution and import package of an entry."""
     return entry.distribution, entry.package
 
@@ -88,7 +94,7 @@ def _is_installed(package: str) -> bool:
     return True
 
 
-def _label(entry: registry.Entry) -> str:
+def _label(entry: Entry) -> str:
     return f"{singular(entry.slot)} {entry.name}"
 
 

@@ -6,12 +6,16 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import entries
-from crossgrad_core.registry.slots import COMMANDS, OFFERED
-from crossgrad_core.system.files import disk_errors
-from crossgrad_core.system.version import VERSION
-from crossgrad_core.wording import listed, singular
+from crossgrad_core.commands import (
+    COMMANDS,
+    OFFERED,
+    VERSION,
+    UserError,
+    disk_errors,
+    entries,
+    listed,
+    singular,
+)
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")

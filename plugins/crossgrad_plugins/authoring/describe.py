@@ -4,15 +4,23 @@ import inspect
 import json
 from textwrap import fill, indent
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from crossgrad_core.contract.component import Component
-from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.commands import load_command, summary
-from crossgrad_core.registry.slots import COMMANDS, LISTS
-from crossgrad_core.wording import listed, singular
+from crossgrad_core.commands import (
+    COMMANDS,
+    LISTS,
+    Entry,
+    listed,
+    load_command,
+    load_entry,
+    singular,
+    summary,
+)
+
+if TYPE_CHECKING:
+    from crossgrad_core.plugin import Component
 
 _WIDTH = 80
 _MARGIN = "  "
@@ -33,7 +41,7 @@ _TRAITS = {
 }
 
 
-def describe(entry: registry.Entry) -> str:
+def describe(entry: Entry) -> str:
     """Everything a user wants to know before choosing a plugin, in 80 columns.
 
     Raises:
@@ -41,7 +49,7 @@ def describe(entry: registry.Entry) -> str:
     """
     if entry.slot == COMMANDS:
         return _described_command(entry)
-    component = registry.load_entry(entry)
+    component = load_entry(entry)
     parts = [
         _heading(entry),
         indent(_prose(inspect.getdoc(component) or "No description."), _MARGIN),
@@ -51,12 +59,12 @@ def describe(entry: registry.Entry) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _heading(entry: registry.Entry) -> str:
+def _heading(entry: Entry) -> str:
     word = singular(entry.slot)
     return f"{word} {entry.name}, from {entry.distribution} {entry.version}\n{_MARGIN}{entry.value}"
 
 
-def _described_command(entry: registry.Entry) -> str:
+def _described_command(entry: Entry) -> str:
     """A command in words; its options are its own help's."""
     load_command(entry)
     hint = f"`crossgrad {entry.name} --help` explains its options"
@@ -79,7 +87,7 @@ def _filled(block: str) -> str:
     )
 
 
-def _traits(component: type[Component]) -> list[tuple[str, object]]:
+def _traits(component: "type[Component]") -> list[tuple[str, object]]:
     found: list[tuple[str, object]] = []
     for attribute, label in _TRAITS.items():
         if attribute not in component.model_fields and hasattr(component, attribute):
@@ -90,7 +98,7 @@ def _traits(component: type[Component]) -> list[tuple[str, object]]:
     return found
 
 
-def _options(entry: registry.Entry, component: type[Component]) -> str:
+def _options(entry: Entry, component: "type[Component]") -> str:
     fields = component.model_fields
     if not fields:
         return f"{_MARGIN}no options"

@@ -1,18 +1,27 @@
-"""`crossgrad plugins`: what is installed, which options it has, whether it keeps the contract."""
+"""List, explain, check and begin plugins."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import COMMANDS, OFFERED, OWN_COMMANDS
-from crossgrad_core.system.grouped import GroupedCommand
-from crossgrad_core.wording import did_you_mean, listed, plural, sentences
+from crossgrad_core.commands import (
+    COMMANDS,
+    OFFERED,
+    OWN_COMMANDS,
+    Entry,
+    GroupedCommand,
+    UserError,
+    did_you_mean,
+    listed,
+    offers,
+    plural,
+    sentences,
+)
 
 app = typer.Typer(
     help="List, explain, check and begin plugins.",
+    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -35,7 +44,7 @@ def list_plugins(slot: SlotOption = None) -> None:
     """Show the installed plugins by slot, and the commands that they add."""
     for each in _slots(slot):
         typer.echo(each)
-        typer.echo("\n".join(_rows(registry.offers(each))) or "  none installed")
+        typer.echo("\n".join(_rows(offers(each))) or "  none installed")
     typer.echo("\n`crossgrad plugins show NAME` explains one of them.")
 
 
@@ -45,9 +54,9 @@ def show(
     slot: SlotOption = None,
 ) -> None:
     """Explain a plugin: purpose, options, origin."""
-    from crossgrad_core.cli.describe import describe
+    from crossgrad_plugins.authoring.describe import describe
 
-    found = [entry for each in _slots(slot) for entry in registry.offers(each)]
+    found = [entry for each in _slots(slot) for entry in offers(each)]
     chosen = [entry for entry in found if entry.name == name]
     if not chosen:
         raise UserError(
@@ -74,7 +83,7 @@ def check(
     Every plugin of the package is loaded and checked as its slot demands.
     Exit status: 0 where all of them pass, 1 where one fails.
     """
-    from crossgrad_core.cli.check import check_package
+    from crossgrad_plugins.authoring.check import check_package
 
     report, passed = check_package(package)
     typer.echo(report)
@@ -99,7 +108,7 @@ def new(
     The package holds a pyproject.toml, one module and one test, and passes `crossgrad plugins
     check`. Nothing is overwritten.
     """
-    from crossgrad_core.cli.new import write_package
+    from crossgrad_plugins.authoring.new import write_package
 
     (wanted,) = _slots(slot)
     folder = out or Path(name)
@@ -121,11 +130,11 @@ def _slots(slot: str | None) -> tuple[str, ...]:
     return (group,)
 
 
-def _rows(offers: tuple[registry.Entry, ...]) -> list[str]:
-    names = [entry.name for entry in offers]
+def _rows(found: tuple[Entry, ...]) -> list[str]:
+    names = [entry.name for entry in found]
     width = max((len(name) for name in names), default=0)
     rows = []
-    for entry in offers:
+    for entry in found:
         note = ""
         if names.count(entry.name) > 1:
             note = "  offered twice: it is refused where it is asked for"

@@ -1,0 +1,1 @@
+"""For authors and users of plugins: lists, explanations, contract checks, new packages."""
