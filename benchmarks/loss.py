@@ -16,8 +16,8 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_core.numerics.threads import configure_threads
-from crossgrad_core.training.loss.loss import photometric_loss
-from crossgrad_core.training.loss.reference import l1_ssim_loss
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 
 
 def timed(loss: Callable[[Tensor], Tensor], image: Tensor, reps: int) -> list[float]:

@@ -24,7 +24,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.numerics.spherical import SH_C0
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step
-from crossgrad_core.training.loss.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
 #: Late enough for SH degree 3 in the published schedule.

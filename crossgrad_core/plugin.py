@@ -41,6 +41,7 @@ from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Scree
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
+from crossgrad_core.contract.images import eight_bit, masked, unit_range
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.metric import Compared, Metric
@@ -60,7 +61,7 @@ from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.evaluation.metrics import SSIM_SKIMAGE_TOO_SMALL, psnr, ssim, ssim_skimage
+from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.ply.cloud import SplatCloud
 from crossgrad_core.ply.file import write_ply
 from crossgrad_core.registry.entries import build as build_component
@@ -75,14 +76,11 @@ from crossgrad_core.run.results.lines import (
 from crossgrad_core.scene.bimodality import bimodality
 from crossgrad_core.system.terminal import shows_bar
 from crossgrad_core.system.text_files import read_rows
-from crossgrad_core.training.loss.loss import photometric_loss
-from crossgrad_core.training.loss.reference import masked, ssim_map, unit_range
 
 __all__ = [
     "EMPTY_STATE",
     "NO_EDIT",
     "SHORTEST_ANCHOR_INTERVAL",
-    "SSIM_SKIMAGE_TOO_SMALL",
     "AfterStepContext",
     "AggregateContext",
     "Aggregated",
@@ -164,6 +162,7 @@ __all__ = [
     "bimodality",
     "build_component",
     "centers_of",
+    "eight_bit",
     "evaluation_line",
     "figures",
     "footprint_of",
@@ -173,7 +172,6 @@ __all__ = [
     "masked",
     "objections_to_views",
     "octave",
-    "photometric_loss",
     "progress_line",
     "psnr",
     "radial_distances",
@@ -181,9 +179,6 @@ __all__ = [
     "screen_statistics",
     "set_for_nothing",
     "shows_bar",
-    "ssim",
-    "ssim_map",
-    "ssim_skimage",
     "unit_range",
     "upward",
     "write_ply",

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.images import eight_bit
 from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.scene import View
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
@@ -50,11 +51,8 @@ def evaluate(
 
 def compare(view: View, render: Tensor) -> Compared:
     """The view's photo and its render [H, W, 3], rounded to 8 bits."""
-    from crossgrad_core.evaluation.metrics import quantise
-
     photo, mask = view.photo.image(), view.photo.mask()
-    image = (quantise(render.detach().cpu()) * 255.0).round().to(torch.uint8)
-    return Compared(view, image, photo, mask)
+    return Compared(view, eight_bit(render), photo, mask)
 
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:

@@ -122,7 +122,7 @@ from crossgrad_core import __main__ as command
 from crossgrad_core.evaluation import evaluation
 from crossgrad_core.run import app
 from crossgrad_core.run.results import curve, panels
-from crossgrad_core.training.loss.numba_kernels import fused
+from crossgrad_plugins.losses.photometric.numba_kernels import fused
 from crossgrad_plugins.rasterizers.numba_kernels import frame
 
 def trap(number, moments):

@@ -20,8 +20,8 @@ from crossgrad_core.plugin import (
     Resolution,
     Sampler,
     hookimpl,
-    photometric_loss,
 )
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
 
 
 class NearAtHalf(Resolution):

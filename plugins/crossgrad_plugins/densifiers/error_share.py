@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.plugin import Camera, DensifyContext, Gaussians, masked, ssim_map, unit_range
+from crossgrad_core.plugin import Camera, DensifyContext, Gaussians, masked, unit_range
+from crossgrad_plugins.losses.photometric.reference import ssim_map
 
 ErrorKind = Literal["ssim", "l1"]
 

@@ -4,7 +4,8 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import Loss, photometric_loss
+from crossgrad_core.plugin import Loss
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
 
 
 class L1SSIM(Loss):

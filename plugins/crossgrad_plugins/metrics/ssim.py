@@ -4,7 +4,8 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Compared, Figure, Metric, ssim
+from crossgrad_core.plugin import Compared, Figure, Metric
+from crossgrad_plugins.metrics.similarity import ssim
 
 
 class SSIM(Metric):

@@ -4,13 +4,8 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import (
-    SSIM_SKIMAGE_TOO_SMALL,
-    Compared,
-    Figure,
-    Metric,
-    ssim_skimage,
-)
+from crossgrad_core.plugin import Compared, Figure, Metric
+from crossgrad_plugins.metrics.similarity import SSIM_SKIMAGE_TOO_SMALL, ssim_skimage
 
 
 class SSIMOfSkimage(Metric):

@@ -192,7 +192,7 @@ def test_two_processes_that_compile_at_once_leave_both_results(package):
 
 def test_every_kernel_of_ours_is_keyed_by_the_files_that_it_inlines():
     from crossgrad_core.numerics import kernel_cache
-    from crossgrad_core.training.loss.numba_kernels import fused
+    from crossgrad_plugins.losses.photometric.numba_kernels import fused
 
     names = {path.name for path in kernel_cache._sources(Path(fused.__file__))}
     assert {"fused.py", "terms.py", "windows.py", "simd.py", "reference.py"} <= names

@@ -7,14 +7,10 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from crossgrad_core.evaluation.metrics import (
-    PSNR_LIMIT,
-    psnr,
-    quantise,
-    ssim,
-    ssim_skimage,
-)
-from crossgrad_core.training.loss.reference import ssim_map
+from crossgrad_core.contract.images import eight_bit
+from crossgrad_core.evaluation.metrics import PSNR_LIMIT, psnr
+from crossgrad_plugins.losses.photometric.reference import ssim_map
+from crossgrad_plugins.metrics.similarity import ssim, ssim_skimage
 
 
 def levels(seed, h=30, w=40):
@@ -28,11 +24,12 @@ MASK = torch.rand(30, 40, generator=torch.Generator().manual_seed(2)) < 0.6
 NOTHING = torch.zeros(30, 40, dtype=torch.bool)
 
 
-def test_quantise_clamps_rounds_and_is_idempotent():
+def test_eight_bit_clamps_rounds_and_is_idempotent():
     image = torch.tensor([[[-1.0, 0.5, 2.0], [torch.nan, 0.1, 1.0]]])
-    expected = torch.tensor([[[0.0, 128 / 255, 1.0], [0.0, 26 / 255, 1.0]]])
-    assert torch.equal(quantise(image), expected)
-    assert torch.equal(quantise(quantise(image)), expected)
+    expected = torch.tensor([[[0, 128, 255], [0, 26, 255]]], dtype=torch.uint8)
+    assert torch.equal(eight_bit(image), expected)
+    assert torch.equal(eight_bit(eight_bit(image)), expected)
+    assert torch.equal(eight_bit(expected / 255), expected)
 
 
 @pytest.mark.parametrize("step", [1, 7, 200])

@@ -9,7 +9,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.opening import parsed
-from crossgrad_core.training.loss.reference import l1_ssim_loss, ssim_map
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss, ssim_map
 
 RNG = np.random.default_rng(0)
 IMAGE = torch.from_numpy(RNG.random((20, 16, 3), dtype=np.float32))

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from crossgrad_core.plugin import masked, unit_range
+
 WINDOW = 11  # pixels
 RADIUS = WINDOW // 2
 SIGMA = 1.5  # pixels
@@ -86,18 +88,6 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     contrast_structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
     ssim: Tensor = luminance * contrast_structure
     return ssim
-
-
-def masked(image: Tensor, mask: Tensor | None) -> Tensor:
-    """The image [H, W, C], 0 at masked-out pixels, so that not even a NaN leaks from them."""
-    if mask is None:
-        return image
-    return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))
-
-
-def unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """The image in `dtype`, 8-bit values divided by 255."""
-    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
 
 
 def _windowed(fields: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel, sum_kernel
 from crossgrad_core.numerics.simd import LANES, fma, fnma, load, splat, store, where
-from crossgrad_core.training.loss.numba_kernels.layout import (
+from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     BACK,
     BY_DIFFERENCE_VARIANCE,
     BY_MEAN,
@@ -24,9 +24,13 @@ from crossgrad_core.training.loss.numba_kernels.layout import (
     STRIDE,
     SUM,
 )
-from crossgrad_core.training.loss.numba_kernels.rows import fill
-from crossgrad_core.training.loss.numba_kernels.windows import across, down, down_with_squares
-from crossgrad_core.training.loss.reference import C1, C2, RADIUS
+from crossgrad_plugins.losses.photometric.numba_kernels.rows import fill
+from crossgrad_plugins.losses.photometric.numba_kernels.windows import (
+    across,
+    down,
+    down_with_squares,
+)
+from crossgrad_plugins.losses.photometric.reference import C1, C2, RADIUS
 
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 

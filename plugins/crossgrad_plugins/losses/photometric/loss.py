@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
-from crossgrad_core.training.loss.reference import l1_ssim_loss
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 
 
 def photometric_loss(
@@ -54,7 +54,7 @@ class _FusedLoss(torch.autograd.Function):
     def forward(
         ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
     ) -> Tensor:
-        from crossgrad_core.training.loss.numba_kernels.fused import loss_terms
+        from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 
         image = image.detach().contiguous()
         target = target.detach().contiguous()

@@ -4,7 +4,7 @@ Rows are kept interleaved, [column * 3 + channel]: a step of one column is three
 """
 
 from crossgrad_core.numerics.simd import LANES
-from crossgrad_core.training.loss.reference import RADIUS, WINDOW
+from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from crossgrad_core.training.loss.loss import photometric_loss
-from crossgrad_core.training.loss.numba_kernels.fused import loss_terms
-from crossgrad_core.training.loss.reference import gaussian_window, l1_ssim_loss, ssim_map
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
+from crossgrad_plugins.losses.photometric.reference import gaussian_window, l1_ssim_loss, ssim_map
 
 H, W = 34, 46
 

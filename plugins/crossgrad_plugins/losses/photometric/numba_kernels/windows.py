@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import device
 from crossgrad_core.numerics.simd import Lanes, fma, load, splat
-from crossgrad_core.training.loss.numba_kernels.layout import CHANNELS, SLOTS, STRIDE
-from crossgrad_core.training.loss.reference import RADIUS, gaussian_window
+from crossgrad_plugins.losses.photometric.numba_kernels.layout import CHANNELS, SLOTS, STRIDE
+from crossgrad_plugins.losses.photometric.reference import RADIUS, gaussian_window
 
 _Floats = NDArray[np.float32]
 _LAST = SLOTS - 1

@@ -23,7 +23,7 @@ from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel, parallel_kernel
-from crossgrad_core.training.loss.numba_kernels.layout import (
+from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     CHANNELS,
     DIFFERENCE,
     HALO,
@@ -34,15 +34,15 @@ from crossgrad_core.training.loss.numba_kernels.layout import (
     TILE_COLUMNS,
     TILE_ROWS,
 )
-from crossgrad_core.training.loss.numba_kernels.rows import copy, load_row, set_centres
-from crossgrad_core.training.loss.numba_kernels.terms import (
+from crossgrad_plugins.losses.photometric.numba_kernels.rows import copy, load_row, set_centres
+from crossgrad_plugins.losses.photometric.numba_kernels.terms import (
     clear_row,
     gradient_row,
     ssim_row,
     sum_absolute,
     sum_of,
 )
-from crossgrad_core.training.loss.reference import RADIUS
+from crossgrad_plugins.losses.photometric.reference import RADIUS
 
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Bytes: TypeAlias = NDArray[np.uint8]  # 1-D

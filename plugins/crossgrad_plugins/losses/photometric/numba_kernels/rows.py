@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.simd import LANES, load, splat, store, where
-from crossgrad_core.training.loss.numba_kernels.layout import (
+from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     CENTRE_DIFFERENCE,
     CENTRE_SUM,
     CHANNELS,
@@ -17,7 +17,7 @@ from crossgrad_core.training.loss.numba_kernels.layout import (
     STRIDE,
     SUM,
 )
-from crossgrad_core.training.loss.reference import RADIUS
+from crossgrad_plugins.losses.photometric.reference import RADIUS
 
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Bytes: TypeAlias = NDArray[np.uint8]  # 1-D

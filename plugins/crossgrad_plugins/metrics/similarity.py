@@ -1,0 +1,75 @@
+"""Two kinds of SSIM on 8-bit images.
+
+Both clamp the images to [0, 1] and round them to 8 bits first, as if the render had been written to
+a file and read back. With a mask only kept pixels count; a masked-out pixel is 0 in both images.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crossgrad_core.plugin import eight_bit, masked
+from crossgrad_plugins.losses.photometric.reference import RADIUS, SIGMA, WINDOW
+
+SSIM_SKIMAGE_TOO_SMALL = (
+    f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
+    f"in an image of {WINDOW} x {WINDOW} or more"
+)
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """SSIM as the loss has it: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
+
+    Arguments as for `psnr`. The mean over kept pixels; None if no pixel is kept.
+    """
+    from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
+
+    if _keeps_nothing(image, mask):
+        return None
+    rendered = (eight_bit(image).to(torch.float32) / 255).contiguous().numpy()
+    photo = eight_bit(target).contiguous().numpy()
+    kept = None if mask is None else mask.cpu().contiguous().numpy()
+    return 1 - loss_terms(rendered, photo, kept)[1]
+
+
+def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """SSIM of scikit-image with Gaussian weights, sigma 1.5, and without sample covariance.
+
+    As in scikit-image, the mean leaves out a border of 5 pixels, where windows leave the image.
+
+    Arguments as for `psnr`. None, with `SSIM_SKIMAGE_TOO_SMALL` as the reason, if nothing is left.
+    """
+    height, width = image.shape[:2]
+    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside[RADIUS : height - RADIUS, RADIUS : width - RADIUS] = True
+    if mask is not None:
+        inside &= mask.cpu()
+    if min(height, width) < WINDOW or not bool(inside.any()):
+        return None
+    return float(_skimage_map(image, target, mask)[inside.numpy()].mean())
+
+
+def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[np.float64]:
+    """SSIM per pixel and channel, [H, W, 3]."""
+    from skimage.metrics import structural_similarity
+
+    mask = None if mask is None else mask.cpu()
+    rendered, photo = (
+        masked(eight_bit(i).to(torch.float64) / 255, mask).numpy() for i in (image, target)
+    )
+    _, full = structural_similarity(  # type: ignore[no-untyped-call]
+        rendered,
+        photo,
+        gaussian_weights=True,
+        sigma=SIGMA,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )
+    return np.asarray(full, dtype=np.float64)
+
+
+def _keeps_nothing(image: Tensor, mask: Tensor | None) -> bool:
+    return image.numel() == 0 if mask is None else not bool(mask.any())
