@@ -39,7 +39,12 @@ from crossgrad_core.contract.exposure import Exposure, PerPhoto
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
-from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator, Weighting
+from crossgrad_core.contract.gramian_operator import (
+    GramianOperator,
+    MatrixOperator,
+    Weighting,
+    diagonals,
+)
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
 from crossgrad_core.contract.images import eight_bit, masked, unit_range
 from crossgrad_core.contract.loss import Loss
@@ -162,6 +167,7 @@ __all__ = [
     "bimodality",
     "build_component",
     "centers_of",
+    "diagonals",
     "eight_bit",
     "evaluation_line",
     "figures",

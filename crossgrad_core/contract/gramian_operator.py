@@ -77,7 +77,10 @@ class GramianOperator(MatrixOperator):
 
 
 class Weighting(GramianOperator):
-    """A Gramian operator that gives each view one weight per block, from this step alone."""
+    """A Gramian operator that gives each view one weight per block, from this step alone.
+
+    In a chain the next link sees the K weighted gradients.
+    """
 
     @abstractmethod
     def weights(
@@ -98,7 +101,15 @@ class Weighting(GramianOperator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        return self.weights(gramians, context)[:, None, :], state
+        return diagonals(self.weights(gramians, context)), state
+
+
+def diagonals(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[B, K, K] matrices that multiply each of K gradients by its weight; `weights` is [B, K]."""
+    blocks, views = weights.shape
+    matrices = np.zeros((blocks, views, views))
+    matrices.reshape(blocks, -1)[:, :: views + 1] = weights
+    return matrices
 
 
 def aggregate_by_gramians(

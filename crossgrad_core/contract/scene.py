@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 import torch
@@ -12,7 +12,41 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Pinhole:
+    """An undistorted calibration; pixels, pixel centres at +0.5.
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        fx: Focal length in pixels; likewise `fy`.
+        fy: See `fx`.
+        cx: Principal point in pixels from the left (top for `cy`) image border.
+        cy: See `cx`.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def resized(self, width: int, height: int) -> Self:
+        """The same calibration for an image resampled to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Camera(Pinhole):
     """A pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 
     Attributes:
@@ -25,12 +59,6 @@ class Camera:
         world_to_camera: [4, 4] float64 on the CPU, rigid, local frame to camera frame.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     world_to_camera: Tensor
 
     @cached_property
@@ -48,19 +76,6 @@ class Camera:
         """[N, 3] points of the local frame in the camera's axes; the third number is the depth."""
         pose = self.world_to_camera.numpy()
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
-
-    def resized(self, width: int, height: int) -> "Camera":
-        """The same camera for an image resampled to `width` x `height`."""
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
 
 
 class Photo(Protocol):

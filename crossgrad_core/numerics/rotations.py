@@ -1,15 +1,25 @@
-"""Rotations."""
+"""Rotation matrices of quaternions."""
+
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+#: Numbers, arrays or tensors of one shape.
+T = TypeVar("T", float, Tensor)
 
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotations of quaternions wxyz [N, 4], normalised first."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = (
+
+def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
+    """The rows of the rotation matrix of a quaternion of unit length."""
+    return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] rotations of quaternions [N, 4], wxyz of any length; the identity of a zero one."""
+    length = quats.norm(dim=-1, keepdim=True)
+    unit = quats / torch.where(length > 0, length, 1.0)
+    return torch.stack([torch.stack(row, -1) for row in matrix_rows(*unit.unbind(-1))], -2)

@@ -104,16 +104,8 @@ def _positions(views: Sequence[RawView], names: Sequence[str]) -> tuple[int, ...
 
 
 def _localize(view: RawView, photos: ChosenPhotos, frame: Frame) -> Camera:
-    pinhole = photos.pinholes[view.name]
-    return Camera(
-        width=pinhole.width,
-        height=pinhole.height,
-        fx=pinhole.fx,
-        fy=pinhole.fy,
-        cx=pinhole.cx,
-        cy=pinhole.cy,
-        world_to_camera=torch.from_numpy(frame.pose(view.world_to_camera)),
-    )
+    pose = torch.from_numpy(frame.pose(view.world_to_camera))
+    return Camera(**vars(photos.pinholes[view.name]), world_to_camera=pose)
 
 
 def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
@@ -23,23 +24,6 @@ _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _AGAIN = "repair the camera, or export the model again"
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """An undistorted calibration; pixels, pixel centres at +0.5."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def resized(self, width: int, height: int) -> "Pinhole":
-        """The calibration of the same photo resampled to `width` x `height`."""
-        sx, sy = width / self.width, height / self.height
-        return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
 @dataclass(frozen=True)

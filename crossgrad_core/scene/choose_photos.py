@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene import pillow
-from crossgrad_core.scene.calibration import Calibration, Pinhole
+from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.photo_files import (
     PhotoFolder,

@@ -1,8 +1,8 @@
-"""Tables in CSV files: rows with the union of their columns."""
+"""Tables in CSV files."""
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import isnan
 from pathlib import Path
 
@@ -18,15 +18,23 @@ def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> 
         UserError: The disk is full, or the folder is read-only.
     """
     columns = list(dict.fromkeys(name for row in rows for name in row))
+    lines = ([_rounded(row.get(name)) for name in columns] for row in rows)
+    write_atomically(path, csv_bytes([columns, *lines]))
+
+
+def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
+    """Lines of cells as they stand in a file: UTF-8, commas, a line feed behind each line."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({name: _cell(value) for name, value in row.items()})
-    write_atomically(path, text.getvalue().encode())
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue().encode()
 
 
-def _cell(value: float | str) -> str:
+def as_cell(value: float | str | None) -> str:
+    """A value with all its digits; an empty cell where there is none."""
+    return "" if value is None else str(value)
+
+
+def _rounded(value: float | str | None) -> str:
     if isinstance(value, float):
         return "" if isnan(value) else f"{value:.9g}"
-    return str(value)
+    return as_cell(value)

@@ -1,4 +1,4 @@
-"""What operators share that give each gradient one weight."""
+"""Weights worked out with as many digits as the gradients ask for."""
 
 from collections.abc import Callable
 from typing import Final, Literal, Protocol
@@ -13,14 +13,6 @@ Flags = NDArray[np.bool_]
 
 #: Unit roundoff of float32.
 FLOAT32: Final = 2.0**-24
-
-
-def weighting(weights: Floats) -> Floats:
-    """[B, K, K] matrices that multiply each of K gradients by its weight; `weights` is [B, K]."""
-    blocks, views = weights.shape
-    matrices = np.zeros((blocks, views, views))
-    matrices.reshape(blocks, -1)[:, :: views + 1] = weights
-    return matrices
 
 
 def sharpened(

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import sharpened, weighting
+from crossgrad_core.plugin import OperatorContext, Weighting
+from crossgrad_operators._weights import sharpened
 
 
-class Aligned(GramianOperator):
+class Aligned(Weighting):
     """All singular values of the gradient matrix are brought down to its smallest one.
 
     G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
@@ -21,15 +21,11 @@ class Aligned(GramianOperator):
     idle_at_one: ClassVar[bool] = True
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import aligned
         from crossgrad_operators.numba_kernels.exact_balance import exact_aligned
 
         weights, doubtful = aligned(gramians, context.present, context.unit)
-        return weighting(sharpened(weights, doubtful, gramians, context, exact_aligned)), state
+        return sharpened(weights, doubtful, gramians, context, exact_aligned)

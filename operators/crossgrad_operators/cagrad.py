@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
-from crossgrad_operators._weights import Flags, Floats, weighting, with_digits
+from crossgrad_core.plugin import OperatorContext, Selection, Weighting
+from crossgrad_operators._weights import Flags, Floats, with_digits
 
 
-class CAGrad(GramianOperator):
+class CAGrad(Weighting):
     """The direction near the mean that serves the worst-off view best.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
@@ -38,13 +38,9 @@ class CAGrad(GramianOperator):
         return {"rescale": "it divides by 1 where c = 0; leave it out"}
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.simplex import cagrad
 
         def kernel(
@@ -55,4 +51,4 @@ class CAGrad(GramianOperator):
         weights = with_digits(kernel, gramians, context)
         several = context.present.sum(axis=1, keepdims=True) > 1
         scale = {"none": 1.0, "1+c": 1.0 / (1.0 + self.c), "1+c^2": 1.0 / (1.0 + self.c**2)}
-        return weighting(weights * np.where(several, scale[self.rescale], 1.0)), state
+        return weights * np.where(several, scale[self.rescale], 1.0)

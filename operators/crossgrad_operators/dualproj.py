@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import weighting, with_digits
+from crossgrad_core.plugin import OperatorContext, Weighting
+from crossgrad_operators._weights import with_digits
 
 
-class DualProj(GramianOperator):
+class DualProj(Weighting):
     """The mean gradient, projected on the cone that conflicts with no gradient.
 
     v = argmin v^T G v subject to v >= 1/K; u = v G. Closed form for two views, Lawson and Hanson's
@@ -20,13 +20,9 @@ class DualProj(GramianOperator):
     idle_at_one: ClassVar[bool] = True
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.cone import dualproj
 
-        return weighting(with_digits(dualproj, gramians, context)), state
+        return with_digits(dualproj, gramians, context)

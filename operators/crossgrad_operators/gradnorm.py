@@ -15,12 +15,12 @@ from crossgrad_core.plugin import (
     OperatorContext,
     PluginState,
     Selection,
+    diagonals,
     hookimpl,
     octave,
 )
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
-from crossgrad_operators._weights import weighting
 
 #: Group -> count, start and average of its losses, and the same by octave where not at full size.
 _Losses = dict[str, dict[str, Any]]
@@ -70,7 +70,7 @@ class GradNorm(GramianOperator):
         weights = follow_losses(logs, gramians, group, self._rates(losses), self.alpha, self.lr)
         values = {**state.values, "losses": cast("Json", losses)}
         kept = PluginState(values, state.tensors, state.per_primitive)
-        return weighting(weights), remember(kept, context, "log_weight", logs)
+        return diagonals(weights), remember(kept, context, "log_weight", logs)
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:

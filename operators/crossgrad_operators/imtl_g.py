@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import sharpened, weighting
+from crossgrad_core.plugin import OperatorContext, Weighting
+from crossgrad_operators._weights import sharpened
 
 
-class IMTLG(GramianOperator):
+class IMTLG(Weighting):
     """The combination with equal projections on all unit gradients, weights adding up to 1.
 
     G v = (|g_k|), w = v / sum v. For two views w = (|g_2|, |g_1|) / (|g_1| + |g_2|): the bisector.
@@ -21,15 +21,11 @@ class IMTLG(GramianOperator):
     idle_at_one: ClassVar[bool] = True
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import imtl_g
         from crossgrad_operators.numba_kernels.exact_balance import exact_imtl_g
 
         weights, doubtful = imtl_g(gramians, context.present, context.unit)
-        return weighting(sharpened(weights, doubtful, gramians, context, exact_imtl_g)), state
+        return sharpened(weights, doubtful, gramians, context, exact_imtl_g)

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import weighting, with_digits
+from crossgrad_core.plugin import OperatorContext, Weighting
+from crossgrad_operators._weights import with_digits
 
 
-class MGDA(GramianOperator):
+class MGDA(Weighting):
     """The shortest convex combination of the gradients: min |sum w_k g_k|, w on the simplex.
 
     Closed form for two views, Lawson and Hanson's active sets above, with 32 digits for gradients
@@ -20,13 +20,9 @@ class MGDA(GramianOperator):
     idle_at_one: ClassVar[bool] = True
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.simplex import mgda
 
-        return weighting(with_digits(mgda, gramians, context)), state
+        return with_digits(mgda, gramians, context)

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import sharpened, weighting
+from crossgrad_core.plugin import OperatorContext, Weighting
+from crossgrad_operators._weights import sharpened
 
 
-class Nash(GramianOperator):
+class Nash(Weighting):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
     Closed form for two views, damped Newton above (decrement 1e-13). |u| would always be sqrt(K);
@@ -21,15 +21,11 @@ class Nash(GramianOperator):
     idle_at_one: ClassVar[bool] = True
 
     @override
-    def transform(
-        self,
-        gramians: NDArray[np.float64],
-        context: OperatorContext,
-        state: PluginState,
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float64], PluginState]:
+    def weights(
+        self, gramians: NDArray[np.float64], context: OperatorContext
+    ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import nash
         from crossgrad_operators.numba_kernels.exact_balance import exact_nash
 
         weights, doubtful = nash(gramians, context.present, context.unit)
-        return weighting(sharpened(weights, doubtful, gramians, context, exact_nash)), state
+        return sharpened(weights, doubtful, gramians, context, exact_nash)

@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import weighting
+from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState, diagonals
 
 #: Bounds of r / r_ref: a camera at the centroid must not lose all weight.
 _BOUNDS = (1e-2, 1e2)
@@ -39,4 +38,4 @@ class Preconditioner(MatrixOperator):
         powers = np.array([self.geometry, self.appearance, self.neutral])
         table = ratios ** powers[:, None]  # [3, K]
         kinds = np.fromiter(map(places.__getitem__, context.kinds), np.int64, len(context.kinds))
-        return weighting(table[kinds]), state
+        return diagonals(table[kinds]), state

@@ -8,8 +8,13 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 from typing_extensions import override
 
-from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, UserError
-from crossgrad_operators._weights import weighting
+from crossgrad_core.plugin import (
+    GramianOperator,
+    OperatorContext,
+    PluginState,
+    UserError,
+    diagonals,
+)
 
 _Value: TypeAlias = bool | int | float | str
 
@@ -62,7 +67,7 @@ class TorchJD(GramianOperator):
                     part = gramians[block][np.ix_(chosen, chosen)]
                     found = rule(torch.from_numpy(part / np.trace(part)))
                     weights[block, chosen] = found.double().numpy()
-        return weighting(weights), state
+        return diagonals(weights), state
 
     def _built(self) -> Any:  # noqa: ANN401 - TorchJD may be absent
         try:

@@ -1,7 +1,5 @@
 """metrics.csv: one row per evaluation, on the disk as soon as it is known."""
 
-import csv
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,6 +11,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.system.files import disk_errors, write_atomically
+from crossgrad_core.system.tables import as_cell, csv_bytes
 from crossgrad_core.system.text_files import parse_number, read_rows
 
 FILE = "metrics.csv"
@@ -102,13 +101,13 @@ class MetricsCsv:
         if unknown:
             message = f"{FILE} has no columns {sorted(unknown)}"
             raise ValueError(message)
-        text = _csv_text([[_cell(row.get(name)) for name in self.columns]])
-        with disk_errors(self.path, len(text)):
-            _append(self.path, text.encode())
+        line = csv_bytes([[as_cell(row.get(name)) for name in self.columns]])
+        with disk_errors(self.path, len(line)):
+            _append(self.path, line)
 
     def rewrite(self, lines: Sequence[Sequence[str]]) -> None:
         """Replaces the whole table by the header and these rows."""
-        write_atomically(self.path, _csv_text([self.columns, *lines]).encode())
+        write_atomically(self.path, csv_bytes([self.columns, *lines]))
 
 
 def read_metrics(folder: Path) -> tuple[Row, ...]:
@@ -134,7 +133,7 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
 def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> tuple[Row, ...]:
     try:
         rows = tuple(
-            {name: _number(cell) for name, cell in zip(header, line, strict=True)} for line in lines
+            {name: _number(text) for name, text in zip(header, line, strict=True)} for line in lines
         )
     except ValueError as error:
         raise _unreadable(path, str(error)) from error
@@ -171,15 +170,5 @@ def _lines(path: Path) -> list[list[str]]:
     return read_rows(path, FILE, _TODO, whole=True)
 
 
-def _csv_text(lines: Sequence[Sequence[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
-
-
-def _cell(value: float | str | None) -> str:
-    return "" if value is None else str(value)
-
-
-def _number(cell: str) -> int | float | None:
-    return None if cell == "" else parse_number(cell)
+def _number(text: str) -> int | float | None:
+    return None if text == "" else parse_number(text)

@@ -1,12 +1,11 @@
 """per_view.csv: the metrics of every held-out view."""
 
-import csv
-import io
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.tables import as_cell, csv_bytes
 from crossgrad_core.system.text_files import parse_number, read_rows
 
 FILE = "per_view.csv"
@@ -20,14 +19,12 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = FILE) -> 
     Raises:
         UserError: The disk is full.
     """
-    text = io.StringIO()
-    columns = [*_NAMES, *(figure.name for figure in result.figures)]
-    table = csv.DictWriter(text, columns, lineterminator="\n")
-    table.writeheader()
-    table.writerows(
-        {"name": view.name, "regime": view.regime, **view.values} for view in result.views
+    figures = [figure.name for figure in result.figures]
+    lines = (
+        [view.name, view.regime, *(as_cell(view.values[each]) for each in figures)]
+        for view in result.views
     )
-    write_atomically(folder / name, text.getvalue().encode())
+    write_atomically(folder / name, csv_bytes([[*_NAMES, *figures], *lines]))
 
 
 def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
+from crossgrad_core.numerics.rotations import matrix_rows
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.raw import RawScene, RawView
@@ -112,12 +113,7 @@ def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
             found=f"quaternion {image.quaternion.tolist()}, shift {image.translation.tolist()}",
             todo="remove the image from the model, or estimate the poses again",
         )
-    w, x, y, z = image.quaternion / np.linalg.norm(image.quaternion)
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = matrix_rows(*(image.quaternion / np.linalg.norm(image.quaternion)))
     pose[:3, 3] = image.translation
     return pose

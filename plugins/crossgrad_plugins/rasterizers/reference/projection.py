@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
 from crossgrad_core.plugin import Camera
 
@@ -59,23 +60,12 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     jacobian = torch.stack([row_u, row_v], 1)  # [N, 2, 3]
 
     # The covariance is factor @ factor.T.
-    factor = jacobian @ pose[:3, :3] @ (rotations(quats) * scales[:, None, :])  # [N, 2, 3]
+    factor = jacobian @ pose[:3, :3] @ (rotation_matrices(quats) * scales[:, None, :])  # [N, 2, 3]
     first, second = factor.unbind(1)
     # Cauchy-Binet: a sum of squares, where xx * yy - xy^2 would cancel for needles.
     det = torch.linalg.cross(first, second).square().sum(-1)
     xx, xy, yy = first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1)
     return Projection(torch.stack([u, v], -1), z, xx, xy, yy, det, factor)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotation matrices of quaternions [N, 4], wxyz of any length."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    entries = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(entries, -1).view(-1, 3, 3)
 
 
 def _slopes(size: int, focal: float, center: float) -> tuple[float, float]:
