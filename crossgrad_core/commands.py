@@ -187,7 +187,7 @@ def assemble(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
 
 
 def with_steps(setup: "Setup", steps: int) -> "Setup":
-    """The run with the published schedule stretched to so many steps, whoever fills its slots."""
+    """The run with the published schedule stretched to so many steps, whatever fills its slots."""
     from crossgrad_core.contract.schedule import Schedule
 
     return replace(setup, schedule=Schedule.for_run(steps, setup.config.schedule))
@@ -220,7 +220,7 @@ def begin(setup: "Setup") -> "TrainState":
 def take_steps(setup: "Setup", state: "TrainState") -> None:
     """Trains to the end of the schedule without a folder: nothing is evaluated or saved.
 
-    `state` is moved on in place. Whoever wants to look on registers a plugin first,
+    `state` is moved on in place. To watch, register a plugin first:
     `setup.manager.register(plugin, name=...)`.
 
     Raises:

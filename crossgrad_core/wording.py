@@ -9,7 +9,7 @@ _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def showable(text: str) -> str:
-    """Text from anybody's file as a terminal can show it."""
+    """Text from any file as a terminal can show it."""
     return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 

@@ -1,4 +1,4 @@
-"""What cannot stand beside `--resume`: all that would change the training."""
+"""Options that cannot stand beside `--resume`: all that would change the training."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -14,7 +14,7 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Makes stdout and stderr swallow what nobody can read any more.
+    """Makes stdout and stderr swallow what can no longer be read.
 
     A closed pipe (`| head`), a terminal that is gone or a full disk would otherwise end a training
     of hours at its next line of progress. What a run says stands in its log.txt as well.
@@ -32,7 +32,7 @@ class _LastingFile(io.FileIO):
         """Writes what can be written; of the rest it is said that it was."""
         try:
             written = super().write(content)
-            if written is None:  # Whoever shares the terminal told it not to wait.
+            if written is None:  # Another process of the terminal told it not to wait.
                 os.set_blocking(self.fileno(), True)
                 written = super().write(content)
         except OSError:

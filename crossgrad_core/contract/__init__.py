@@ -1,1 +1,1 @@
-"""What plugins see: data, slots, components, contexts and hooks."""
+"""The contract with plugins: data, slots, components, contexts and hooks."""

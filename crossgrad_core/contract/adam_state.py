@@ -1,4 +1,4 @@
-"""What Adam remembers between steps."""
+"""Adam's moments and step counts."""
 
 from dataclasses import dataclass, field
 

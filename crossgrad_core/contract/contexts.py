@@ -1,4 +1,4 @@
-"""What the hooks are offered and what they answer with."""
+"""Arguments and answers of the hooks."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -299,7 +299,7 @@ class AggregateContext(StepContext):
         """The gradients, of each view by itself.
 
         Raises:
-            TypeError: They were accumulated, because nobody said that single views matter.
+            TypeError: They were accumulated, because no plugin said that single views matter.
         """
         if isinstance(self.gradients, SeparateGradients):
             return self.gradients
@@ -505,7 +505,7 @@ class OperatorContext:
         unit: Unit roundoff of the gradients' type: no result needs to be closer.
         remainders: Works out [B, K, K], what rounding to float64 took from the Gramians; both
             together have twice the digits. It takes another, slower pass over the gradients: for
-            Gramians so close to singular that their own rounding shows. None where nobody knows.
+            Gramians so close to singular that their own rounding shows. None where it is not known.
         scales: K scales at which losses and gradients were taken; empty where all are 1.
     """
 

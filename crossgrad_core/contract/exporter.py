@@ -40,5 +40,5 @@ class Exporter(Component):
         """
 
     def stored(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians as whoever reads the file has them, local frame; by default unchanged."""
+        """The Gaussians as a reader of the file gets them, local frame; by default unchanged."""
         return gaussians

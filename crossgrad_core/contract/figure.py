@@ -1,4 +1,4 @@
-"""What a figure of the results is called and how it is shown. Imports nothing heavy."""
+"""A figure of the results: its name and how it is shown. Imports nothing heavy."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What every backbone decodes to and every rasterizer takes and returns."""
+"""Gaussians, which every backbone decodes to, and renders, which every rasterizer returns."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

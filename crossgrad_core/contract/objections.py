@@ -1,4 +1,4 @@
-"""What holds for all components of a slot: what cannot work together, options that do nothing."""
+"""Objections to a selection: combinations that cannot work, options that do nothing."""
 
 from collections.abc import Iterator, Mapping
 

@@ -1,4 +1,4 @@
-"""What losses that were taken at different scales have to do with each other."""
+"""Octaves of scale, within which losses can be compared."""
 
 from math import log2
 

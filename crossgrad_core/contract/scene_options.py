@@ -1,4 +1,4 @@
-"""What a user can say about how a scene is read."""
+"""Options of reading a scene."""
 
 from pathlib import Path
 from typing import Annotated, Literal

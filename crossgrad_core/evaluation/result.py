@@ -1,4 +1,4 @@
-"""What an evaluation found: figures per view, means overall and per regime. Imports no torch."""
+"""Results of an evaluation: figures per view, means overall and per regime. Imports no torch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

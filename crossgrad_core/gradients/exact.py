@@ -1,4 +1,4 @@
-"""What rounding to float64 takes from Gramians: a slow second pass over gradients of any type."""
+"""Rounding errors of Gramians in float64: a slow second pass over gradients of any type."""
 
 from collections.abc import Sequence
 

@@ -26,7 +26,7 @@ def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noq
 
 def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
     """Compiles a function that kernels call; becomes part of the caller."""
-    # Entry points for Python and C, which nobody would use, take a quarter of the compilation.
+    # Entry points for Python and C, which would not be used, take a quarter of the compilation.
     whole = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast("Callable[P, R]", _COMPILE(**whole, **options, **_OPTIONS)(function))
 

@@ -1,4 +1,4 @@
-"""What plugins of crossgrad 0.1 do that is done in another way now, and what to do about it."""
+"""Changes since crossgrad 0.1 that its plugins meet, and what to do about them."""
 
 import re
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """One plugin manager per run, and seams that must answer.
 
-pluggy is quiet about a hook that nobody specified, a hook method without its mark and a second
+pluggy is quiet about a hook that is not specified, a hook method without its mark and a second
 plugin that answers first. All three are errors here, with the plugin's name.
 """
 
@@ -60,7 +60,7 @@ def call_seam(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) ->
         answer: Type of the answer.
 
     Raises:
-        UserError: Nobody answered, or the answer is of another type.
+        UserError: No plugin answered, or the answer is of another type.
     """
     result: object = hook(context=context)
     if isinstance(result, answer) and _complete(result):

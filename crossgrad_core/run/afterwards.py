@@ -1,4 +1,4 @@
-"""What the commands do with a run that was trained: evaluate, render, export."""
+"""Evaluation, renders and exports of a run that was trained."""
 
 import logging
 from collections.abc import Iterator

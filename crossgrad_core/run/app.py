@@ -198,7 +198,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
 
 @contextmanager
 def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
-    """A folder for a new run, which nobody else writes into meanwhile."""
+    """A folder for a new run, which no other process writes into meanwhile."""
     names = setup.selection.names
     name = RunName(
         setup.scene.name,

@@ -7,7 +7,7 @@ from crossgrad_core.training.state import TrainState
 
 #: Steps and training seconds to look at before anything is said; the very first step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
-#: A run that takes less is over before an estimate helps anybody.
+#: A run that takes less is over before an estimate helps.
 WORTH_A_LINE = 60.0
 
 

@@ -7,7 +7,7 @@ from crossgrad_core.training.setup import Setup
 def idle_note(setup: Setup) -> tuple[str, ...]:
     """Says that an operator leaves the gradient of a single view as it is, and the way out.
 
-    The default operator is left alone: nobody expects a sum of one gradient to be more than that.
+    The default operator is left alone: a sum of one gradient is expected to be no more than that.
     """
     selection = setup.selection
     name, views = selection.names["operator"], selection.views_per_step

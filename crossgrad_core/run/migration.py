@@ -85,5 +85,5 @@ def _with_granularity(operator: dict[str, Any]) -> dict[str, Any]:
 def _has_no_granularity(name: str) -> bool:
     try:
         return "granularity" not in load("operators", name).model_fields
-    except UserError:  # Whoever builds the operator says what is wrong with it.
+    except UserError:  # Building the operator raises the error that explains it.
         return False

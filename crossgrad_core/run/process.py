@@ -1,4 +1,4 @@
-"""What a process may have set for itself before it trains, as it is in a new one."""
+"""Settings of the process, brought to those of a new one before training."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""What may change when a run goes on."""
+"""Settings that may change when a run goes on."""
 
 from typing import Final
 

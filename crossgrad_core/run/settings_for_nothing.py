@@ -96,7 +96,7 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """A grouping that somebody named and nobody looks at."""
+    """A grouping that was named and is not read."""
     selection = setup.selection
     sampler, operator = selection.sampler, selection.operator
     watched = any(choice.name != PROGRESS for choice in config.observers)

@@ -1,4 +1,4 @@
-"""What a scene is known by: frame, cameras, split, points, and the ends of its photos' files."""
+"""The fingerprint of a scene: frame, cameras, split, points, and the ends of its photos' files."""
 
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256

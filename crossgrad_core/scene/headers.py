@@ -1,4 +1,4 @@
-"""What a photo file says about itself without being decoded, and whether it is whole."""
+"""Headers of photo files: size and kind without decoding, and whether the file is whole."""
 
 from dataclasses import dataclass, replace
 from math import inf

@@ -1,4 +1,4 @@
-"""What a reader finds before it is split, resized and moved to the local frame."""
+"""The raw scene: a reader's findings before split, resizing and the local frame."""
 
 from dataclasses import dataclass
 from pathlib import Path

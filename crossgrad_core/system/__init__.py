@@ -1,1 +1,1 @@
-"""What the operating system gives: files, signals and terminals."""
+"""Services of the operating system: files, signals and terminals."""

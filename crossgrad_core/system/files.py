@@ -107,7 +107,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Deletes what killed processes left half-written in a folder that nobody else writes into."""
+    """Deletes half-written files of killed processes in a folder that only this one writes into."""
     for path in folder.glob(".*.tmp"):
         if is_leftover(path):
             path.unlink(missing_ok=True)

@@ -46,7 +46,7 @@ def tell(text: str, *, alone: bool = True) -> None:
         with suppress(OSError):
             os.write(2, line.encode())
     except (OSError, ValueError):
-        pass  # Nobody can be told any more.
+        pass  # There is nowhere left to say it.
 
 
 def end_at_once(number: int, _frame: FrameType | None) -> None:

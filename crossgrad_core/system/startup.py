@@ -1,4 +1,4 @@
-"""What a command is doing before its first result: a line for each stage, kernels with a clock.
+"""Progress before a command's first result: a line for each stage, kernels with a clock.
 
 Listens to the log of the package; what takes long says so there (`reading scene ...`), and so does
 the cache of kernels before it compiles one. Nothing heavy is imported.
@@ -141,4 +141,4 @@ def _say(text: str, *, stays: bool = True) -> None:
         sys.stderr.write(f"{clear}{text}" + ("\n" if stays else ""))
         sys.stderr.flush()
     except (OSError, ValueError):
-        pass  # Nobody reads it any more.
+        pass  # It is no longer read.

@@ -1,4 +1,4 @@
-"""What a stream can show."""
+"""Capabilities of a terminal."""
 
 import os
 from typing import TextIO

@@ -43,7 +43,7 @@ def help_can_be_shown(command: Command) -> None:
 def importing_it_is_quick(command: Command) -> None:
     """The module of the command imports nothing that takes long.
 
-    Whoever calls a command sees within two seconds that it has started; what it needs is imported
+    A user sees within two seconds that a command has started; what it needs is imported
     inside its function.
     """
     module = _module(command)

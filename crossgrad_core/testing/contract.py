@@ -1,4 +1,4 @@
-"""What contract checks are made of.
+"""Building blocks of contract checks.
 
 A check is a plain function `check(make)`: `make()` gives a fresh component with default options;
 the check raises `ContractError` with a sentence for the author of the component. Checks need

@@ -178,7 +178,7 @@ def _backbones() -> Iterator[Backbone]:
         try:
             yield cast("Backbone", build("backbones", name, {}))
         except UserError:
-            # A broken backbone of somebody else is not this densifier's fault.
+            # A broken backbone of another package is not this densifier's fault.
             continue
 
 

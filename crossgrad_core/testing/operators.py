@@ -245,7 +245,7 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
     """`reads_labels` and `reads_gramians` are right: other labels or Gramians change nothing else.
 
-    A run refuses a grouping that nobody reads, and a granularity of Gramians that nobody reads.
+    A run refuses a grouping that is not read, and a granularity of Gramians that are not read.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):

@@ -1,4 +1,4 @@
-"""What can go wrong inside a step."""
+"""Errors of a training step."""
 
 
 class NonFiniteError(Exception):

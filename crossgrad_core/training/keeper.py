@@ -1,4 +1,4 @@
-"""What training goes back to when a step is cut short."""
+"""The last good state, to which training returns when a step is cut short."""
 
 from crossgrad_core.training.checks import are_parameters_finite, check_parameters
 from crossgrad_core.training.state import Mark, Snapshot, TrainState

@@ -122,7 +122,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: Sink, keeper: Keeper) -> bool:
-    """Looks at a state that somebody is going to keep; where it is bad, training goes back."""
+    """Checks a state that is about to be kept; where it is bad, training goes back."""
     try:
         keeper.look(state)
     except NonFiniteError as error:

@@ -12,7 +12,7 @@ def decoded_meanwhile(scene: Scene) -> Iterator[None]:
     """Decodes the scene's photos in a thread as long as the block runs, the held-out ones first.
 
     They stay where decoded photos are kept, as far as there is room. A photo that cannot be decoded
-    is left to whoever asks for it next, who gets the error.
+    is left alone; the next access to it raises the error.
     """
     over = Event()
     thread = Thread(target=_decode, args=(scene, over), name="crossgrad-photos", daemon=True)

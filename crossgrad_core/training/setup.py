@@ -1,4 +1,4 @@
-"""What a run is made of once its configuration is resolved; training changes nothing here."""
+"""The parts of a run once its configuration is resolved; training changes nothing here."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -84,7 +84,7 @@ class Stopper:
             raise KeyboardInterrupt
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        """Leaves the end to whoever handled signals before; in Python itself an exception."""
+        """Leaves the end to the previous handler of signals; in Python itself an exception."""
         before = self._before.get(number)
         (before if callable(before) else end_at_once)(number, frame)
         raise KeyboardInterrupt

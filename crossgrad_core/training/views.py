@@ -87,7 +87,7 @@ def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[f
     state.counters.backward_passes += len(records)
     if not setup.separate:
         return Rendered(tuple(records), total, regular, tuple(photos))
-    # Nobody looks at single views after they are combined, unless a plugin says so.
+    # Single views are not needed after they are combined, unless a plugin says so.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(tuple(records), apart, regular, tuple(photos))
 
@@ -120,7 +120,7 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
         state.parameters, target.camera, setup.phase(state.step, training=True)
     )
     state.laps.lap("decode")
-    # Nobody reads the optional statistics once density control is over, and some cost much.
+    # The optional statistics are not needed once density control is over, and some cost much.
     wanted = setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
     render = setup.rasterizer.render(gaussians, target.camera, background, wanted)
     state.laps.lap("render")

@@ -29,7 +29,7 @@ def sharpened(
         doubtful: [B].
         gramians: [B, K, K].
         context: Tells which views are present, and what rounding took from the Gramians; where
-            nobody knows that, the weights stay as they are.
+            that is not known, the weights stay as they are.
         exact: From the doubtful Gramians, their remainders and presence [n, K] to their weights.
 
     Returns:

@@ -44,7 +44,7 @@ def lazy(request, monkeypatch):
 
 
 def forbidden(monkeypatch, tmp):
-    """Whoever asks (root may write anywhere), the system refuses."""
+    """The system refuses every user, even root, who may write anywhere."""
 
     def refused(*_, **__):
         raise PermissionError(13, "Permission denied")

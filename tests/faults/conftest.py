@@ -32,7 +32,7 @@ def reference(tmp_path_factory):
 
 
 def install_plugin(folder):
-    """Makes the observer `faulty` known to whoever has the folder on its path."""
+    """Makes the observer `faulty` known to each process with the folder on its path."""
     info = folder / "faulty-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")

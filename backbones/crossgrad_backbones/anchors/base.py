@@ -1,4 +1,4 @@
-"""What the backbones of anchors share: options, blocks, first values, decoding, regularisation."""
+"""Base of the anchor backbones: options, blocks, first values, decoding, regularisation."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence

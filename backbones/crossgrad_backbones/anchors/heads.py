@@ -1,4 +1,4 @@
-"""What the networks say about the Gaussians of the anchors that a camera sees."""
+"""The networks that give the Gaussians of the anchors that a camera sees."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

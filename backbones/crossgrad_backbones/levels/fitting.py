@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size
 
-#: More levels than anybody needs.
+#: More levels than any scene needs.
 MOST_LEVELS = 16
 #: The least edge of a cell, largest coordinates: float32 positions round to half of 2^-23 of them.
 RESOLUTION = 2.0**-20

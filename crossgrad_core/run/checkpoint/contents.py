@@ -1,4 +1,4 @@
-"""What a checkpoint holds."""
+"""The contents of a checkpoint."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

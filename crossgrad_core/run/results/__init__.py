@@ -1,1 +1,1 @@
-"""What a run leaves on disk and shows at its end: folder, tables, curve, panels, log."""
+"""Results of a run on disk and on screen: folder, tables, curve, panels, log."""

@@ -1,4 +1,4 @@
-"""What a run was executed on and with."""
+"""The machine and the versions that a run was executed with."""
 
 import os
 import platform

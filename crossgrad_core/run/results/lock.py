@@ -17,11 +17,11 @@ from typing_extensions import override
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import disk_errors
 
-#: The file that is locked. It stays when its process is gone; then nobody holds the lock on it.
+#: The file that is locked. It stays when its process is gone; then no process holds the lock on it.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
-# Windows locks ranges of bytes, which nobody else can read: one far behind the content.
+# Windows locks ranges of bytes, which no other process can read: one far behind the content.
 _FAR = 2**30
 
 
@@ -91,7 +91,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
 
 def writer_of(folder: Path) -> str | None:
-    """Which process writes into the folder now; None where none does, or nobody can tell."""
+    """Which process writes into the folder now; None where none does, or it cannot be told."""
     try:
         with (folder / FILE).open("r+b") as file:
             return _named(_read(file)) if _take(file) == "by another" else None
@@ -113,7 +113,7 @@ def _named(holder: Holder | None) -> str:
 
 
 def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:
-    """Who has the lock after we tried to take it; nobody where the file system knows no locks."""
+    """Who has the lock after we tried to take it; no process on file systems without locks."""
     try:
         _lock(file)
     except OSError as error:

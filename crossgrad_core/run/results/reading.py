@@ -1,4 +1,4 @@
-"""What runs wrote, read back to be compared: configuration, metrics.csv, summary.json, views.
+"""Reads results back to compare them: configuration, metrics.csv, summary.json, views.
 
 Imports no torch, so that a table of many runs is there at once.
 """

@@ -1,4 +1,4 @@
-"""What a run has cost so far."""
+"""The cost of a run so far."""
 
 from dataclasses import dataclass
 

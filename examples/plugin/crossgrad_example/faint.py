@@ -1,4 +1,4 @@
-"""What has become transparent is removed; nothing is added."""
+"""Removes Gaussians that have become transparent; adds none."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""What the wrapper does to the operator's answer."""
+"""The wrapper's effect on the operator's answer."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What is promised of each operator, and on which set: the one place that says so.
+"""The promises of each operator, and the set on which they hold: the one place that says so.
 
 Inside the set the relative error is at most `PROMISED` u kappa, u the unit roundoff of the
 gradients' type and kappa = max |w_k| |g_k| / |u|; outside the result is finite and at most a stated

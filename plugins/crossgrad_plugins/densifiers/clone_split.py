@@ -1,4 +1,4 @@
-"""What the densifiers of the 3DGS family share: clone, split, prune, opacity reset."""
+"""Edits of the 3DGS family of densifiers: clone, split, prune, opacity reset."""
 
 from abc import abstractmethod
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What the cameras alone say, and how the result depends on the grouping."""
+"""Diagnostics of the cameras alone, and how they depend on the grouping."""
 
 from collections.abc import Iterator, Mapping
 

@@ -1,4 +1,4 @@
-"""What `crossgrad diagnose` does: a model, its probes, the report."""
+"""`crossgrad diagnose`: a model, its probes, the report."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

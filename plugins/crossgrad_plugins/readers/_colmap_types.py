@@ -1,4 +1,4 @@
-"""What a COLMAP model holds, as it is in its files."""
+"""A COLMAP model as it stands in its files."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

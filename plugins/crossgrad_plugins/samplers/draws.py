@@ -44,7 +44,7 @@ class Deck:
         return drawn + fresh, Deck(fresh + rest, missing)
 
     def to_json(self) -> dict[str, Json]:
-        """The deck as plain data; the order is shared, not copied, for nobody ever changes it."""
+        """The deck as plain data; the order is shared, not copied: it never changes."""
         return {"order": cast("list[Json]", self.order), "dealt": self.dealt}
 
     @staticmethod

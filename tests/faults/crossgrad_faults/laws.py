@@ -25,7 +25,7 @@ def parses(folder: Path) -> None:
 
 
 def is_scratch(path: Path) -> bool:
-    """Whether a name says that its file or folder is not finished; nobody takes it for a result."""
+    """Whether a name says that its file or folder is not finished; it counts as no result."""
     return any(part.startswith((".", "scratch")) for part in path.parts)
 
 

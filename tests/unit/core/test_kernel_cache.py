@@ -123,7 +123,7 @@ def test_a_change_of_what_the_kernel_holds_is_noticed_and_the_old_file_goes(pack
 
 
 def blocked(folder: Path) -> Path:
-    """A path that no folder can be made at, whoever asks (root may write to any folder)."""
+    """A path that no folder can be made at, not even by root, who may write to any folder."""
     folder.parent.mkdir(exist_ok=True)
     folder.touch()
     return folder

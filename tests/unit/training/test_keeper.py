@@ -74,7 +74,7 @@ def of_model(self, model):
     self.spring(model.phase.step)
 
 
-#: Before parameters change only the step under way is lost. While they change, the way back is to
+#: Before parameters change only the step under way is lost. While they change, training returns to
 #: the copy that was made with the last checkpoint. Afterwards nothing is lost.
 BEFORE, WHILE, AFTERWARDS = FAILS_IN - 1, FAILS_IN - FAILS_IN % SAVE_EVERY, FAILS_IN
 HOOKS = [

@@ -1,4 +1,4 @@
-"""What the fused decoding takes, and what it keeps for the backward pass."""
+"""Arguments of the fused decoding, and the values kept for its backward pass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

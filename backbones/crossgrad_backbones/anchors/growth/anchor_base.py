@@ -1,4 +1,4 @@
-"""What the densifiers of anchors share: statistics, pruning and the edit that adds anchors."""
+"""Base of the densifiers of anchors: statistics, pruning and the edit that adds anchors."""
 
 from abc import abstractmethod
 from collections.abc import Mapping

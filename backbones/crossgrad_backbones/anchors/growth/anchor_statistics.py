@@ -1,4 +1,4 @@
-"""What growing and pruning of anchors know: running sums per anchor and per offset."""
+"""Statistics for growing and pruning anchors: running sums per anchor and per offset."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""What is to be said about an operator's results on a batch."""
+"""Examines an operator's results on a batch."""
 
 from dataclasses import dataclass, replace
 from typing import Final

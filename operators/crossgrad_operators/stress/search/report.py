@@ -1,4 +1,4 @@
-"""What a search found, as text."""
+"""The report of a search, as text."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the search knows of an operator."""
+"""An operator as the search sees it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

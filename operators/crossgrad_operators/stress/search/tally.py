@@ -1,4 +1,4 @@
-"""What a search has found of one operator in one precision."""
+"""Findings of a search for one operator in one precision."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""What is trained."""
+"""A backbone: the trained representation."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""What a camera does to light between render and photo."""
+"""An exposure: between the render and the photo of a camera."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""What watches a run."""
+"""An observer of a run."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""What draws Gaussians."""
+"""A rasterizer."""
 
 from typing import ClassVar, cast
 

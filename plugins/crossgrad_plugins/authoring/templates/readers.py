@@ -1,4 +1,4 @@
-"""What reads a scene."""
+"""A reader of scenes."""
 
 import json
 from collections.abc import Mapping

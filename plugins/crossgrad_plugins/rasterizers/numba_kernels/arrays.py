@@ -1,4 +1,4 @@
-"""What goes into and comes out of a render, as plain arrays."""
+"""Inputs and outputs of a render, as plain arrays."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What the backward passes keep of each pixel of a tile, in segments of eight, and their step."""
+"""Pixel states of the backward passes in segments of eight of a tile, and their step."""
 
 import numpy as np
 from numpy.typing import NDArray

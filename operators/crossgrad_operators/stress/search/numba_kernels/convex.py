@@ -37,7 +37,7 @@ Solved: TypeAlias = tuple[Floats, NDArray[np.float64]]
 NOISE = 2e-12
 #: 1 + cos up to which two directions are opposite.
 OPPOSITE = 1e-12
-#: What 32 digits leave of a sum of more directions that is zero; up to `UNSURE` nobody knows.
+#: What 32 digits leave of a sum of more directions that is zero; up to `UNSURE` it is open.
 VANISHED, UNSURE = 1e-28, 1e-24
 #: Steps of CAGrad's one-dimensional search.
 STEPS = 60
