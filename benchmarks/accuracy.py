@@ -62,7 +62,7 @@ def draw(
     name: str, case: dict[str, Any], dtype: torch.dtype, options: dict[str, float]
 ) -> dict[str, Tensor]:
     """Renders a case and its gradients: image, alpha, pixels and each of `GRADIENTS`."""
-    rasterizer = cast("Rasterizer", build("rasterizers", name, options))
+    rasterizer = build(Rasterizer, name, options)
     tensors = [torch.from_numpy(case[key]).to(dtype).requires_grad_() for key in INPUTS]
     outputs = frozenset({"pixels", "abs_gradient"})
     background = torch.zeros(3, dtype=dtype)

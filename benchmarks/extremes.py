@@ -8,7 +8,6 @@ of a parameter tensor. Both of the `numba` rasterizer in float32 against `torch`
 
 import argparse
 import json
-from typing import cast
 
 import torch
 from _machine import facts
@@ -40,7 +39,7 @@ def main() -> None:
     names = arguments.backbones or sorted(entries("backbones"))
     print("| case | " + " | ".join(names) + " |")
     print("|" + "---|" * (len(names) + 1))
-    models = [cast("Backbone", build("backbones", name, {})) for name in names]
+    models = [build(Backbone, name, {}) for name in names]
     for case in cases(arguments.crowd):
         cells = [cell(model, case, arguments.crowd) for model in models]
         print(f"| {case} | " + " | ".join(cells) + " |", flush=True)

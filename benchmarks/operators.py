@@ -55,7 +55,7 @@ def main() -> None:
     arguments = _arguments()
     configure_threads()
     names = arguments.operators or list(entries("operators"))
-    operators = {name: cast("Operator", build("operators", name, {})) for name in names}
+    operators = {name: build(Operator, name, {}) for name in names}
     lines: dict[str, dict[str, Any]] = {name: {"operator": name} for name in operators}
     for views in (2, 4):
         for name, result in _measured(operators, views, arguments).items():

@@ -13,7 +13,7 @@ import json
 import statistics
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numba
 import numpy as np
@@ -44,7 +44,7 @@ def main() -> None:
     with np.load(arguments.case) as archive:
         case = dict(archive)
     options = {key: getattr(arguments, key) for key in ("max_alpha", "near", "dilation")}
-    rasterizer = cast("Rasterizer", build("rasterizers", arguments.rasterizer, options))
+    rasterizer = build(Rasterizer, arguments.rasterizer, options)
     tensors = {key: torch.from_numpy(case[key]).requires_grad_() for key in INPUTS}
     forwards, backwards = [], []
     for _ in range(arguments.reps + 1):

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.commands import load_command, summary
-from crossgrad_core.registry.entries import Entry, entries, load_entry, offers
+from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.blocks import Block
-    from crossgrad_core.contract.component import Component
     from crossgrad_core.contract.contexts import Model
     from crossgrad_core.contract.gradients import SeparateGradients
     from crossgrad_core.contract.scene import Scene, View
@@ -126,16 +124,7 @@ def names(slot: str) -> list[str]:
     Raises:
         KeyError: There is no such slot.
     """
-    return list(registry.entries(slot))
-
-
-def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
-    """The component of that name with validated options.
-
-    Raises:
-        UserError: There is none, it cannot be imported, or an option is wrong.
-    """
-    return registry.build(slot, name, options)
+    return list(entries(slot))
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
 from inspect import isabstract
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from importlib.metadata import Distribution
 
     from crossgrad_core.contract.component import Component
+
+    #: The base class of a slot.
+    C = TypeVar("C", bound=Component)
 
 _BASES: Final[dict[str, str]] = {
     "backbones": "crossgrad_core.contract.backbone:Backbone",
@@ -109,14 +112,22 @@ def find(slot: str, name: str) -> Entry:
     return found[0]
 
 
-def load(slot: str, name: str) -> "type[Component]":
+@overload
+def load(slot: "type[C]", name: str) -> "type[C]": ...
+@overload
+def load(slot: str, name: str) -> "type[Component]": ...
+def load(slot: "str | type[Component]", name: str) -> "type[Component]":
     """The class that fills a slot under a name; imports its module.
+
+    Args:
+        slot: Name of the slot, or its base class, which the answer is a subclass of.
+        name: Name of the plugin.
 
     Raises:
         UserError: The name is unknown or ambiguous, the plugin fails to import, or what it offers
             is no complete subclass of the slot's base class.
     """
-    return load_entry(find(slot, name))
+    return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
 
 def load_entry(entry: Entry) -> "type[Component]":
@@ -148,8 +159,17 @@ def resolve_entry(entry: Entry) -> object:
         ) from error
 
 
-def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
+@overload
+def build(slot: "type[C]", name: str, options: Mapping[str, Any]) -> "C": ...
+@overload
+def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component": ...
+def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) -> "Component":
     """The component of that name with validated options.
+
+    Args:
+        slot: Name of the slot, or its base class, which the answer is an instance of.
+        name: Name of the plugin.
+        options: Name of an option -> value.
 
     Raises:
         UserError: See `load`; or an option is unknown, missing or out of bounds.
@@ -159,6 +179,7 @@ def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component":
     from crossgrad_core.registry.validation import as_user_error
 
     component = load(slot, name)
+    slot = component.slot
     word = singular(slot)
     try:
         return component.model_validate(dict(options))

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol
 
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.errors import UserError
@@ -187,7 +187,7 @@ def _exporter(setup: Setup, name: str | None) -> Exporter:
     """The exporter of that name, with the run's own options where it is the run's."""
     if name is None or name == setup.selection.names["exporter"]:
         return setup.selection.exporter
-    return cast("Exporter", build("exporters", name, {}))
+    return build(Exporter, name, {})
 
 
 @contextmanager

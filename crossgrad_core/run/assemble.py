@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar
 
 import torch
 
@@ -18,6 +18,7 @@ from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.objections import objections_to
+from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
@@ -40,6 +41,8 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed, plural
 
 _LOG = logging.getLogger(__name__)
+#: The base class of a slot.
+C = TypeVar("C", bound=Component)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
 #: Up to which K one that suits both sampler and operator is looked for.
@@ -60,11 +63,11 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     _LOG.info("reading scene %s", path)
     names = [config.reader.name] if config.reader.name != AUTO else list(entries("readers"))
     for name in names:
-        reader = cast("Reader", build("readers", name, config.reader.options))
+        reader = build(Reader, name, config.reader.options)
         if config.reader.name != AUTO or reader.accepts(path):
             return reader.read(path, config.reading), name
     # No reader recognises it: the default one explains what it misses.
-    reader = cast("Reader", build("readers", READER, {}))
+    reader = build(Reader, READER, {})
     return reader.read(path, config.reading), READER
 
 
@@ -139,7 +142,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     """
     config = _with_first_degree(config)
     selection, notes = select(config, scene, reader)
-    observers = {choice.name: _built("observers", choice) for choice in config.observers}
+    observers = {choice.name: _built(Observer, choice) for choice in config.observers}
     plugins = _plugins(selection, observers)
     manager = make_manager(plugins)
     answers = manager.hook.crossgrad_objections(selection=selection)
@@ -181,13 +184,13 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     _require_points(config, scene)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
-    sampler = cast("Sampler", _built("samplers", config.sampler))
+    sampler = _built(Sampler, config.sampler)
     operator, operator_name = _operator(config)
-    backbone = cast("Backbone", _built("backbones", config.backbone))
+    backbone = _built(Backbone, config.backbone)
     backbone, left_out = backbone.fitted_to(scene)
     notes += left_out
     densifier_choice = _or_default(config.densifier, backbone.default_densifier)
-    densifier = cast("Densifier", _built("densifiers", densifier_choice))
+    densifier = _built(Densifier, densifier_choice)
     wanted = Wanted(
         device=device.type,
         response=backbone.response,
@@ -196,10 +199,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     )
     rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
     notes += choosing
-    rasterizer = cast(
-        "Rasterizer",
-        build("rasterizers", rasterizer_name, _rasterizer_options(config, scene, rasterizer_name)),
-    )
+    options = _rasterizer_options(config, scene, rasterizer_name)
+    rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.views_per_step or _usual_views(sampler, operator, notes)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     names = {
@@ -216,7 +217,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     }
     grouping = None
     if grouping_choice is not None:
-        grouping = cast("Grouping", _built("groupings", grouping_choice))
+        grouping = _built(Grouping, grouping_choice)
         names["grouping"] = grouping_choice.name
     selection = Selection(
         backbone=backbone,
@@ -224,10 +225,10 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         operator=operator,
         densifier=densifier,
         rasterizer=rasterizer,
-        loss=cast("Loss", _built("losses", config.loss)),
-        exposure=cast("Exposure", _built("exposures", config.exposure)),
-        resolution=cast("Resolution", _built("resolutions", config.resolution)),
-        exporter=cast("Exporter", _built("exporters", config.exporter)),
+        loss=_built(Loss, config.loss),
+        exposure=_built(Exposure, config.exposure),
+        resolution=_built(Resolution, config.resolution),
+        exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene),
         names=names,
         views_per_step=views,
@@ -246,7 +247,7 @@ def _require_points(config: RunConfig, scene: Scene) -> None:
         )
 
 
-def _built(slot: str, choice: ComponentChoice) -> Component:
+def _built(slot: type[C], choice: ComponentChoice) -> C:
     return build(slot, choice.name, choice.options)
 
 
@@ -256,7 +257,7 @@ def _metrics(config: RunConfig, scene: Scene) -> dict[str, Metric]:
     Raises:
         UserError: Two columns of metrics.csv would have one name.
     """
-    metrics = {each.name: cast("Metric", _built("metrics", each)) for each in config.metrics}
+    metrics = {each.name: _built(Metric, each) for each in config.metrics}
     regimes = sorted({view.regime for view in scene.test_views})
     columns = columns_for(regimes, [metric.figure for metric in metrics.values()])
     if twice := sorted({name for name in columns if columns.count(name) > 1}):
@@ -279,10 +280,10 @@ def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
 def _operator(config: RunConfig) -> tuple[Operator, str]:
     links = config.operators
     if len(links) == 1:
-        return cast("Operator", _built("operators", links[0])), links[0].name
-    built = tuple(_built("operators", link) for link in links)
-    chain = build("operators", CHAIN, {"links": built})
-    return cast("Operator", chain), "+".join(link.name for link in links)
+        return _built(Operator, links[0]), links[0].name
+    built = tuple(_built(Operator, link) for link in links)
+    chain = build(Operator, CHAIN, {"links": built})
+    return chain, "+".join(link.name for link in links)
 
 
 def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Which rasterizer draws where the user names none."""
 
 from dataclasses import dataclass
-from typing import cast
 
 from crossgrad_core.config import AUTO
 from crossgrad_core.contract.gaussians import Response
@@ -70,7 +69,7 @@ def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:
     notes = []
     for name in entries("rasterizers"):
         try:
-            rasterizer = cast("type[Rasterizer]", load("rasterizers", name))
+            rasterizer = load(Rasterizer, name)
         except UserError as error:
             notes.append(f"rasterizer {name} left out: {error.what}")
             continue

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -79,7 +78,7 @@ class DensifierRun:
     def context(self, step: int, room: int = _ROOM) -> DensifyContext:
         """What the densifier is offered at a step in which two views were rendered."""
         fields = {**step_fields(step), "rng": self.rng}
-        rasterizer = cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {}))
+        rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
         return DensifyContext(
             **fields,
             parameters=self.parameters,
@@ -176,7 +175,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 def _backbones() -> Iterator[Backbone]:
     for name in sorted(entries("backbones"), key=lambda each: (each != BACKBONE, each)):
         try:
-            yield cast("Backbone", build("backbones", name, {}))
+            yield build(Backbone, name, {})
         except UserError:
             # A broken backbone of another package is not this densifier's fault.
             continue

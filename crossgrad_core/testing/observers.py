@@ -158,13 +158,13 @@ def seams_stay_answered(make: Make[Observer]) -> None:
 
 def _model(step: int) -> Model:
     """The model of a new run on the sample scene."""
-    backbone = cast("Backbone", build("backbones", BACKBONE, {}))
+    backbone = build(Backbone, BACKBONE, {})
     parameters = created(backbone)
     return Model(
         phase=sample_phase(step),
         scene=sample_scene(),
         backbone=backbone,
-        rasterizer=cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, {})),
+        rasterizer=build(Rasterizer, REFERENCE_RASTERIZER, {}),
         parameters=parameters,
         adam=AdamState(
             exp_avg={name: torch.zeros_like(tensor) for name, tensor in parameters.items()},
@@ -172,7 +172,7 @@ def _model(step: int) -> Model:
             steps=dict.fromkeys(parameters, step),
         ),
         background=torch.zeros(3),
-        loss=cast("Loss", build("losses", LOSS, {})),
+        loss=build(Loss, LOSS, {}),
         groups=None,
     )
 
@@ -184,7 +184,7 @@ def _seams(hooks: Hooks, step: int) -> list[Answer]:
     sample = SampleContext(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=None
     )
-    quiet = cast("Densifier", build("densifiers", NO_DENSIFIER, {}))
+    quiet = build(Densifier, NO_DENSIFIER, {})
     return [
         call_seam(hooks.crossgrad_sample_views, sample, Sampled),
         call_seam(

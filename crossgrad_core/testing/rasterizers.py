@@ -1,7 +1,7 @@
 """Contract checks of rasterizers: shapes, gradients, statistics, the common rule set."""
 
 from dataclasses import fields, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -199,7 +199,7 @@ def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
     """Image and gradients agree with rasterizer `torch`, the readable form of the rule set."""
     rasterizer = make()
     shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
-    reference = cast("Rasterizer", build("rasterizers", REFERENCE_RASTERIZER, shared))
+    reference = build(Rasterizer, REFERENCE_RASTERIZER, shared)
     for harmonics in (False, True):
         ours = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
         theirs = _moved(sample_gaussians(harmonics=harmonics), torch.device("cpu"))

@@ -1,7 +1,6 @@
 """Renders on request without a run, for contexts of checks and tests."""
 
 from collections.abc import Mapping
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -26,7 +25,7 @@ def renders_of(
     parameters: Mapping[str, Tensor],
 ) -> RenderOnRequest:
     """What a context offers as `render`, over black, without an exposure, with the usual loss."""
-    loss = cast("Loss", build("losses", LOSS, {}))
+    loss = build(Loss, LOSS, {})
 
     def render(
         view: int,

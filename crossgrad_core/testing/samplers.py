@@ -1,7 +1,6 @@
 """Contract checks of samplers."""
 
 from functools import cache
-from typing import cast
 
 import numpy as np
 
@@ -32,7 +31,7 @@ _PATIENCE = 400
 @cache
 def _groups(grouping: str) -> tuple[str, ...]:
     scene = sample_scene()
-    rule = cast("Grouping", build("groupings", grouping, {}))
+    rule = build(Grouping, grouping, {})
     return rule.fit(scene, np.random.default_rng(0)).labels(scene.train_views)
 
 

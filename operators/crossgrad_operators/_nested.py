@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Annotated, Any, TypeAlias, cast
+from typing import Annotated, Any, TypeAlias
 
 from pydantic import BeforeValidator, PlainSerializer
 
@@ -30,7 +30,7 @@ def operator_of(value: object) -> MatrixOperator:
     if not isinstance(value, Mapping) or "name" not in value:
         raise ValueError("must be an operator's name, or a name with options")
     options = {key: option for key, option in value.items() if key != "name"}
-    return _checked(cast("Operator", build_component("operators", str(value["name"]), options)))
+    return _checked(build_component(Operator, str(value["name"]), options))
 
 
 def _checked(operator: Operator) -> MatrixOperator:

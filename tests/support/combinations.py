@@ -11,7 +11,7 @@ import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import combinations, product
-from typing import Any, Final, TypeAlias, cast
+from typing import Any, Final, TypeAlias
 
 from support.pairwise import Row
 
@@ -60,8 +60,8 @@ def config_of(row: Row) -> RunConfig:
 def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int | None:
     """The smallest K above 1 that both admit, so that operators have something to do."""
     counts = (
-        cast("Sampler", build("samplers", sampler.name, sampler.options)).view_counts,
-        cast("Operator", build("operators", operator.name, operator.options)).views,
+        build(Sampler, sampler.name, sampler.options).view_counts,
+        build(Operator, operator.name, operator.options).views,
     )
     both = (k for k in range(2, 7) if all(each.admits(k) for each in counts))
     return next(both, None)

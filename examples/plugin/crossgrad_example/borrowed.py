@@ -1,6 +1,6 @@
 """Another rasterizer under a name of one's own: a place to put faster kernels."""
 
-from typing import ClassVar, cast
+from typing import ClassVar
 
 from torch import Tensor
 from typing_extensions import override
@@ -35,5 +35,5 @@ class Borrowed(Rasterizer):
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
         options = self.model_dump(include=set(Rasterizer.model_fields))
-        reference = cast("Rasterizer", build_component("rasterizers", self.by, options))
+        reference = build_component(Rasterizer, self.by, options)
         return reference.render(gaussians, camera, background, outputs)

@@ -1,7 +1,7 @@
 """The whole suite: every operator on every case, and every law."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
 from crossgrad_core.commands import build
 from crossgrad_core.commands import names as installed_names
@@ -22,7 +22,7 @@ def installed() -> list[str]:
 
 def made(name: str) -> Operator:
     """An operator with the options under which the suite runs it."""
-    return cast("Operator", build("operators", name, OPTIONS.get(name, {})))
+    return build(Operator, name, OPTIONS.get(name, {}))
 
 
 def run_suite(

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -137,7 +136,7 @@ def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
 def _write_signature(model: Model, path: Path, seed: int) -> str:
     """Writes the labels of `conflict-signature` for grouping `lists`."""
     scene = model.scene
-    grouping = cast("Grouping", build("groupings", "conflict-signature", {}))
+    grouping = build(Grouping, "conflict-signature", {})
     rng = np.random.default_rng(seed)
     rule = grouping.fit(scene, rng, ModelProbe(model, rng))
     lines = [f"{view.name},{rule.label(view)}" for view in scene.views]

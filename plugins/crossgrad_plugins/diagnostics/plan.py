@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ def labelled(scene: Scene, grouping: str, seed: int) -> tuple[tuple[str, ...], t
     Raises:
         UserError: There is no such grouping, or it cannot group this scene.
     """
-    component = cast("Grouping", build("groupings", grouping, {}))
+    component = build(Grouping, grouping, {})
     rule = component.fit(scene, np.random.default_rng(seed))
     return rule.labels(scene.train_views), rule.notes
 

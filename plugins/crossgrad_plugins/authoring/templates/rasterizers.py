@@ -1,6 +1,6 @@
 """A rasterizer."""
 
-from typing import ClassVar, cast
+from typing import ClassVar
 
 from torch import Tensor
 from typing_extensions import override
@@ -28,5 +28,5 @@ class Template(Rasterizer):
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
         options = self.model_dump(include=set(Rasterizer.model_fields))
-        reference = cast("Rasterizer", build_component("rasterizers", REFERENCE, options))
+        reference = build_component(Rasterizer, REFERENCE, options)
         return reference.render(gaussians, camera, background, outputs)
