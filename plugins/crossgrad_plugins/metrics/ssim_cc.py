@@ -4,8 +4,9 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Compared, Figure, Metric, ssim
+from crossgrad_core.plugin import Compared, Figure, Metric
 from crossgrad_plugins.metrics.color_correction import DEFINITION, color_corrected
+from crossgrad_plugins.metrics.similarity import ssim
 
 
 class ColorCorrectedSSIM(Metric):

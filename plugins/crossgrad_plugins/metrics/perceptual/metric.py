@@ -1,4 +1,4 @@
-"""What all LPIPS figures do: they need files of weights, and are null without."""
+"""Base of the LPIPS figures: files of weights, and null with a reason without them."""
 
 from abc import abstractmethod
 from dataclasses import replace
