@@ -17,11 +17,14 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
+from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
+from crossgrad_core.system.interrupts import exit_code, listened_to, tell
 from crossgrad_core.system.progress import Progress
-from crossgrad_core.system.startup import announce
+from crossgrad_core.system.startup import announce, finish
 from crossgrad_core.system.tables import write_table
+from crossgrad_core.system.terminal import is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder
@@ -63,19 +66,30 @@ __all__ = [
     "affordable_steps",
     "announce",
     "assemble",
+    "assemble_new",
+    "available_cores",
+    "available_memory",
     "begin",
     "build",
     "check_file",
     "check_folder",
+    "chosen",
     "configured",
     "did_you_mean",
     "disk_errors",
     "entries",
+    "exit_code",
     "find_runs",
+    "fingerprint",
+    "finish",
     "gathered",
+    "is_live",
+    "layered",
     "listed",
+    "listened_to",
     "load_command",
     "load_entry",
+    "locked",
     "model_of",
     "names",
     "offers",
@@ -87,14 +101,20 @@ __all__ = [
     "read_results",
     "read_rows",
     "read_scene",
+    "read_settings",
+    "resolved",
     "sentences",
     "singular",
     "summary",
+    "summary_of",
     "take_steps",
+    "tell",
     "view_gradients",
     "with_steps",
     "write_atomically",
+    "write_settings",
     "write_table",
+    "writer_of",
 ]
 
 #: Exit code of a command whose training failed.
@@ -127,6 +147,53 @@ def names(slot: str) -> list[str]:
     return list(entries(slot))
 
 
+def read_settings(path: Path, what: str, todo: str) -> dict[str, Any]:
+    """The mapping in a YAML file, read as configuration files are.
+
+    Args:
+        path: The file.
+        what: What cannot be read, should it be so, such as `the grid`.
+        todo: What to do about it.
+
+    Raises:
+        UserError: The file is missing, not YAML, or holds something else than a mapping.
+    """
+    from crossgrad_core.system.yaml_values import read_mapping
+
+    return read_mapping(path, what, todo)
+
+
+def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
+    """Writes settings as a configuration file, for `crossgrad run --config`.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
+    """
+    from crossgrad_core.run.migration import marked
+    from crossgrad_core.system.yaml_values import write_yaml
+
+    write_atomically(path, write_yaml(marked(settings)).encode())
+
+
+def layered(
+    layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Settings of which the later ones win over the earlier ones, in their long form.
+
+    Args:
+        layers: What the options of `crossgrad run` or the keys of a configuration file are called
+            -> value. A layer that chooses another component drops the options that earlier layers
+            gave to the one before; a length replaces that of earlier layers.
+        assignments: `KEY=VALUE` texts as after `--set`, which win over all layers.
+
+    Raises:
+        UserError: An assignment, or a key with a dot, makes no sense.
+    """
+    from crossgrad_core.run import settings
+
+    return settings.layered(layers, assignments)
+
+
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
     """The configuration that `crossgrad run` would have, with scene and length filled in.
 
@@ -140,6 +207,33 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
     from crossgrad_core.run.opening import parsed
 
     return with_defaults(parsed(settings))
+
+
+def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
+    """Slot and choice of each component that a configuration names, links of a chain one by one."""
+    from crossgrad_core.config import AUTO, ComponentChoice
+
+    found: list[tuple[str, ComponentChoice]] = []
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        choices = value if isinstance(value, tuple) else (value,)
+        slot = name if name in LISTS else plural(name)
+        found += [(slot, each) for each in choices if isinstance(each, ComponentChoice)]
+    return [(slot, choice) for slot, choice in found if choice.name != AUTO]
+
+
+def fingerprint(scene: "Scene", config: "RunConfig") -> str:
+    """A digest of what a scene is known by, wherever it lies: cameras, split, points, files.
+
+    Raises:
+        UserError: A photo or mask cannot be read.
+    """
+    from hashlib import sha256
+
+    from crossgrad_core.scene.fingerprint import fingerprint_of
+
+    marks = fingerprint_of(scene, config.scene or Path())
+    return sha256(marks.model_dump_json().encode()).hexdigest()
 
 
 def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
@@ -173,6 +267,60 @@ def assemble(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     from crossgrad_core.run import assemble as assembling
 
     return assembling.assemble(config, scene, reader)
+
+
+def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
+    """As `assemble`, and refuses what a new run refuses: settings and labels that do nothing.
+
+    Raises:
+        UserError: As `assemble`, or a setting would change nothing.
+    """
+    from crossgrad_core.run import settings_for_nothing as nothing
+
+    setup = assemble(config, scene, reader)
+    nothing.refuse_labels_for_nothing(setup)
+    nothing.refuse_settings_for_nothing(config, setup)
+    return setup
+
+
+def resolved(setup: "Setup") -> dict[str, Any]:
+    """The configuration that a run would write: components with all options, as plain data."""
+    from crossgrad_core.run import resolve
+
+    return resolve.resolved(setup).model_dump(mode="json")
+
+
+def available_cores() -> tuple[int, ...]:
+    """The numbers of the cores that this process may use, as many as its container's quota."""
+    import os
+
+    from crossgrad_core.numerics import threads
+
+    count = threads.available_cores()
+    affinity = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(count)
+    return tuple(affinity[:count])
+
+
+def available_memory() -> int | None:
+    """Bytes of memory that can still be taken; None where the system does not say."""
+    import torch
+
+    from crossgrad_core.training.memory import available_bytes
+
+    return available_bytes(torch.device("cpu"))
+
+
+def summary_of(folder: Path) -> dict[str, Any] | None:
+    """The content of a run's summary.json; None before the run has ended, or where it is damaged.
+
+    Imports no torch.
+    """
+    from crossgrad_core.run.results.summary import read_summary
+
+    try:
+        return read_summary(folder)
+    except UserError:
+        return None
 
 
 def with_steps(setup: "Setup", steps: int) -> "Setup":

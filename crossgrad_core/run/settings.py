@@ -5,6 +5,7 @@ it: unknown keys and values out of bounds are found there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -27,6 +28,8 @@ ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
 #: Settings that say how long a run is.
 LENGTHS: Final = (("steps",), ("seconds",), ("revisions",))
+#: Settings that hold settings.
+GROUPS_OF_SETTINGS: Final = ("reading",)
 _FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")
 #: Options of the command line -> their setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}
@@ -46,20 +49,68 @@ def merged(
     Raises:
         UserError: The file cannot be read, or an assignment makes no sense.
     """
-    settings = {} if config is None else _of_file(config)
-    chosen = {
+    chosen = _places(options)
+    assigned = list(map(_parsed, assignments))
+    settings = _overlaid({} if config is None else _of_file(config), chosen, assigned)
+    return _named_by_default(settings)
+
+
+def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
+    """Settings of which the later ones win over the earlier ones.
+
+    Args:
+        layers: Option name or key of a configuration file -> value; a layer that chooses another
+            component drops the options that earlier layers gave to the one before, and a length
+            replaces that of earlier layers.
+        assignments: `KEY=VALUE` texts, values in YAML, which win over all layers.
+
+    Raises:
+        UserError: An assignment makes no sense.
+    """
+    settings: Settings = {}
+    for layer in layers:
+        settings = _overlaid(settings, _places(_flat(deepcopy(layer))), [])
+    settings = _overlaid(settings, {}, list(map(_parsed, assignments)))
+    return _named_by_default(settings)
+
+
+def _flat(layer: Mapping[str, object]) -> Settings:
+    """The layer with one entry for each setting of a group, which is no component: `reading`."""
+    flat: Settings = {}
+    for name, value in layer.items():
+        if name in GROUPS_OF_SETTINGS and isinstance(value, dict):
+            flat |= {f"{name}.{inner}": each for inner, each in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
+    """Place of a setting -> what the user gave; None and empty lists stand for nothing."""
+    return {
         _PLACES.get(name, tuple(name.split("."))): _plain(value)
         for name, value in options.items()
         if not (value is None or (isinstance(value, list) and not value))
     }
-    assigned = list(map(_parsed, assignments))
+
+
+def _overlaid(
+    settings: Settings,
+    chosen: Mapping[tuple[str, ...], object],
+    assigned: Sequence[tuple[tuple[str, ...], object]],
+) -> Settings:
+    """The settings with those that were given later."""
     if any(path in LENGTHS for path in (*chosen, *(path for path, _ in assigned))):
-        # A new length replaces that of the file as a whole.
+        # A new length replaces the earlier one as a whole.
         settings = {key: value for key, value in settings.items() if (key,) not in LENGTHS}
     # Names first: choosing another component drops the options of the one it replaces.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
             _assign(settings, path, value)
+    return settings
+
+
+def _named_by_default(settings: Settings) -> Settings:
     return {key: _with_default_name(key, value) for key, value in settings.items()}
 
 

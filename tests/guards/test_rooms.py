@@ -34,6 +34,7 @@ PLACES = {
     # Checks packages, and writes one for each slot, readers and tests included.
     "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
     "crossgrad_plugins.diagnostics": COMMAND_ROOMS,
+    "crossgrad_plugins.sweep": COMMAND_ROOMS,
     "crossgrad_operators.stress": COMMAND_ROOMS,
 }
 #: Files at the top of the core.

@@ -1,0 +1,205 @@
+"""What `crossgrad sweep` does."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crossgrad_core.commands import (
+    FAILED,
+    UserError,
+    check_folder,
+    exit_code,
+    finish,
+    locked,
+    writer_of,
+)
+from crossgrad_plugins.sweep.engines import Stop, Work, engine
+from crossgrad_plugins.sweep.estimate import estimated
+from crossgrad_plugins.sweep.grid import Grid, read_grid, with_scenes
+from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.machine import Machine, divided
+from crossgrad_plugins.sweep.plan import planned
+from crossgrad_plugins.sweep.records import read_records
+from crossgrad_plugins.sweep.screen import Screen
+from crossgrad_plugins.sweep.standing import Standing, standings
+from crossgrad_plugins.sweep.stopping import noted
+from crossgrad_plugins.sweep.summary import listing, table, write_plan
+from crossgrad_plugins.sweep.watch import Watch
+
+#: Where sweeps are kept, below the working folder.
+SWEEPS = Path("runs/sweeps")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for.
+
+    Attributes:
+        path: The grid file.
+        out: Folder of the sweep.
+        scenes: Scenes instead of those of the grid.
+        seeds: Seeds instead of those of the grid.
+        assignments: `KEY=VALUE` texts that win over the grid.
+        workers: Runs at a time.
+        threads: Threads of a run.
+        memory: GiB that a run may take.
+        engine: Name of the engine.
+        options: Its options.
+    """
+
+    path: Path
+    out: Path | None = None
+    scenes: Sequence[Path] = ()
+    seeds: Sequence[int] = ()
+    assignments: Sequence[str] = ()
+    workers: int | None = None
+    threads: int = 1
+    memory: float | None = None
+    engine: str = "local"
+    options: Sequence[tuple[str, str]] = ()
+
+
+class Sweep:
+    """A sweep: its runs and its folder.
+
+    Args:
+        request: What the user asked for.
+        looks_only: Whether nothing is going to be run.
+
+    Raises:
+        UserError: The grid is bad, this machine is too small, or another sweep is under way in the
+            folder.
+    """
+
+    def __init__(self, request: Request, *, looks_only: bool = False) -> None:
+        self.request = request
+        grid = _grid(request)
+        self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
+        if not looks_only:  # Before the work of planning; the lock itself comes after it.
+            _refuse_a_second(self.layout.out)
+        self.plan = planned(grid, request.path, request.assignments)
+        finish()
+        self.machine: Machine | None = None
+        if request.engine == "local":
+            self.machine = divided(request.workers, request.threads, request.memory)
+
+    @property
+    def at_a_time(self) -> int:
+        """How many runs are trained at a time, as far as that is known."""
+        return len(self.machine.cores) if self.machine else self.request.workers or 1
+
+    def standings(self, *, alive: bool) -> tuple[Standing, ...]:
+        """How far the runs are, where a sweep is under way in the folder or not."""
+        return standings(
+            self.plan.jobs, self.layout, read_records(self.layout.records), alive=alive
+        )
+
+    def tell(self) -> int:
+        """Prints how far each run is, and the table of what is finished."""
+        found = self.standings(alive=writer_of(self.layout.out) is not None)
+        _say(listing(self.plan.cells, found))
+        _say(["", *table(self.plan.cells, found, self.plan.grid.metric)])
+        return 0
+
+    def foretell(self) -> int:
+        """Prints the runs that would be carried out, and how long that takes."""
+        found = self.standings(alive=writer_of(self.layout.out) is not None)
+        left = [each for each in found if each.state != "finished"]
+        ids = {each.job.id for each in left}
+        _say(listing([cell for cell in self.plan.cells if cell.id in ids], found))
+        _say([self._forecast(left)])
+        return 0
+
+    def carry_out(self) -> int:
+        """Carries out what is not finished.
+
+        Returns:
+            The exit code: 0 where all runs are finished, 1 where one failed, 128 and the number of
+            the signal that stopped the sweep.
+
+        Raises:
+            UserError: Another sweep is under way in the folder, or it cannot be written to.
+        """
+        check_folder(self.layout.out)
+        self.layout.make()
+        with locked(self.layout.out, "sweeping"):
+            write_plan(self.layout, self.plan.cells)
+            found = self.standings(alive=False)
+            _note(self._forecast([each for each in found if each.state != "finished"]))
+            signals = self._watched(found)
+        return self._result(signals)
+
+    def _watched(self, before: Sequence[Standing]) -> list[int]:
+        """Carries out what is left and shows how; answers the signals that came."""
+        request, stop = self.request, Stop()
+        screen = Screen(Watch(self.layout, before), self.at_a_time)
+        work = Work(
+            jobs=[each.job for each in before if each.state != "finished"],
+            out=self.layout.out,
+            folder=request.path.resolve().parent,
+            threads=request.threads,
+            workers=request.workers,
+            memory=request.memory,
+            options=dict(request.options),
+            machine=self.machine,
+            stop=stop,
+        )
+        with noted(stop) as signals:
+            for _ in engine(request.engine)(work):
+                screen.show()
+            screen.close()
+        return signals
+
+    def _result(self, signals: Sequence[int]) -> int:
+        """Prints what was found and what failed; the exit code."""
+        found = self.standings(alive=False)
+        _say(table(self.plan.cells, found, self.plan.grid.metric))
+        failed = [each for each in found if each.state == "failed"]
+        left = [each for each in found if each.state not in {"finished", "failed"}]
+        done = len(found) - len(failed) - len(left)
+        _say([f"{done} of {len(found)} runs finished, results in {self.layout.out}"])
+        _say(f"failed: {each.job.title} ({each.job.id}): {each.error}" for each in failed)
+        if left:
+            _say([f"{len(left)} runs are left; the same command goes on with them"])
+        if failed:
+            _say([f"what they printed is in {self.layout.output('ID')}; the same command tries "
+                  "them again"])  # fmt: skip
+        if signals:
+            return exit_code(signals[0])
+        return FAILED if failed or left else 0
+
+    def _forecast(self, left: Sequence[Standing]) -> str:
+        jobs = {job.id: job for job in self.plan.jobs}
+        time = estimated([each.job for each in left], jobs, read_records(self.layout.records))
+        return (
+            f"{len(jobs)} runs, {len(jobs) - len(left)} finished, {len(left)} to do, "
+            f"{self.at_a_time} at a time: {time.text(self.at_a_time)}"
+        )
+
+
+def _grid(request: Request) -> Grid:
+    """The grid with what the user named instead of parts of it."""
+    grid = read_grid(request.path)
+    if request.scenes:
+        grid = with_scenes(grid, request.scenes)
+    return grid.model_copy(update={"seeds": tuple(request.seeds)}) if request.seeds else grid
+
+
+def _refuse_a_second(out: Path) -> None:
+    if writer := writer_of(out):
+        raise UserError(
+            "another sweep is under way in this folder",
+            where=out,
+            found=writer,
+            todo="wait until it ends, stop it, or choose another --out; --list shows how far it is",
+        )
+
+
+def _note(line: str) -> None:
+    print(line, file=sys.stderr)  # noqa: T201
+
+
+def _say(lines: Iterable[str]) -> None:
+    for line in lines:
+        print(line)  # noqa: T201 - the result of the command

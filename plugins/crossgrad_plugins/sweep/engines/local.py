@@ -1,0 +1,74 @@
+"""The cores of this machine."""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from time import sleep
+
+from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Worker, is_free
+from crossgrad_plugins.sweep.engines import Work
+from crossgrad_plugins.sweep.job import Job
+from crossgrad_plugins.sweep.tries import Tries
+
+
+def carry_out(work: Work) -> Iterator[None]:
+    """Carries out runs, each in a process of its own that is pinned to its worker's cores."""
+    crew = _Crew(work)
+    while crew.is_busy():
+        crew.look()
+        yield
+        sleep(PAUSE)
+
+
+class _Crew:
+    """The workers of this machine.
+
+    Args:
+        work: What is to be done.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+        self._waiting = deque(work.jobs)
+        self._tries = Tries(work.out)
+        self._free = list(reversed(_workers(work)))
+        self._under_way: list[Attempt] = []
+        self._asked = Counter[Attempt]()
+
+    def is_busy(self) -> bool:
+        """Whether anything is under way or to be begun."""
+        return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
+
+    def look(self) -> None:
+        """Takes leave of what has ended, and begins what can begin."""
+        for attempt in list(self._under_way):
+            while self._asked[attempt] < self._work.stop.count:
+                self._asked[attempt] += 1
+                attempt.stop()
+            outcome = attempt.poll()
+            if outcome is not None:
+                self._under_way.remove(attempt)
+                self._free.append(attempt.worker)
+                if self._tries.once_more(attempt.job, outcome):
+                    self._waiting.appendleft(attempt.job)
+        if not self._work.stop.count:
+            self._begin()
+
+    def _begin(self) -> None:
+        while self._free and (job := self._next()) is not None:
+            self._waiting.remove(job)
+            self._under_way.append(Attempt(job, self._free.pop()))
+
+    def _next(self) -> Job | None:
+        """The first run that no process of an earlier sweep still writes to."""
+        worker = self._free[-1]
+        return next((job for job in self._waiting if is_free(job, worker)), None)
+
+
+def _workers(work: Work) -> list[Worker]:
+    machine = work.machine
+    if machine is None:
+        raise ValueError("this machine is not divided")
+    return [
+        Worker(str(number), work.out, work.folder, work.threads, cores, machine.memory)
+        for number, cores in enumerate(machine.cores, 1)
+    ]

@@ -1,0 +1,261 @@
+"""The grid file: which settings, on which scenes, with which seeds."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
+
+from crossgrad_core.commands import UserError, did_you_mean, listed, read_settings
+from crossgrad_plugins.sweep.problems import Problem, refuse
+
+Settings: TypeAlias = dict[str, Any]
+
+_TODO = "docs/sweep.md shows the format"
+#: Settings that the sweep decides about, and how.
+_RESERVED = {
+    "out": "every run has its own folder below --out",
+    "stop_after": "a sweep runs its runs to their ends",
+    "threads": "say --threads, for all runs alike",
+}
+_SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
+_WITH_DISTRIBUTION = frozenset({"min", "max", "distribution", "mu", "sigma", "q", "probabilities"})
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Parameter(_Part):
+    """A setting that varies.
+
+    Attributes:
+        values: Its values.
+        value: Its only value.
+        parameters: Those of the settings inside it, such as the options of a component.
+    """
+
+    values: tuple[Any, ...] | None = Field(None, min_length=1)
+    value: Any = None
+    parameters: "dict[str, Parameter] | None" = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_a_list(cls, given: object) -> object:
+        if not isinstance(given, Mapping):
+            raise ValueError(_SHAPE)  # noqa: TRY004 - pydantic reports ValueError
+        if drawn := sorted(_WITH_DISTRIBUTION & given.keys()):
+            raise ValueError(f"nothing is drawn from distributions ({listed(drawn)}): list values")
+        if len({"values", "value", "parameters"} & given.keys()) != 1:
+            raise ValueError("must have exactly one of values, value and parameters")
+        return given
+
+    def axes(self, name: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
+        """Each setting with its values; a setting inside another one has a name with a dot."""
+        if self.parameters is not None:
+            for inner, parameter in self.parameters.items():
+                yield from parameter.axes(f"{name}.{inner}")
+        else:
+            yield name, (self.value,) if self.values is None else self.values
+
+
+class Arm(_Part):
+    """A configuration with a name.
+
+    Attributes:
+        name: Its name.
+        settings: Its settings.
+        parameters: What varies in it, besides what varies in all arms.
+        by_scene: Name of a scene's folder -> settings that hold on that scene only.
+    """
+
+    name: str = Field(min_length=1)
+    settings: Settings = Field(default_factory=dict)
+    parameters: dict[str, Parameter] = Field(default_factory=dict)
+    by_scene: dict[str, Settings] = Field(default_factory=dict)
+
+
+class Metric(_Part):
+    """What the table at the end shows.
+
+    Attributes:
+        name: A figure of the held-out views, as in summary.json.
+        goal: Whether more of it is better.
+    """
+
+    name: str = "psnr"
+    goal: Literal["maximize", "minimize"] = "maximize"
+
+
+class Grid(_Part):
+    """What a grid file says.
+
+    Attributes:
+        name: Its name; that of the file by default.
+        description: What it is for.
+        method: Every combination is run.
+        base: Settings of all runs, as in a configuration file.
+        scenes: Scene folders; None is the bundled scene.
+        seeds: Seeds.
+        arms: Configurations by name; a nameless one where there are none.
+        parameters: What varies in all arms.
+        metric: What the table at the end shows.
+    """
+
+    name: str | None = None
+    description: str = ""
+    method: Literal["grid"] = "grid"
+    base: Settings = Field(default_factory=dict)
+    scenes: tuple[str | None, ...] = Field((None,), min_length=1)
+    seeds: tuple[NonNegativeInt, ...] = Field((0,), min_length=1)
+    arms: tuple[Arm, ...] = Field((Arm(name="run"),), min_length=1)
+    parameters: dict[str, Parameter] = Field(default_factory=dict)
+    metric: Metric = Metric()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _axes_with_names(cls, given: object) -> object:
+        """Scenes and seeds may stand among the parameters, as everything does elsewhere."""
+        if not isinstance(given, dict) or not isinstance(given.get("parameters"), dict):
+            return given
+        moved = {"scene": "scenes", "seed": "seeds"}
+        parameters = dict(given["parameters"])
+        found = {new: parameters.pop(old) for old, new in moved.items() if old in parameters}
+        if twice := sorted(found.keys() & given.keys()):
+            raise ValueError(f"{listed(twice)} must be said once, on top or among the parameters")
+        return {**given, **{n: _values(p) for n, p in found.items()}, "parameters": parameters}
+
+
+class Choice(_Part):
+    """One configuration of a grid.
+
+    Attributes:
+        arm: The arm.
+        parameters: Setting -> value of what varies.
+    """
+
+    arm: Arm
+    parameters: Settings
+
+    @property
+    def label(self) -> str:
+        """What the configuration is called in tables."""
+        values = [f"{name}={value}" for name, value in self.parameters.items()]
+        return ", ".join([self.arm.name, *values])
+
+
+def _values(parameter: object) -> object:
+    """The values of a parameter that is no setting."""
+    if isinstance(parameter, Mapping):
+        return parameter.get("values", [parameter.get("value")])
+    return parameter
+
+
+def choices(grid: Grid) -> list[Choice]:
+    """All configurations, arm by arm; the last parameter varies fastest."""
+    found = []
+    for arm in grid.arms:
+        parameters = {**grid.parameters, **arm.parameters}
+        axes = dict(axis for name, each in parameters.items() for axis in each.axes(name))
+        found += [
+            Choice(arm=arm, parameters=dict(zip(axes, values, strict=True)))
+            for values in product(*axes.values())
+        ]
+    return found
+
+
+def read_grid(path: Path) -> Grid:
+    """The grid in a YAML file.
+
+    Raises:
+        UserError: The file cannot be read; or it is no grid: everything that is wrong with it.
+    """
+    content = read_settings(path, "the grid", _TODO)
+    try:
+        grid = Grid.model_validate(content)
+    except ValidationError as error:
+        refuse([_problem(each) for each in error.errors(include_url=False)], path)
+        raise
+    here = path.resolve().parent
+    scenes = tuple(each and _absolute(each, here) for each in grid.scenes)
+    grid = grid.model_copy(update={"scenes": scenes})
+    refuse(list(_of_the_settings(grid)), path)
+    return grid
+
+
+def _absolute(scene: str, here: Path) -> str:
+    return str((here / Path(scene).expanduser()).resolve())
+
+
+def _problem(error: Mapping[str, Any]) -> Problem:
+    """What pydantic found, with its place in the file."""
+    path = [part for part in error["loc"] if part != "dict"]
+    place = ".".join(str(part) for part in path) or "the grid"
+    if error["type"] == "extra_forbidden":
+        hint = did_you_mean(str(path[-1]), Grid.model_fields if len(path) == 1 else ())
+        below = "base" if len(path) == 1 else "settings"
+        return Problem(place, f"is no part of a grid; settings go below {below}", hint)
+    message = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    found = "" if error["type"] in {"missing", "value_error"} else f", not {error['input']!r}"
+    return Problem(place, f"{message}{found}")
+
+
+def _of_the_settings(grid: Grid) -> Iterator[Problem]:
+    layers: list[tuple[str, Mapping[str, object]]] = [("base", grid.base)]
+    layers.append(("parameters", grid.parameters))
+    for arm in grid.arms:
+        layers += [(f"arms.{arm.name}", arm.settings), (f"arms.{arm.name}", arm.parameters)]
+        layers += [(f"arms.{arm.name}.by_scene.{name}", s) for name, s in arm.by_scene.items()]
+    for place, settings in layers:
+        for name, why in _RESERVED.items():
+            if name in settings:
+                yield Problem(f"{place}.{name}", f"is not for a grid to set: {why}")
+        for name, axis in (("scene", "scenes"), ("seed", "seeds")):
+            if name in settings:
+                yield Problem(f"{place}.{name}", f"is not for a grid to set: list it in {axis}")
+    yield from _of_the_names(grid)
+
+
+def _of_the_names(grid: Grid) -> Iterator[Problem]:
+    names = [arm.name for arm in grid.arms]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        yield Problem("arms", f"two are named {name!r}")
+    if len(set(grid.seeds)) < len(grid.seeds):
+        yield Problem("seeds", f"one of them stands there twice: {list(grid.seeds)}")
+    scenes = [scene_name(scene) for scene in grid.scenes]
+    for name in sorted({name for name in scenes if scenes.count(name) > 1}):
+        yield Problem("scenes", f"two are named {name!r}")
+    for arm in grid.arms:
+        for name in arm.by_scene.keys() - set(scenes):
+            hint = did_you_mean(name, scenes)
+            yield Problem(f"arms.{arm.name}.by_scene", f"there is no scene named {name!r}", hint)
+
+
+def scene_name(scene: str | None) -> str:
+    """What a scene is called: its folder's name."""
+    return "the bundled scene" if scene is None else Path(scene).name
+
+
+def with_scenes(grid: Grid, scenes: Sequence[Path]) -> Grid:
+    """The grid on other scenes, of which the arms' settings by scene hold for those they name.
+
+    Raises:
+        UserError: Two scenes have one name.
+    """
+    names = [path.resolve().name for path in scenes]
+    if len(set(names)) < len(names):
+        raise UserError(
+            "two scenes have the same name",
+            where="--scene",
+            found=listed(names),
+            todo="give one of the folders another name",
+        )
+    arms = tuple(
+        arm.model_copy(
+            update={"by_scene": {name: s for name, s in arm.by_scene.items() if name in names}}
+        )
+        for arm in grid.arms
+    )
+    found = tuple(str(path.resolve()) for path in scenes)
+    return grid.model_copy(update={"scenes": found, "arms": arms})

@@ -1,0 +1,172 @@
+"""From a grid to its runs: every setting validated, every combination assembled, none trained."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import chdir
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crossgrad_core.commands import (
+    UserError,
+    assemble_new,
+    build,
+    chosen,
+    configured,
+    fingerprint,
+    layered,
+    read_scene,
+    resolved,
+)
+from crossgrad_plugins.sweep.grid import Choice, Grid, choices, scene_name
+from crossgrad_plugins.sweep.job import Job, run_id
+from crossgrad_plugins.sweep.problems import Problem, refuse
+
+if TYPE_CHECKING:
+    from crossgrad_core.commands import RunConfig
+
+#: Of configurations with the same fault, how many are named.
+MOST_PLACES = 3
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The runs of a grid.
+
+    Attributes:
+        grid: The grid.
+        cells: All combinations in the order in which they are run; two may be the same run.
+    """
+
+    grid: Grid
+    cells: tuple[Job, ...]
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """The runs, each of them once."""
+        found: dict[str, Job] = {}
+        for job in self.cells:
+            found.setdefault(job.id, job)
+        return tuple(found.values())
+
+
+def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
+    """The runs of a grid.
+
+    Seeds vary slowest, so that an interrupted sweep has every configuration, with fewer seeds.
+
+    Args:
+        grid: The grid.
+        path: Its file; paths in settings are relative to its folder.
+        assignments: `KEY=VALUE` texts that win over the grid.
+
+    Raises:
+        GridError: Everything that is wrong with settings, components and scenes.
+    """
+    planner = _Planner(grid.base, tuple(assignments))
+    pairs = list(product(grid.scenes, choices(grid)))
+    with chdir(path.resolve().parent):
+        checked = [planner.checked(scene, choice) for scene, choice in pairs]
+    refuse(planner.problems(), path)
+    cells = [
+        _job(scene, choice, seed, found)
+        for seed in grid.seeds
+        for (scene, choice), found in zip(pairs, checked, strict=True)
+        if found is not None
+    ]
+    return Plan(grid, tuple(cells))
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """A configuration on a scene: what it is started with, what that comes to, the scene's mark."""
+
+    settings: Mapping[str, Any]
+    resolved: Mapping[str, Any]
+    fingerprint: str
+
+
+@dataclass
+class _Planner:
+    """Checks configurations and collects what is wrong, each thing once."""
+
+    base: Mapping[str, Any]
+    assignments: tuple[str, ...]
+    _wrong: dict[str, list[str]] = field(default_factory=dict)
+    _scenes: dict[str, Any] = field(default_factory=dict)
+
+    def problems(self) -> list[Problem]:
+        """What was found, with the configurations that it concerns."""
+        return [Problem(_shortened(places), text) for text, places in self._wrong.items()]
+
+    def checked(self, scene: str | None, choice: Choice) -> _Checked | None:
+        """The configuration on that scene; None where something is wrong with it."""
+        place = choice.label
+        try:
+            settings = self._settings(scene, choice)
+            config = configured(settings)
+        except UserError as error:
+            self._note(place, error)
+            return None
+        faults = list(_faults(config))
+        for fault in faults:
+            self._note(place, fault)
+        found = self._scene(config)
+        if faults or found is None:
+            return None
+        try:
+            setup = assemble_new(config, found[0], found[1])
+        except UserError as error:
+            self._note(f"{scene_name(scene)}, {place}", error)
+            return None
+        final = {**resolved(setup), "seconds": config.seconds}
+        return _Checked(settings, final, found[2])
+
+    def _settings(self, scene: str | None, choice: Choice) -> dict[str, Any]:
+        arm = choice.arm
+        own = arm.by_scene.get(scene_name(scene), {})
+        layers = (self.base, arm.settings, choice.parameters, own)
+        return {**layered(layers, self.assignments), **({} if scene is None else {"scene": scene})}
+
+    def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
+        """The scene as the configuration reads it; None where it cannot be read."""
+        key = f"{config.scene} {config.reader} {config.reading}"
+        if key not in self._scenes:
+            try:
+                scene, reader = read_scene(config)
+                self._scenes[key] = (scene, reader, fingerprint(scene, config))
+            except UserError as error:
+                self._note(str(config.scene), error)
+                self._scenes[key] = None
+        return self._scenes[key]
+
+    def _note(self, place: str, error: UserError) -> None:
+        places = self._wrong.setdefault(str(error), [])
+        if place not in places:
+            places.append(place)
+
+
+def _shortened(places: Sequence[str]) -> str:
+    """The first of the places, and how many more there are."""
+    more = len(places) - MOST_PLACES
+    return "; ".join([*places[:MOST_PLACES], *([f"and {more} more"] if more > 0 else [])])
+
+
+def _faults(config: "RunConfig") -> Iterator[UserError]:
+    """What is wrong with the components by themselves."""
+    for slot, choice in chosen(config):
+        try:
+            build(slot, choice.name, choice.options)
+        except UserError as error:
+            yield error
+
+
+def _job(scene: str | None, choice: Choice, seed: int, found: _Checked) -> Job:
+    return Job(
+        id=run_id({**found.resolved, "seed": seed}, found.fingerprint),
+        label=choice.label,
+        scene=scene_name(scene),
+        seed=seed,
+        settings={**found.settings, "seed": seed},
+        seconds=found.resolved["seconds"],
+    )

@@ -1,0 +1,69 @@
+"""Everything that is wrong with a grid, in one error."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from typing_extensions import override
+
+from crossgrad_core.commands import UserError
+
+#: How many are shown.
+MOST = 20
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong.
+
+    Attributes:
+        place: Where in the grid.
+        what: What is wrong.
+        hint: What to do about it, where that is known.
+    """
+
+    place: str
+    what: str
+    hint: str = ""
+
+    @override
+    def __str__(self) -> str:
+        lines = self.what.splitlines() or [""]
+        text = "\n".join([f"{self.place}: {lines[0]}", *(f"    {line}" for line in lines[1:])])
+        return f"{text}; {self.hint}" if self.hint else text
+
+
+class GridError(UserError):
+    """A grid with all that is wrong with it.
+
+    Args:
+        problems: What is wrong.
+        path: The grid's file.
+    """
+
+    def __init__(self, problems: Sequence[Problem], path: Path) -> None:
+        self.problems = tuple(problems)
+        super().__init__(
+            f"{len(problems)} things are wrong with this grid"
+            if len(problems) > 1
+            else "something is wrong with this grid",
+            where=path,
+            todo="repair it and start again; nothing was started",
+        )
+
+    @override
+    def message(self) -> str:
+        """The error, and below it each thing that is wrong."""
+        shown = [f"- {problem}" for problem in self.problems[:MOST]]
+        more = len(self.problems) - len(shown)
+        return "\n".join([super().message(), *shown, *([f"- and {more} more"] if more else [])])
+
+
+def refuse(problems: Sequence[Problem], path: Path) -> None:
+    """Refuses a grid with which something is wrong.
+
+    Raises:
+        GridError: There are problems.
+    """
+    if problems:
+        raise GridError(problems, path)

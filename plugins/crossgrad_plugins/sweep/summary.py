@@ -1,0 +1,67 @@
+"""What a sweep has found: a table of means over seeds, and what failed."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from statistics import mean, stdev
+
+from crossgrad_core.commands import write_table
+from crossgrad_plugins.sweep.grid import Metric
+from crossgrad_plugins.sweep.job import Job
+from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.standing import Standing
+
+
+def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
+    """A line for each combination: id, how far it is, what it is."""
+    state = {each.job.id: each for each in standings}
+    for job in cells:
+        found = state[job.id]
+        error = f": {' '.join(found.error.split())}" if found.error else ""
+        yield f"{job.id}  {found.state:<11}  {job.title}{error}"
+
+
+def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
+    """Mean and, over seeds, standard deviation of a figure: configurations x scenes.
+
+    The best mean of each scene has an asterisk.
+    """
+    summaries = {each.job.id: each.summary for each in standings if each.summary is not None}
+    found: dict[tuple[str, str], list[float]] = {}
+    for job in cells:
+        value = (summaries.get(job.id, {}).get("overall") or {}).get(metric.name)
+        if isinstance(value, int | float):
+            found.setdefault((job.label, job.scene), []).append(float(value))
+    labels = list(dict.fromkeys(job.label for job in cells))
+    scenes = list(dict.fromkeys(job.scene for job in cells))
+    best = {scene: _best(found, scene, metric) for scene in scenes}
+    rows = [[f"{metric.name}, mean over seeds", *scenes]]
+    rows += [
+        [label, *(_cell(found.get((label, scene)), best[scene]) for scene in scenes)]
+        for label in labels
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+
+
+def _best(found: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:
+    means = [mean(values) for (_, where), values in found.items() if where == scene]
+    if not means:
+        return None
+    return max(means) if metric.goal == "maximize" else min(means)
+
+
+def _cell(values: Sequence[float] | None, best: float | None) -> str:
+    if not values:
+        return "-"
+    spread = f" ± {stdev(values):.3f}" if len(values) > 1 else ""
+    mark = " *" if mean(values) == best else ""
+    return f"{mean(values):.3f}{spread} ({len(values)}){mark}"
+
+
+def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
+    """Writes runs.csv: which run is what."""
+    rows: list[dict[str, str | int | float]] = [
+        {"run": job.id, "scene": job.scene, "configuration": job.label, "seed": job.seed}
+        for job in cells
+    ]
+    write_table(layout.plan, rows)

@@ -1,0 +1,187 @@
+"""A sweep that is killed loses and repeats nothing; its bits are those of an undisturbed one."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from crossgrad_faults import laws
+from support.scenes import write_tiny_scene
+
+import crossgrad_core
+from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.records import read_records
+
+#: 60 steps with edits, checkpoints and evaluations.
+BASE = {
+    "steps": 60,
+    "densify_from": 10,
+    "densify_every": 10,
+    "densify_until": 55,
+    "save_every": 9,
+    "eval_every": 20,
+}
+#: Kills in the short version and in the long one, and seeds of four configurations in it.
+SHORT, LONG, SEEDS = 2, 20, 6
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    """24 short runs; 3 in the short version."""
+    folder = tmp_path_factory.mktemp("sweep")
+    write_tiny_scene(folder / "tiny", views=6, suffix=".jpg")
+    content = {"scenes": ["tiny"], "base": BASE, "seeds": list(range(SEEDS))}
+    content["parameters"] = {
+        "sampler": {"values": ["epoch", "random"]},
+        "backbone": {"values": ["vanilla", "mip"]},
+    }
+    if "FAULTS" not in os.environ:
+        content |= {"seeds": [0, 1, 2], "parameters": {}}
+    path = folder / "grid.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def start(grid, out, *more):
+    command = [sys.executable, "-m", "crossgrad_core", "sweep", str(grid), "--out", str(out), *more]
+    with (out.parent / f"{out.name}.txt").open("ab") as file:
+        return subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+
+
+def said(out):
+    return (out.parent / f"{out.name}.txt").read_text()
+
+
+def children(pid):
+    """The processes that a process started, and those that they did."""
+    try:
+        text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    except OSError:
+        return []
+    own = [int(each) for each in text.split()]
+    return [*own, *(each for child in own for each in children(child))]
+
+
+def begins(out):
+    return [each for each in read_records(out / "workers") if each.event == "begun"]
+
+
+def wait_for(happened, seconds=240.0):
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def kill(process, what):
+    """Kills the sweep, one of its runs, or everything at once."""
+    runs = children(process.pid)
+    victims = {"sweep": [process.pid], "run": runs[:1], "all": [process.pid, *runs]}[what]
+    for victim in victims:
+        try:
+            os.kill(victim, signal.SIGKILL)
+        except ProcessLookupError:  # It ended meanwhile.
+            continue
+
+
+def finished(out):
+    """Finished runs -> when their results were written."""
+    found = {}
+    for summary in (out / "runs").glob("*/summary.json"):
+        if yaml.safe_load(summary.read_text())["status"] == "finished":
+            found[summary.parent.name] = summary.stat().st_mtime_ns
+    return found
+
+
+def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
+    out = tmp_path / "sweep"
+    draw = random.Random(0)
+    long = "FAULTS" in os.environ
+    seen = {}
+    for number in range(LONG if long else SHORT):
+        known = len(begins(out)) if out.exists() else 0
+        process = start(grid, out)
+        wait_for(lambda known=known, process=process: len(begins(out)) > known
+                 or process.poll() is not None)  # fmt: skip
+        time.sleep(draw.uniform(0.0, 12.0 if long else 5.0))
+        kill(process, ("all", "sweep", "run")[number % 3])
+        if number % 3 == 2:
+            time.sleep(draw.uniform(0.0, 5.0))
+            kill(process, "all")
+        process.wait()
+        seen |= {name: when for name, when in finished(out).items() if name not in seen}
+    assert start(grid, out).wait() == 0, said(out)
+    after = finished(out)
+    assert len(after) == len(list((out / "runs").iterdir())) == (24 if long else 3)
+    assert {name: after[name] for name in seen} == seen
+    for name in after:
+        events = [each for each in read_records(out / "workers") if each.run == name]
+        ends = [n for n, each in enumerate(events) if each.status == "finished"]
+        assert ends in ([], [len(events) - 1])
+    laws.parses(out / "runs")
+    for name in after:
+        laws.same_bits(undisturbed(out, name, tmp_path / "undisturbed"), out / "runs" / name)
+
+
+def undisturbed(out, name, folder):
+    """The same run by itself, in this process."""
+    crossgrad_core.run(config=Layout(out).settings(name), out=folder / name, threads=1, quiet=True)
+    return folder / name
+
+
+@pytest.fixture
+def slow(tmp_path, monkeypatch):
+    """A third party's observer, with which a run takes a minute until the file `go` is there."""
+    folder = tmp_path / "stranger"
+    info = folder / "slow-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[crossgrad.observers]\nslow = slow_steps:Slow\n")
+    (folder / "slow_steps.py").write_text(SLOW)
+    found = (os.environ.get("PYTHONPATH"), str(folder))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, found)))
+    return tmp_path / "go"
+
+
+SLOW = """
+import time
+from pathlib import Path
+from crossgrad_core.plugin import Observer, hookimpl
+
+class Slow(Observer):
+    go: str
+
+    @hookimpl
+    def crossgrad_step_end(self, record):
+        end = time.monotonic() + 1
+        while time.monotonic() < end and not Path(self.go).exists():
+            time.sleep(0.05)
+"""
+
+
+def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path):
+    out = tmp_path / "sweep"
+    observer = json.dumps({"name": "slow", "go": str(slow)})
+    more = ("--seed", "7", "--set", f"observers={observer}")
+    process = start(grid, out, *more)
+    wait_for(lambda: begins(out) if out.exists() else False)
+    run = out / "runs" / begins(out)[0].run
+    wait_for((run / "config.yaml").is_file)
+    assert start(grid, out, *more).wait() == 2
+    assert f"process {process.pid}, sweeping since" in said(out)
+    command = [sys.executable, "-m", "crossgrad_core", "sweep", str(grid), "--out", str(out), *more]
+    listed = subprocess.run([*command, "--list"], capture_output=True, text=True, check=True)
+    assert f"{run.name}  training " in listed.stdout
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 130, said(out)
+    ends = [each.status for each in read_records(out / "workers") if each.event == "ended"]
+    assert set(ends) == {"stopped"}
+    slow.touch()
+    assert start(grid, out, *more).wait() == 0, said(out)
+    assert run.name in finished(out)

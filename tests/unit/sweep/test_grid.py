@@ -1,0 +1,125 @@
+"""The grid file: what it means, and everything that can be wrong with it at once."""
+
+import pytest
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.sweep.grid import choices, read_grid, with_scenes
+
+
+def written(folder, text):
+    path = folder / "grid.yaml"
+    path.write_text(text)
+    return path
+
+
+def labels(grid):
+    return [each.label for each in choices(grid)]
+
+
+def test_parameters_are_multiplied_and_the_last_varies_fastest(tmp_path):
+    grid = read_grid(written(tmp_path, """
+        parameters:
+          sampler: {values: [epoch, random]}
+          rate: {values: [1, 2]}
+          steps: {value: 30}
+    """))  # fmt: skip
+    assert labels(grid) == [
+        f"run, sampler={sampler}, rate={rate}, steps=30"
+        for sampler in ("epoch", "random")
+        for rate in (1, 2)
+    ]
+
+
+def test_parameters_inside_a_component_are_its_options(tmp_path):
+    text = "parameters: {operator: {parameters: {name: {value: cagrad}, c: {values: [0, 1]}}}}"
+    found = choices(read_grid(written(tmp_path, text)))
+    assert [each.parameters for each in found] == [
+        {"operator.name": "cagrad", "operator.c": c} for c in (0, 1)
+    ]
+
+
+def test_an_arm_may_have_parameters_of_its_own(tmp_path):
+    grid = read_grid(written(tmp_path, """
+        arms:
+          - {name: one, settings: {views: 1}}
+          - {name: two, settings: {views: 2}, parameters: {operator: {values: [sum, pcgrad]}}}
+        parameters: {backbone: {values: [vanilla, mip]}}
+    """))  # fmt: skip
+    assert labels(grid) == [
+        "one, backbone=vanilla",
+        "one, backbone=mip",
+        "two, backbone=vanilla, operator=sum",
+        "two, backbone=vanilla, operator=pcgrad",
+        "two, backbone=mip, operator=sum",
+        "two, backbone=mip, operator=pcgrad",
+    ]
+
+
+def test_scenes_and_seeds_may_stand_among_the_parameters(tmp_path):
+    text = "parameters: {scene: {values: [a, b]}, seed: {values: [3, 4]}}"
+    grid = read_grid(written(tmp_path, text))
+    assert grid.seeds == (3, 4)
+    assert grid.scenes == (str(tmp_path / "a"), str(tmp_path / "b"))
+    assert labels(grid) == ["run"]
+
+
+def test_scenes_are_relative_to_the_grid(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    path = written(tmp_path, "scenes: [scene, ../other, /abs]")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert read_grid(path).scenes == (
+        str(tmp_path / "scene"),
+        str(tmp_path.parent / "other"),
+        "/abs",
+    )
+
+
+def test_other_scenes_keep_the_settings_of_those_with_their_name(tmp_path):
+    text = "scenes: [a, b]\narms: [{name: x, by_scene: {a: {steps: 3}, b: {steps: 4}}}]"
+    grid = with_scenes(read_grid(written(tmp_path, text)), [tmp_path / "b", tmp_path / "c"])
+    assert grid.arms[0].by_scene == {"b": {"steps": 4}}
+    with pytest.raises(UserError, match="same name"):
+        with_scenes(grid, [tmp_path / "b", tmp_path / "c" / "b"])
+
+
+#: Grid, what the error says of it.
+WRONG = {
+    "sceens: [a]": "did you mean 'scenes'?",
+    "steps: 30": "settings go below base",
+    "method: bayes": "method: ",
+    "parameters: {rate: {min: 0, max: 1}}": "nothing is drawn from distributions (max, min)",
+    "parameters: {rate: [1, 2]}": "must be `values: [...]`",
+    "parameters: {rate: {values: []}}": "parameters.rate.values",
+    "parameters: {rate: {values: [1], value: 2}}": "exactly one of",
+    "base: {out: x}": "base.out: is not for a grid to set",
+    "base: {threads: 2}": "say --threads",
+    "parameters: {stop_after: {value: 3}}": "parameters.stop_after",
+    "arms: [{name: a, settings: {seed: 1}}]": "list it in seeds",
+    "base: {scene: x}": "list it in scenes",
+    "arms: [{settings: {}}]": "arms.0.name",
+    "arms: [{name: a}, {name: a}]": "two are named 'a'",
+    "seeds: [1, 1]": "twice",
+    "seeds: [-1]": "seeds.0",
+    "scenes: [x/a, y/a]": "two are named 'a'",
+    "scenes: [town]\narms: [{name: a, by_scene: {towm: {}}}]": "did you mean 'town'?",
+    "seeds: [1]\nparameters: {seed: {values: [1]}}": "must be said once",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_wrong_is_said_with_its_place(tmp_path, text):
+    with pytest.raises(UserError) as caught:
+        read_grid(written(tmp_path, text))
+    assert WRONG[text] in str(caught.value)
+    assert str(tmp_path / "grid.yaml") in str(caught.value)
+
+
+def test_all_that_is_wrong_is_said_at_once(tmp_path):
+    text = "base: {out: x, threads: 1}\nseeds: [1, 1]\narms: [{name: a}, {name: a}]"
+    with pytest.raises(UserError, match="4 things are wrong"):
+        read_grid(written(tmp_path, text))
+
+
+def test_an_empty_grid_is_one_run_of_the_bundled_scene(tmp_path):
+    grid = read_grid(written(tmp_path, ""))
+    assert (grid.scenes, grid.seeds, labels(grid)) == ((None,), (0,), ["run"])

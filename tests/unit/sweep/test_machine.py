@@ -1,0 +1,59 @@
+"""A machine divided among workers: no core twice, no memory twice."""
+
+import pytest
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.sweep import machine
+from crossgrad_plugins.sweep.machine import divided
+
+GIB = 2**30
+
+
+@pytest.fixture
+def has(monkeypatch):
+    def make(cores, gib):
+        monkeypatch.setattr(machine, "available_cores", lambda: tuple(cores))
+        available = None if gib is None else int(gib * GIB)
+        monkeypatch.setattr(machine, "available_memory", lambda: available)
+
+    return make
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("workers", [None, 1, 2])
+def test_no_core_is_given_twice_and_none_that_is_not_ours(has, threads, workers):
+    ours = (3, 4, 5, 8, 9, 11)
+    has(ours, 64)
+    found = divided(workers, threads, None)
+    assert len(found.cores) == (workers or 6 // threads)
+    given = [core for cores in found.cores for core in cores]
+    assert all(len(cores) == threads for cores in found.cores)
+    assert len(set(given)) == len(given) and set(given) <= set(ours)
+    assert found.memory * len(found.cores) <= 0.9 * 64 * GIB
+
+
+def test_little_memory_means_fewer_workers(has):
+    has(range(16), 5)
+    assert len(divided(None, 1, None).cores) == 3
+    assert len(divided(None, 1, 2.0).cores) == 2
+    assert divided(None, 1, 2.0).memory == 2 * GIB
+    has(range(16), 0.5)
+    assert len(divided(None, 1, None).cores) == 1
+
+
+def test_where_the_system_does_not_say_there_is_no_bound(has):
+    has(range(4), None)
+    assert divided(None, 2, None).memory is None
+    assert divided(3, 1, 1.5).memory == 3 * GIB // 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [((5, 1, None), "--workers"), ((None, 5, None), "--threads"), ((2, 1, 5.0), "--workers"),
+     ((None, 1, 20.0), "--memory")],
+)  # fmt: skip
+def test_more_than_there_is_is_refused(has, arguments, named):
+    has(range(4), 8)
+    with pytest.raises(UserError) as caught:
+        divided(*arguments)
+    assert named in caught.value.where and caught.value.expected

@@ -1,0 +1,35 @@
+"""Records of workers: append-only, whole whatever happened."""
+
+import json
+
+import pytest
+
+from crossgrad_plugins.sweep.records import append, read_records
+
+
+def add(folder, worker="1", **more):
+    append(folder, {"event": "begun", "run": "a", "worker": worker, **more})
+
+
+def test_lines_of_all_workers_come_in_the_order_of_time(tmp_path):
+    for worker, run in (("1", "a"), ("2", "b"), ("1", "c")):
+        add(tmp_path, worker, run=run)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl"]
+    found = read_records(tmp_path)
+    assert {each.run for each in found} == set("abc")
+    assert [each.time for each in found] == sorted(each.time for each in found)
+
+
+@pytest.mark.parametrize("torn", [b'{"event": "beg', b"{}\n", b"[1]\n", b'\xff\xfe\n{"a": 1}'])
+def test_a_torn_or_foreign_line_costs_no_other(tmp_path, torn):
+    add(tmp_path)
+    with (tmp_path / "1.jsonl").open("ab") as file:
+        file.write(torn)
+    add(tmp_path, run="b")
+    assert [each.run for each in read_records(tmp_path)] == ["a", "b"]
+
+
+def test_a_line_is_json_with_time_and_machine(tmp_path):
+    add(tmp_path, event="ended", status="finished", seconds=1.5)
+    line = json.loads((tmp_path / "1.jsonl").read_text())
+    assert line.keys() == {"event", "run", "worker", "time", "host", "status", "seconds"}
