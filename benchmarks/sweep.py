@@ -1,0 +1,95 @@
+"""Throughput of a sweep with workers, beside the same runs one after another.
+
+    python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
+
+Times three sweeps of the same runs: one after another with one thread, one after another with as
+many threads as there are workers, and all workers with one thread each; and beside them what the
+machine itself reaches: as many `crossgrad run` at once, started by hand, against one. The figures
+mean something only on a machine that does nothing else.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import yaml
+from _machine import code, facts
+
+from crossgrad_plugins.sweep.records import read_records
+
+CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
+
+
+def swept(grid: Path, out: Path, workers: int, threads: int) -> float:
+    """Seconds from the start of the first run of a sweep to the end of the last one."""
+    command = [*CROSSGRAD, "sweep", str(grid), "--out", str(out)]
+    command += ["--workers", str(workers), "--threads", str(threads)]
+    subprocess.run(command, check=True, capture_output=True)
+    times = [each.when for each in read_records(out / "workers")]
+    return (max(times) - min(times)).total_seconds()
+
+
+def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
+    """Seconds of so many runs that are started at once, each with one thread."""
+    start = time.monotonic()
+    runs = [subprocess.Popen(
+        [*CROSSGRAD, "run", str(arguments.scene), "--steps", str(arguments.steps), "--threads", "1",
+         "--max-size", str(arguments.max_size), "--seed", str(number), "-q",
+         "--out", str(folder / f"{count}-{number}")],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    ) for number in range(count)]  # fmt: skip
+    for run in runs:
+        if run.wait():
+            raise SystemExit("a run failed; `crossgrad run` says why")
+    return time.monotonic() - start
+
+
+def measured(arguments: argparse.Namespace, folder: Path) -> None:
+    """Times everything in a folder and prints the ratios."""
+    grid = folder / "grid.yaml"
+    settings = {"steps": arguments.steps, "max_size": arguments.max_size}
+    seeds = list(range(arguments.runs))
+    grid.write_text(
+        yaml.safe_dump(
+            {"base": settings, "scenes": [str(arguments.scene.resolve())], "seeds": seeds}
+        ),
+        encoding="utf-8",
+    )
+    workers = arguments.workers
+    for threads in (1, workers):  # Kernels are compiled before any clock runs.
+        command = [*CROSSGRAD, "run", str(arguments.scene), "--steps", "20", "-q"]
+        command += ["--threads", str(threads), "--out", str(folder / f"warm-{threads}")]
+        subprocess.run(command, check=True, capture_output=True)
+    one, many = by_hand(arguments, folder, 1), by_hand(arguments, folder, workers)
+    print(f"{workers} runs at once, started by hand: {workers * one / many:.2f} x one", flush=True)
+    together = swept(grid, folder / "together", workers, 1)
+    for threads in (1, workers):
+        alone = swept(grid, folder / f"alone-{threads}", 1, threads)
+        print(
+            f"sweep of {arguments.runs} runs, {workers} workers of one thread: {together:.1f} s, "
+            f"{alone / together:.2f} x one after another with {threads} ({alone:.1f} s)",
+            flush=True,
+        )
+    print(json.dumps({**facts(), "code": code(), "steps": arguments.steps}))
+
+
+def main() -> None:
+    """Reads the options and measures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    bundled = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
+    parser.add_argument("scene", type=Path, nargs="?", default=bundled)
+    parser.add_argument("--runs", type=int, default=6)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--max-size", type=int, default=400)
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        measured(arguments, Path(folder))
+
+
+if __name__ == "__main__":
+    main()
