@@ -12,6 +12,7 @@ OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"
 RESOLUTION: Final = "full"
+#: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-cc+lpips"
 #: The densifier of a backbone that names none.

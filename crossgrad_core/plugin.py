@@ -67,8 +67,6 @@ from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.evaluation.metrics import psnr
-from crossgrad_core.ply.cloud import SplatCloud
-from crossgrad_core.ply.file import write_ply
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.run.results.lines import (
@@ -79,8 +77,10 @@ from crossgrad_core.run.results.lines import (
     progress_line,
 )
 from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.terminal import shows_bar
 from crossgrad_core.system.text_files import read_rows
+from crossgrad_core.wording import listed
 
 __all__ = [
     "EMPTY_STATE",
@@ -154,7 +154,6 @@ __all__ = [
     "Selection",
     "SeparateGradients",
     "Similarity",
-    "SplatCloud",
     "StepContext",
     "StepRecord",
     "UserError",
@@ -164,6 +163,7 @@ __all__ = [
     "Weighting",
     "altitudes",
     "apply_to_parameters",
+    "atomic_file",
     "bimodality",
     "build_component",
     "centers_of",
@@ -175,6 +175,7 @@ __all__ = [
     "hookimpl",
     "installed_plugins",
     "length_lines",
+    "listed",
     "masked",
     "objections_to_views",
     "octave",
@@ -185,7 +186,7 @@ __all__ = [
     "screen_statistics",
     "set_for_nothing",
     "shows_bar",
+    "size_text",
     "unit_range",
     "upward",
-    "write_ply",
 ]

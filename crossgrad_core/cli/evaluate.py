@@ -1,31 +1,14 @@
 """`crossgrad eval`: figures of a run's held-out views."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
+from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
 
 
 def evaluate(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
-    ],
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
-    ] = None,
-    accept_scene: Annotated[
-        bool,
-        typer.Option(
-            "--accept-scene",
-            help="Take the scene although photos, masks, points or held-out views have changed.",
-        ),
-    ] = False,
+    run: RunFolder,
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()

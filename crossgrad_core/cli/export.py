@@ -5,13 +5,12 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
 
 
 def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
-    ],
+    run: RunFolder,
     file_format: Annotated[
         str | None,
         typer.Option(
@@ -32,20 +31,9 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             "Default: mean of the training views.",
         ),
     ] = None,
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
-    ] = None,
-    accept_scene: Annotated[
-        bool,
-        typer.Option(
-            "--accept-scene",
-            help="Take the scene although photos, masks, points or held-out views have changed.",
-        ),
-    ] = False,
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
 
 
@@ -18,28 +19,15 @@ class Split(StrEnum):
 
 
 def render(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
-    ],
+    run: RunFolder,
     split: Annotated[Split, typer.Option(help="Which views are drawn.")] = Split.TEST,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
     ] = None,
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
-    ] = None,
-    accept_scene: Annotated[
-        bool,
-        typer.Option(
-            "--accept-scene",
-            help="Take the scene although photos, masks, points or held-out views have changed.",
-        ),
-    ] = False,
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
 ) -> None:
     """Draw the views of a run as PNG files."""
     announce()

@@ -8,6 +8,7 @@ from typing import ClassVar
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.errors import UserError
 
 
 class Exporter(Component):
@@ -42,3 +43,34 @@ class Exporter(Component):
     def stored(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians as a reader of the file gets them, local frame; by default unchanged."""
         return gaussians
+
+    def read(self, path: Path, similarity: Similarity) -> Gaussians:
+        """The Gaussians in a file of this format, to start from; by default refused.
+
+        Args:
+            path: The file.
+            similarity: Maps the local frame, that of the answer, back to the frame of the file.
+
+        Returns:
+            float32 Gaussians on the CPU with spherical harmonics.
+
+        Raises:
+            UserError: The file cannot be read.
+        """
+        raise _not_read(path)
+
+    def sh_degree_of(self, path: Path) -> int:
+        """The SH degree of the Gaussians in a file, from its header alone; by default refused.
+
+        Raises:
+            UserError: The file cannot be read.
+        """
+        raise _not_read(path)
+
+
+def _not_read(path: Path) -> UserError:
+    return UserError(
+        "files of this format are written, not read",
+        where=path,
+        todo="name a file of a format that a run can start from, such as a PLY of Gaussians",
+    )

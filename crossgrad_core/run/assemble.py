@@ -26,7 +26,7 @@ from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.defaults import CHAIN, READER
+from crossgrad_core.defaults import CHAIN, EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
@@ -170,9 +170,8 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
     path = config.reading.init_file
     if config.sh_from is not None or path is None:
         return config
-    from crossgrad_core.ply.file import sh_degree_of
-
-    return config.model_copy(update={"sh_from": sh_degree_of(path)})
+    degree = build(Exporter, EXPORTER, {}).sh_degree_of(path)
+    return config.model_copy(update={"sh_from": degree})
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:

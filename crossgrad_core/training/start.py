@@ -9,7 +9,10 @@ import numpy as np
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.defaults import EXPORTER
+from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training import photo_parameters
 from crossgrad_core.training.loop import timed_step
@@ -48,10 +51,8 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
         if reading.init == "random":
             scene = with_random_points(scene, rng)
         return setup.backbone.create(scene, rng)
-    from crossgrad_core.ply.file import read_ply
-
-    cloud = read_ply(reading.init_file).to_local(setup.scene.similarity)
-    return setup.backbone.adopt(cloud.to_gaussians(), setup.scene, rng)
+    gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, setup.scene.similarity)
+    return setup.backbone.adopt(gaussians, setup.scene, rng)
 
 
 def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:

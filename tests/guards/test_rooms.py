@@ -15,7 +15,7 @@ FLOORS = (
     ("system",),
     ("numerics",),
     ("contract",),
-    ("gradients", "ply", "scene", "config"),
+    ("gradients", "scene", "config"),
     ("registry",),
     ("training",),
     ("evaluation",),

@@ -10,9 +10,9 @@ import yaml
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.ply.file import read_ply
 from crossgrad_core.run import afterwards, app
 from crossgrad_core.run.results.lock import locked
+from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 STEPS = 4
 

@@ -11,13 +11,13 @@ from support.combinations import NEEDED
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.ply.cloud import SplatCloud
 from crossgrad_core.registry.entries import offers
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.export import export_scene
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
 
 OURS = sorted(e.name for e in offers("backbones") if e.distribution == "crossgrad")
 NORMALS = ["nx", "ny", "nz"]

@@ -11,10 +11,10 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
-from crossgrad_core.ply.file import read_ply
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config
+from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 #: Density control within a few dozen steps; by default it waits for step 500.
 GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}

@@ -6,7 +6,9 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Exporter, Gaussians, Similarity, SplatCloud, write_ply
+from crossgrad_core.plugin import Exporter, Gaussians, Similarity
+from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_format.file import read_ply, sh_degree_of, write_ply
 
 
 class Ply(Exporter):
@@ -23,3 +25,11 @@ class Ply(Exporter):
     @override
     def stored(self, gaussians: Gaussians) -> Gaussians:
         return SplatCloud.from_gaussians(gaussians).to_gaussians()
+
+    @override
+    def read(self, path: Path, similarity: Similarity) -> Gaussians:
+        return read_ply(path).to_local(similarity).to_gaussians()
+
+    @override
+    def sh_degree_of(self, path: Path) -> int:
+        return sh_degree_of(path)

@@ -12,13 +12,13 @@ from typing import BinaryIO
 import numpy as np
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.ply import file as ply
-from crossgrad_core.ply import table as ply_table
-from crossgrad_core.ply.table import Element, Header
 from crossgrad_core.scene import pillow, reduction
 from crossgrad_core.scene.headers import PhotoHeader
 from crossgrad_core.system import yaml_values
 from crossgrad_fuzz.targets import photos
+from crossgrad_plugins.exporters.ply_format import file as ply
+from crossgrad_plugins.exporters.ply_format import table as ply_table
+from crossgrad_plugins.exporters.ply_format.table import Element, Header
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.ply import file as ply
-from crossgrad_core.ply import table as ply_table
-from crossgrad_core.ply.cloud import SplatCloud
-from crossgrad_core.ply.file import PROPERTIES, read_ply, sh_degree_of, write_ply
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
+from crossgrad_plugins.exporters.ply_format import file as ply
+from crossgrad_plugins.exporters.ply_format import table as ply_table
+from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_format.file import (
+    PROPERTIES,
+    read_ply,
+    sh_degree_of,
+    write_ply,
+)
 
 _FILE = "model.ply"
 _ROTATIONS = (b"0 0 0 0", b"1e30 0 0 0", b"1e-30 0 0 0", b"1 0 0 0")

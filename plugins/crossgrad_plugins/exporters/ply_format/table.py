@@ -10,9 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.errors import UserError
-from crossgrad_core.system.files import size_text
-from crossgrad_core.wording import listed
+from crossgrad_core.plugin import UserError, listed, size_text
 
 #: PLY type name -> numpy type without byte order.
 _TYPES = {

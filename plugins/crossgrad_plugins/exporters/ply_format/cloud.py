@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.plugin import Gaussians, Similarity
 
 #: Coefficients of bands 1 to 3.
 REST = 15

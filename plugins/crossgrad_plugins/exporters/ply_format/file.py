@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.spherical import COEFFICIENTS
-from crossgrad_core.ply.cloud import REST, RenderMode, SplatCloud
-from crossgrad_core.ply.table import read_vertices, vertex_properties
-from crossgrad_core.system.files import atomic_file
+from crossgrad_core.plugin import Similarity, UserError, atomic_file
+from crossgrad_plugins.exporters.ply_format.cloud import REST, RenderMode, SplatCloud
+from crossgrad_plugins.exporters.ply_format.table import read_vertices, vertex_properties
 
 #: Property names in the order in which they are written.
 PROPERTIES = (
