@@ -34,7 +34,11 @@ HOMES = {
     ),
     "the centre of a camera": (r"-[\w.]+\[:3, :3\]\.T @ ", {SCENE}),
     "training seconds": (r"class (Clock|Seconds)\b", {f"{CORE}/training/clock.py"}),
-    "how a run ended": (r"^Status\b.*=", {f"{CORE}/run/results/summary.py"}),
+    "how a run ended": (
+        r"^Status\b.*=",
+        # An attempt of a sweep may also have died.
+        {f"{CORE}/run/results/summary.py", "plugins/crossgrad_plugins/sweep/records.py"},
+    ),
     "a calibration": (r"class (Pinhole|Camera)\b", {SCENE}),
     "the rule set of rasterizers": (
         r"^(ALPHA_THRESHOLD|TRANSMITTANCE_STOP|JACOBIAN_MARGIN)\b.*=",

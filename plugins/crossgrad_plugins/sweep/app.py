@@ -1,4 +1,4 @@
-"""What `crossgrad sweep` does."""
+"""A sweep from its grid to its summary."""
 
 import sys
 from collections.abc import Iterable, Sequence

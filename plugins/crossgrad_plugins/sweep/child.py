@@ -3,7 +3,7 @@
     python -m crossgrad_plugins.sweep.child CORES ARGUMENT ...
 
 CORES are the numbers of the cores that it may use, joined by commas, or `-` for any. Its standard
-input is a pipe from whoever started it; where that ends, the run is asked to stop.
+input is a pipe from its starter; where that ends, the run is asked to stop.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""What workers did: one append-only file of JSON lines for each, readable whatever ended them."""
+"""Records of workers: one append-only file of JSON lines for each, readable whatever ended them."""
 
 import json
 import os

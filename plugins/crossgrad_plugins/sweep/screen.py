@@ -1,4 +1,4 @@
-"""What a sweep shows while it runs: one live table on a terminal, elsewhere a line for each end."""
+"""The screen of a sweep: one live table on a terminal, elsewhere a line for each end."""
 
 import sys
 from datetime import UTC, datetime

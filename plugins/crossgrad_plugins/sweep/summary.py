@@ -1,4 +1,4 @@
-"""What a sweep has found: a table of means over seeds, and what failed."""
+"""The summary of a sweep: a table of means over seeds, and what failed."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, stdev
