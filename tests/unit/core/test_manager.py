@@ -2,13 +2,17 @@
 
 import types
 
+import pluggy
 import pytest
 from pydantic import BaseModel, ConfigDict
 
 from crossgrad_core.contract.contexts import Densified, Draw, Sampled
+from crossgrad_core.contract.marks import PROJECT
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
 from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 
 
 class Densifier:
@@ -201,3 +205,64 @@ def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
 def test_a_seam_without_plugins_is_an_error():
     with pytest.raises(UserError, match="plugins none"):
         call_seam(make_manager({}).hook.crossgrad_densify, None, Densified)
+
+
+class Marked:
+    @hookimpl
+    def plain(self): ...
+
+    @staticmethod
+    @hookimpl
+    def inner(): ...
+
+    @hookimpl
+    @staticmethod
+    def outer(): ...
+
+    @classmethod
+    @hookimpl
+    def of_class(cls): ...
+
+    @property
+    def evaluated(self):
+        raise AssertionError("a property is not evaluated")
+
+    def unmarked(self): ...
+
+
+class Inherited(Marked):
+    def plain(self): ...
+
+
+class Slotted:
+    __slots__ = ("held",)
+
+    def __init__(self, held):
+        self.held = held
+
+
+def with_own_attribute():
+    plugin = Marked()
+    plugin.own = Marked.plain
+    plugin.bound = plugin.plain
+    return plugin
+
+
+def module():
+    found = types.ModuleType("plugin")
+    found.plain = Marked.plain
+    return found
+
+
+@pytest.mark.parametrize(
+    "plugin",
+    [
+        Marked(), Inherited(), Inherited, Slotted(Marked.plain), Slotted(3), with_own_attribute(),
+        module(), AdaptiveDensityControl(), PCGrad(), object(),
+    ],
+    ids=lambda plugin: type(plugin).__name__,
+)  # fmt: skip
+def test_hooks_are_found_where_pluggy_finds_them(plugin):
+    ours, plain = make_manager({}), pluggy.PluginManager(PROJECT)
+    for name in dir(plugin):
+        assert ours.parse_hookimpl_opts(plugin, name) == plain.parse_hookimpl_opts(plugin, name)
