@@ -148,6 +148,21 @@ class RunConfig(BaseModel):
         "separate",
         description="One backward pass per view, or one for all views. Default: separate.",
     )
+    final_decay: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Over the last share of the steps, rates that are constant as published fade. "
+        "Default: 0.",
+    )
+    final_rate: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
+    average: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Evaluate and export the average of the parameters of the last share of the "
+        "steps. Default: 0.",
+    )
     device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
         "cpu", description="Where tensors live. Default: cpu."
     )

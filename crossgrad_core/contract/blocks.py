@@ -23,9 +23,14 @@ class LearningRate:
     initial: float
     final: float | None = None
 
+    @property
+    def decays(self) -> bool:
+        """Whether the rate changes over the schedule."""
+        return self.final is not None and self.initial not in {0.0, self.final}
+
     def at(self, progress: float) -> float:
         """The rate when a share `progress` of the schedule is over (clipped to [0, 1])."""
-        if self.final is None or self.initial in {0.0, self.final}:
+        if self.final is None or not self.decays:
             return self.initial
         u = min(max(progress, 0.0), 1.0)
         return exp((1.0 - u) * log(self.initial) + u * log(self.final))

@@ -38,6 +38,7 @@ from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.steady import notes_on
 from crossgrad_core.wording import listed, plural
 
 _LOG = logging.getLogger(__name__)
@@ -159,7 +160,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=choose_device(config.device),
         notes=tuple(notes),
     )
-    return replace(setup, notes=(*setup.notes, *_linear_note(setup), *idle_note(setup)))
+    return replace(
+        setup, notes=(*setup.notes, *_linear_note(setup), *idle_note(setup), *notes_on(config))
+    )
 
 
 def _with_first_degree(config: RunConfig) -> RunConfig:

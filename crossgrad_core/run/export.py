@@ -18,6 +18,7 @@ from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.steady import shown
 from crossgrad_core.training.views import eval_background
 
 
@@ -88,7 +89,7 @@ def export_scene(
     views = setup.train_views if view is None else (view,)
     with torch.no_grad():
         cameras = [each.camera for each in views]
-        baked = setup.backbone.bake(state.parameters, phase, cameras)
+        baked = setup.backbone.bake(shown(state), phase, cameras)
     exporter = exporter or setup.selection.exporter
     comments = (f"crossgrad step {state.step}",)
     notes = exporter.write(baked, setup.scene.similarity, path, comments)
@@ -136,18 +137,18 @@ def view_named(setup: Setup, name: str) -> View:
 
 
 def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
-    """Renders a view with the current parameters as an evaluation does, exposure included."""
+    """Renders a view with the parameters to be shown as an evaluation does, exposure included."""
     through = camera_renderer(setup, state)
     return lambda view: exposed(setup, state, view, through(view.camera))
 
 
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
-    """Renders what any camera sees with the current parameters, before any exposure."""
-    background = eval_background(setup)
+    """Renders what any camera sees with the parameters to be shown, before any exposure."""
+    background, parameters = eval_background(setup), shown(state)
     phase = setup.phase(state.step, training=False)
 
     def render_one(camera: Camera) -> Tensor:
-        gaussians = setup.backbone.decode(state.parameters, camera, phase)
+        gaussians = setup.backbone.decode(parameters, camera, phase)
         return setup.rasterizer.render(gaussians, camera, background).image
 
     return render_one

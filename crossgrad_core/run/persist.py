@@ -8,6 +8,7 @@ from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.contents import Checkpoint
+from crossgrad_core.training import steady
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.photo_parameters import check_photos_are
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
@@ -48,6 +49,9 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise _misfit(checkpoint, "the state of a run", in_one_line(error)) from error
     check_photos_are(setup, state)
+    average = state.states.get(steady.STATE)
+    if average is not None and not steady.fits(average, state.parameters):
+        raise _misfit(checkpoint, "sums in the shapes of the parameters", "another average")
     return state
 
 

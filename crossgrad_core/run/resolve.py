@@ -7,6 +7,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.steady import average_of, final_decay_of
 
 #: Slots that every run fills with one component.
 ALWAYS = (
@@ -40,6 +41,8 @@ def resolved(setup: Setup) -> RunConfig:
             "out": None,
             "views_per_step": selection.views_per_step,
             "steps": config.steps or setup.schedule.total,
+            "final_decay": final_decay_of(config),
+            "average": average_of(config),
         }
     )
 

@@ -18,6 +18,7 @@ from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
 
 _SLOTS = ("grouping", *ALWAYS)
@@ -53,6 +54,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_density_control(config, setup),
         *_of_groups(config, setup),
         *_of_the_split(config),
+        *_of_the_end(config, setup),
     ]
     if found:
         raise UserError(
@@ -123,6 +125,16 @@ def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
     lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
     if reading.split == "auto" and lists:
         yield "reading.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+
+
+def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """What is said about rates that fade, where none does."""
+    fades = final_decay_of(config) > 0.0
+    if config.final_rate != RunConfig.model_fields["final_rate"].default and not fades:
+        yield "final_rate", "no rate fades without --final-decay"
+    if config.final_decay and all(block.lr.decays for block in setup.trained_blocks):
+        name = setup.selection.names["backbone"]
+        yield "final_decay", f"backbone {name} has no constant rates"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

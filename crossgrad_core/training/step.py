@@ -34,6 +34,7 @@ from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.steady import average_of, faded, follow, restart
 from crossgrad_core.training.views import (
     Rendered,
     TensorGradients,
@@ -66,6 +67,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     _check_finite(state, rendered, gradients)
     state.laps.lap("aggregation")
     counts = _finish(setup, state, rendered, gradients, scale)
+    follow(setup, state)
     return StepRecord(
         step=state.step,
         views=draw.views,
@@ -165,7 +167,8 @@ def _optimize(
     progress = state.step / setup.schedule.lr_steps
     take_photo_step(setup, state, rendered.photos, progress)
     blocks = setup.trained_blocks
-    rates = {name: block.lr.at(progress) for block in blocks for name in block.tensors}
+    fades = partial(faded, setup.config, step=state.step, total=setup.schedule.total)
+    rates = {n: block.lr.at(progress) * fades(block.lr) for block in blocks for n in block.tensors}
     adam_step(state.parameters, gradients, state.adam, rates, scales=scale.to_sum)
     state.laps.lap("optimizer")
 
@@ -184,6 +187,8 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
     state.commit(answer.states)
     edited = apply_edit(setup, state, answer.edit)
+    if edited or answer.edit.values:
+        restart(state)
     state.laps.lap("density_control")
     return answer.edit, edited
 
@@ -198,7 +203,9 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
     )
     for answer in setup.hook.crossgrad_after_step(context=context):
         state.commit(answer.states)
-        apply_edit(setup, state, answer.edit)
+        # Noise and filters, which change in every step, are what an average takes away.
+        if apply_edit(setup, state, answer.edit):
+            restart(state)
 
 
 def _means_lr(setup: Setup, step: int) -> float:
@@ -234,6 +241,7 @@ def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
         separate=setup.separate,
         watched=bool(setup.watchers),
         joint=setup.joint,
+        averaged=average_of(setup.config) > 0.0,
     )
 
 

@@ -1,0 +1,75 @@
+"""How much the test PSNR still jumps at the end of runs: a table of runs that were trained before.
+
+    crossgrad sweep benchmarks/grids/steady_ends.yaml --scene SCENE
+    python benchmarks/steady_ends.py runs/sweeps/steady_ends
+
+Of each run the evaluations in the last tenth are taken, a straight line is fitted to their PSNR,
+and what is left is its jitter. Imports no torch.
+"""
+
+import argparse
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+
+from crossgrad_core.run.results.reading import RunResults, find_runs, read_run
+
+#: Fewer evaluations in the last tenth say nothing about jitter.
+FEWEST = 10
+LAST = 0.1
+
+
+def jitter(steps: Sequence[float], values: Sequence[float]) -> float:
+    """Standard deviation of values around their straight line over the steps, same units.
+
+    Two degrees of freedom are the line's.
+    """
+    x, y = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    rest = y - np.polyval(np.polyfit(x - x.mean(), y, 1), x - x.mean())
+    return float(np.sqrt((rest**2).sum() / (len(y) - 2)))
+
+
+def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
+    """Steps and PSNR of the evaluations in the last tenth of a run."""
+    total = max(float(row["step"] or 0) for row in run.rows)
+    rows = [row for row in run.rows if float(row["step"] or 0) > (1.0 - LAST) * total]
+    known = [(row["step"], row["psnr"]) for row in rows]
+    pairs = [(float(x), float(y)) for x, y in known if x is not None and y is not None]
+    return [x for x, _ in pairs], [y for _, y in pairs]
+
+
+def arm(run: RunResults) -> tuple[str, float, float]:
+    """Scene and what is done at the end of a run."""
+    shares = (run.config.get(name) or 0.0 for name in ("final_decay", "average"))
+    fades, averages = map(float, shares)
+    return Path(str(run.config["scene"])).name, fades, averages
+
+
+def main() -> None:
+    """Prints a line per scene and arm."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    found = defaultdict(list)
+    for folder in parser.parse_args().folders:
+        for path in find_runs(folder):
+            run = read_run(path)
+            steps, values = last_tenth(run) if run.summary is not None else ([], [])
+            if len(steps) >= FEWEST:
+                found[arm(run)].append((jitter(steps, values), values[-1], len(steps)))
+    print(
+        "| scene | rates fade over | averaged | runs | evaluations | jitter, dB | last PSNR, dB |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for (scene, fades, averages), runs in sorted(found.items()):
+        jitters, last, counts = zip(*runs, strict=True)
+        print(
+            f"| {scene} | {fades:.0%} | {averages:.0%} | {len(runs)} | {min(counts)} | "
+            f"{mean(jitters):.3f} (at most {max(jitters):.3f}) | {mean(last):.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
