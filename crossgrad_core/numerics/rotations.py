@@ -21,5 +21,9 @@ def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
 def rotation_matrices(quats: Tensor) -> Tensor:
     """[N, 3, 3] rotations of quaternions [N, 4], wxyz of any length; the identity of a zero one."""
     length = quats.norm(dim=-1, keepdim=True)
-    unit = quats / torch.where(length > 0, length, 1.0)
-    return torch.stack([torch.stack(row, -1) for row in matrix_rows(*unit.unbind(-1))], -2)
+    return unit_rotation_matrices(quats / torch.where(length > 0, length, 1.0))
+
+
+def unit_rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] rotations of quaternions [N, 4], wxyz of unit length."""
+    return torch.stack([torch.stack(row, -1) for row in matrix_rows(*quats.unbind(-1))], -2)

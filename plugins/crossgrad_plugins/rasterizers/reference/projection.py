@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from crossgrad_core.numerics.rotations import rotation_matrices
+from crossgrad_core.numerics.rotations import unit_rotation_matrices
 from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
 from crossgrad_core.plugin import Camera
 
@@ -59,8 +59,9 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     row_v = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1)
     jacobian = torch.stack([row_u, row_v], 1)  # [N, 2, 3]
 
-    # The covariance is factor @ factor.T.
-    factor = jacobian @ pose[:3, :3] @ (rotation_matrices(quats) * scales[:, None, :])  # [N, 2, 3]
+    # The covariance is factor @ factor.T. Of a zero quaternion, all of this is NaN.
+    axes = unit_rotation_matrices(quats / quats.norm(dim=-1, keepdim=True)) * scales[:, None, :]
+    factor = jacobian @ pose[:3, :3] @ axes  # [N, 2, 3]
     first, second = factor.unbind(1)
     # Cauchy-Binet: a sum of squares, where xx * yy - xy^2 would cancel for needles.
     det = torch.linalg.cross(first, second).square().sum(-1)
