@@ -75,7 +75,7 @@ class ViewRecord:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What happened in a step; observers see it, samplers see the last one.
+    """The record of a step; observers see it, samplers see the last one.
 
     Attributes:
         step: 1-based number of the step.
@@ -192,7 +192,7 @@ def unexposed(_view: View, image: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class StepContext:
-    """What every seam may know about the step.
+    """The context of a step, common to all seams.
 
     Attributes:
         step: 1-based number of the step.
@@ -369,7 +369,7 @@ class AfterStepContext(StepContext):
 
 @dataclass(frozen=True)
 class Answer:
-    """What every seam's answer carries: new states by plugin name."""
+    """The part common to the answers of all seams: new states by plugin name."""
 
     states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
 
@@ -421,7 +421,7 @@ class Densified(Answer):
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """What observers learn when a run starts.
+    """The run at its start, for observers.
 
     Attributes:
         folder: The output folder; None where nothing is written.
@@ -474,7 +474,7 @@ class Model:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """What observers learn after an evaluation.
+    """An evaluation, for observers.
 
     Attributes:
         step: The step.
@@ -489,7 +489,7 @@ class EvaluationReport:
 
 @dataclass(frozen=True, eq=False)
 class OperatorContext:
-    """What a Gramian operator may know besides the Gramians.
+    """The context of a Gramian operator, besides the Gramians.
 
     Attributes:
         step: 1-based number of the step.

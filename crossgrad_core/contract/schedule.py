@@ -141,7 +141,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Phase:
-    """What a backbone may know about the moment it decodes in."""
+    """The moment in which a backbone decodes: step, schedule, training or evaluation."""
 
     step: int
     training: bool

@@ -12,7 +12,7 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 
 @dataclass(frozen=True)
 class PluginState:
-    """What one plugin remembers between steps.
+    """The state of one plugin between steps.
 
     Attributes:
         values: Plain numbers, strings, lists and dictionaries (must survive JSON).

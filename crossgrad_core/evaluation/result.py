@@ -47,7 +47,7 @@ class Means:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """What an evaluation found.
+    """The results of an evaluation.
 
     Attributes:
         figures: What was measured, in the order of all tables.

@@ -12,7 +12,7 @@ from crossgrad_core.gradients.columns import Column, is_native
 
 
 class Passes(Protocol):
-    """What both modules of passes offer for single columns; see `generic`."""
+    """The passes over single columns that both modules offer; see `generic`."""
 
     def overlap(self, column: Column, first: int, second: int) -> bool:
         """Whether two views share a non-zero element's place."""

@@ -38,7 +38,7 @@ class _Manager(pluggy.PluginManager):
 
 
 def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
-    """A fresh manager that knows the hooks and the given plugins.
+    """A fresh manager with the hooks and the given plugins registered.
 
     Args:
         plugins: Name -> plugin. Of two wrappers of one seam the later one is the outer one.

@@ -31,7 +31,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Opens(Protocol):
-    """What opens a run."""
+    """A way of opening a run."""
 
     def open(self, folder: Path) -> tuple[Setup, TrainState]:
         """The run's setup and its newest state."""

@@ -57,7 +57,7 @@ FAILED = 1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What has become of a run.
+    """The outcome of a run.
 
     Attributes:
         folder: Where its results are.

@@ -24,7 +24,7 @@ from crossgrad_core.training.views import eval_background
 
 @dataclass(frozen=True)
 class Exported:
-    """What is in a file.
+    """The contents of an exported file.
 
     Attributes:
         gaussians: Number of Gaussians.

@@ -11,7 +11,7 @@ from crossgrad_core.registry.entries import entries, load
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a run asks of its rasterizer.
+    """The demands of a run on its rasterizer.
 
     Attributes:
         device: Torch device type.

@@ -12,7 +12,7 @@ _TOLERANCE = 10.0 ** (1 - DECIMALS)
 
 
 class Weight(IntEnum):
-    """What a difference means for a model that was trained on the former scene."""
+    """The weight of a difference for a model that was trained on the former scene."""
 
     #: Pixels or points are others; every camera and every parameter is where it was.
     CONTENT = 1

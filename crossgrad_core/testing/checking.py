@@ -20,7 +20,7 @@ AnyCheck: TypeAlias = Callable[[Any], None]
 
 @dataclass(frozen=True)
 class Result:
-    """What one check of one plugin found.
+    """The result of one check of one plugin.
 
     Attributes:
         check: Name of the check.

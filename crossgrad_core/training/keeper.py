@@ -5,7 +5,7 @@ from crossgrad_core.training.state import Mark, Snapshot, TrainState
 
 
 class Keeper:
-    """Knows the state before the step under way, and a copy of an earlier good one.
+    """Holds the state before the step under way, and a copy of an earlier good one.
 
     Most of what can go wrong in a step (sampling, a photo, rendering, an operator, the memory)
     does so before parameters change: then only the step under way is lost. Where an optimizer step

@@ -68,7 +68,7 @@ def _cgroup_available() -> int | None:
 
 @dataclass(frozen=True)
 class Demand:
-    """What a step keeps for each primitive, at the worst moment.
+    """Memory that a step keeps for each primitive, at the worst moment.
 
     Attributes:
         parameters: Bytes of its parameters.

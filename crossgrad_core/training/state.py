@@ -17,7 +17,7 @@ from crossgrad_core.training.setup import Setup
 
 @dataclass
 class Counters:
-    """What was done so far.
+    """Counts of the work done so far.
 
     Attributes:
         views: Rendered training views.

@@ -151,7 +151,7 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a render of a view is made with and compared with.
+    """The camera of a render of a view, and the photo it is compared with.
 
     Attributes:
         camera: The camera to render with.

@@ -25,14 +25,20 @@ WORDS = {
 FOUND = re.compile(rf"\b({'|'.join(WORDS)})\b", re.IGNORECASE)
 
 
-def opening(path):
-    """The first words of a module's docstring."""
-    return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+def riddles(path):
+    """The modules and classes of a file whose docstring does not begin with what they are."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    things = [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]
+    return [
+        getattr(each, "name", path.name)
+        for each in things
+        if (ast.get_docstring(each) or "").startswith("What ")
+    ]
 
 
-def test_modules_say_what_they_are():
-    """`What X share` and `What is known of X` are riddles; a module has a name."""
-    assert not [str(path.relative_to(ROOT)) for path in CODE if opening(path).startswith("What ")]
+def test_modules_and_classes_say_what_they_are():
+    """`What X share` and `What is known of X` are riddles; a thing has a name."""
+    assert not {str(path.relative_to(ROOT)): found for path in CODE if (found := riddles(path))}
 
 
 @pytest.mark.parametrize("paths", [CODE, PAGES], ids=["code", "pages"])

@@ -20,7 +20,7 @@ _UNSAFE = re.compile(r"[^\w.+-]+")
 
 @dataclass(frozen=True)
 class RunName:
-    """What a run is called after.
+    """The parts of a run's name.
 
     Attributes:
         scene: Name of the scene.

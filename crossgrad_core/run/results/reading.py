@@ -20,7 +20,7 @@ from crossgrad_core.run.results.summary import read_summary
 
 @dataclass(frozen=True)
 class RunResults:
-    """What a run's folder says.
+    """The results in a run's folder.
 
     Attributes:
         folder: The folder.

@@ -28,7 +28,7 @@ RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What summary.json says.
+    """The contents of summary.json.
 
     Attributes:
         status: How the run ended.

@@ -47,7 +47,7 @@ CHANGES = 12
 
 
 class Rounding(NamedTuple):
-    """What follows from the digits that the cosines have.
+    """Bounds that follow from the digits that the cosines have.
 
     Attributes:
         exact: True for 32 digits, None for 16.

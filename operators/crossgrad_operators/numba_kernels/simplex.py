@@ -133,7 +133,7 @@ def mgda(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -> 
 
 
 class Search(NamedTuple):
-    """What CAGrad looks for: the level at which the nearest point to g_0 is at distance rho.
+    """CAGrad as a search: for the level at which the nearest point to g_0 is at distance rho.
 
     Attributes:
         q: [K] e_k.g_0.

@@ -22,7 +22,7 @@ UNRELATED = "1e-14"
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What an oracle is asked.
+    """A question to an oracle.
 
     Attributes:
         gramian: [n][n] exact Gramian of the views that have a gradient.

@@ -40,7 +40,7 @@ APART: Final = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """What sets are stated in: B Gramians, as norms and cosines, and their exact answers.
+    """The terms in which sets are stated: B Gramians, as norms and cosines, and exact answers.
 
     Attributes:
         norms: [B, K] lengths of the gradients, 0 where a view is not present.
@@ -178,7 +178,7 @@ def hull_apart(facts: Facts) -> Flags:
 
 @dataclass(frozen=True)
 class Promise:
-    """What is promised of one operator.
+    """The promise of one operator.
 
     Attributes:
         words: The set, in words and formula.

@@ -59,7 +59,7 @@ def _between(gramian: Matrix, factors: Sequence[Number]) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What exact arithmetic says.
+    """The answer of exact arithmetic.
 
     Attributes:
         weights: [K]; zero for views that have no gradient.

@@ -53,7 +53,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What an operator is held against.
+    """The reference that an operator is held against.
 
     Attributes:
         oracle: Exact weights, for operators that have them.

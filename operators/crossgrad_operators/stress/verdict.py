@@ -31,7 +31,7 @@ ElementRule = Callable[[Case, Tensor], float]
 
 @dataclass(frozen=True)
 class Finding:
-    """What is to be said about one result.
+    """The verdict on one result.
 
     Attributes:
         verdict: `ok`; `undetermined`: kappa u > 0.1 and finite; `outside`: not in the set on which

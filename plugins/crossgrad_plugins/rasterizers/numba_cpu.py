@@ -63,7 +63,7 @@ class NumbaRasterizer(Rasterizer):
 
 
 class _Call:
-    """What autograd must carry besides tensors."""
+    """Values that autograd must carry besides tensors."""
 
     def __init__(
         self,

@@ -33,7 +33,7 @@ SWEEPS = Path("runs/sweeps")
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked for.
+    """The request of the user.
 
     Attributes:
         path: The grid file.

@@ -77,7 +77,7 @@ class Arm(_Part):
 
 
 class Metric(_Part):
-    """What the table at the end shows.
+    """A column of the table at the end.
 
     Attributes:
         name: A figure of the held-out views, as in summary.json.
@@ -89,7 +89,7 @@ class Metric(_Part):
 
 
 class Grid(_Part):
-    """What a grid file says.
+    """The contents of a grid file.
 
     Attributes:
         name: Its name; that of the file by default.

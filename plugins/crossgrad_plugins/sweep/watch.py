@@ -26,7 +26,7 @@ class UnderWay:
 
 @dataclass
 class Watch:
-    """What happened since the sweep began.
+    """The events since the sweep began.
 
     Attributes:
         layout: Folder of the sweep.

@@ -13,7 +13,7 @@ Layer = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is constant in the decoding of a view; A of P anchors are seen.
+    """Constants in the decoding of a view; A of P anchors are seen.
 
     Attributes:
         positions: [P, 3].
@@ -61,7 +61,7 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What the backward pass needs besides the inputs; G Gaussians are drawn.
+    """Values kept for the backward pass besides the inputs; G Gaussians are drawn.
 
     Attributes:
         joined: [A or more, F + V] inputs of the networks, padded with rows of 0.

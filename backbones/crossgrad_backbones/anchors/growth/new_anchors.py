@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Urge:
-    """What the offsets of the present anchors ask for.
+    """New anchors at offsets of the present ones.
 
     Attributes:
         gradient: [P, k] mean gradient norm of each offset, NDC.

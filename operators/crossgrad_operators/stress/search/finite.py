@@ -24,7 +24,7 @@ BATCH, ELEMENTS = 1000, 20
 
 @dataclass(frozen=True, eq=False)
 class Finite:
-    """What was found of one operator.
+    """The findings for one operator.
 
     Attributes:
         operator: Its name.

@@ -26,7 +26,7 @@ def multiplicities(size: int, resamples: int, rng: np.random.Generator) -> _Arra
 
 @dataclass(frozen=True, eq=False)
 class GroupResamples:
-    """What one group contributes, for each of R + 1 resamples.
+    """The contribution of one group, for each of R + 1 resamples.
 
     Attributes:
         counts: [R + 1, n] multiplicities.

@@ -63,7 +63,7 @@ class _Draft:
 
 @dataclass(frozen=True)
 class Header:
-    """What a PLY header says; `byte_order` is None for ascii files."""
+    """The contents of a PLY header; `byte_order` is None for ascii files."""
 
     byte_order: str | None
     elements: tuple[Element, ...]

@@ -23,7 +23,7 @@ REMEMBERED_ENTRIES = 2**21
 
 @dataclass(frozen=True)
 class Drawing:
-    """What all tiles of an image share.
+    """Data common to all tiles of an image.
 
     Attributes:
         size: Width and height of the image, pixels.
@@ -52,7 +52,7 @@ def composite_tiles(
     Args:
         table: [V, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
         lists: The rows of each tile.
-        drawing: What all tiles share.
+        drawing: Data common to all tiles.
 
     Returns:
         `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as of `composite`.
@@ -90,7 +90,7 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
     Args:
         table: [G, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
         centers: [P, 2] pixel centres.
-        drawing: What all tiles share.
+        drawing: Data common to all tiles.
 
     Returns:
         `channels` [P, 5]: RGB, depth and accumulated opacity, without background; `touched` [G]

@@ -33,7 +33,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Work:
-    """What an engine is given.
+    """The arguments of an engine.
 
     Attributes:
         jobs: The runs in their order.
