@@ -327,7 +327,8 @@ def with_steps(setup: "Setup", steps: int) -> "Setup":
     """The run with the published schedule stretched to so many steps, whatever fills its slots."""
     from crossgrad_core.contract.schedule import Schedule
 
-    return replace(setup, schedule=Schedule.for_run(steps, setup.config.schedule))
+    counting = setup.schedule.counting
+    return replace(setup, schedule=Schedule.for_run(steps, setup.config.schedule, counting))
 
 
 def affordable_steps(setup: "Setup", seconds: float) -> int:

@@ -8,8 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator,
 
 from crossgrad_core import defaults
 from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS, TRAINING, Flag
+from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.contract.schedule import ScheduleMode
+from crossgrad_core.contract.schedule import ScheduleMode, Unit
 
 #: Name of a choice that the run makes at its start.
 AUTO: Final = "auto"
@@ -112,11 +113,16 @@ class RunConfig(BaseModel):
         (), description="Adds an observer, repeatable."
     )
 
-    views_per_step: Annotated[int | None, Flag("K", TRAINING, "views")] = Field(
-        None, ge=1, description="Views per step. Default: the sampler's."
+    views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
+        None,
+        description="Views per step, K; 1..2@0.5 changes it after that share of the steps. "
+        "Default: the sampler's.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None, ge=1, description="Optimizer steps; every schedule stretches with them."
+    )
+    max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
+        None, ge=1, description="Length of the run in views: as many steps as draw them."
     )
     seconds: Annotated[float | None, Flag("S", TRAINING)] = Field(
         None, gt=0, description="Training seconds; the number of steps follows the clock."
@@ -132,10 +138,25 @@ class RunConfig(BaseModel):
         description="Stretch the published schedule to the run, or keep its numbers. "
         "Default: scaled.",
     )
-    densify_from: int | None = Field(None, ge=0, description="density control after this step ...")
-    densify_until: int | None = Field(None, ge=0, description="... and before this one")
-    densify_every: int | None = Field(None, ge=1, description="steps between its edits")
-    reset_every: int | None = Field(None, ge=1, description="steps between opacity resets")
+    reference: Annotated[int | None, Flag("N", TRAINING)] = Field(
+        None,
+        ge=1,
+        description="With --schedule absolute: have the schedule of a run of that length. "
+        "Default: 30000.",
+    )
+    events: Annotated[Unit | None, Flag("views|steps", TRAINING)] = Field(
+        None,
+        description="What schedules count. Default: views; steps with --preset inria, and with "
+        "--schedule absolute without --reference.",
+    )
+    densify_from: int | None = Field(
+        None, ge=0, description="density control after this, counted in --events ..."
+    )
+    densify_until: int | None = Field(None, ge=0, description="... and before this")
+    densify_every: int | None = Field(None, ge=1, description="interval of its edits, likewise")
+    reset_every: int | None = Field(
+        None, ge=1, description="interval of opacity resets, counted in --events"
+    )
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
@@ -216,6 +237,14 @@ class RunConfig(BaseModel):
     def _chain(cls, value: object) -> object:
         return tuple(value) if isinstance(value, list) else value
 
+    @field_validator("views_per_step")
+    @classmethod
+    def _views_per_step(cls, value: int | str | None) -> int | str | None:
+        """A number as a number, and a change of K in its one form."""
+        if value is None:
+            return None
+        return ViewPlan.parsed(str(value)).setting
+
     @field_validator("background")
     @classmethod
     def _background(cls, value: str) -> str:
@@ -228,6 +257,11 @@ class RunConfig(BaseModel):
         if not all(0.0 <= level <= 1.0 for level in (red, green, blue)):
             raise ValueError("must be black, white, random, or three numbers r,g,b in [0, 1]")
         return value
+
+    @property
+    def view_plan(self) -> ViewPlan | None:
+        """How many views the steps have; None where it is left to the sampler."""
+        return None if self.views_per_step is None else ViewPlan.parsed(str(self.views_per_step))
 
     @property
     def operators(self) -> tuple[ComponentChoice, ...]:

@@ -117,6 +117,7 @@ def renews(schedule: Schedule, step: int) -> bool:
 
     As published: every 100 of 30,000 steps once density control is over, until 100 before the end.
     """
-    every = max(1, schedule.lr_steps // 300)
-    inside = schedule.lr_steps // 2 < step <= schedule.total - every
-    return inside and step % every == 0
+    every = max(1, schedule.lr_until // 300)
+    last = schedule.counted(schedule.total) - every
+    inside = schedule.lr_until // 2 < schedule.counted(step) <= last
+    return inside and schedule.reaches(step, every)

@@ -150,12 +150,12 @@ class Octree(AnchorBackbone):
     def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
         """The finest level that is open; None where all are."""
         span = phase.schedule.coarse_until
-        if not (self.progressive and phase.training and phase.step < span):
+        if not (self.progressive and phase.training and phase.count < span):
             return None
         last = Lattice.of(parameters["lattice"]).count - 1
         initial = (last + 1) // 2 if self.init_level < 0 else self.init_level
         openings = opening_steps(span, max(0, last - initial), self.coarse_factor)
-        return allowed_top(phase.step, openings, initial)
+        return allowed_top(phase.count, openings, initial)
 
     @override
     def bake(

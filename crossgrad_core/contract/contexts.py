@@ -221,7 +221,7 @@ class SampleContext(StepContext):
     """For `crossgrad_sample_views`.
 
     Attributes:
-        views_per_step: K.
+        views_per_step: K of this step.
         groups: Label of each training view, or None where no grouping was made.
         centers: [N, 3] float64 camera centres of the training views, local frame.
         last: Record of the step before, None in the first one.

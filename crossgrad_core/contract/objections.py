@@ -21,24 +21,26 @@ def objections_to(selection: Selection) -> list[str]:
 
 def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
     """Numbers of views for which the operator, named as the selection's, means nothing."""
-    name, views = selection.names["operator"], selection.views_per_step
-    if not operator.views.admits(views):
-        return [f"operator {name} needs {operator.views} (--views); K is {views}"]
-    counts = sorted(selection.sampler.counts(views))
-    if all(map(operator.views.admits, counts)):
-        return []
-    listed = ", ".join(map(str, counts))
-    return [
-        f"operator {name} needs {operator.views}; with sampler {selection.names['sampler']} steps "
-        f"have {listed} views"
-    ]
+    name, needed, found = selection.names["operator"], operator.views, []
+    for views in selection.views.counts:
+        counts = sorted(selection.sampler.counts(views))
+        if not needed.admits(views):
+            found.append(f"operator {name} needs {needed} (--views); K is {views}")
+        elif not all(map(needed.admits, counts)):
+            listed = ", ".join(map(str, counts))
+            found.append(
+                f"operator {name} needs {needed}; with sampler {selection.names['sampler']} steps "
+                f"have {listed} views"
+            )
+    return found
 
 
 def _of_the_sampler(selection: Selection) -> Iterator[str]:
-    sampler, views, labels = selection.sampler, selection.views_per_step, selection.labels
+    sampler, labels = selection.sampler, selection.labels
     name = selection.names["sampler"]
-    if not sampler.view_counts.admits(views):
-        yield f"sampler {name} needs {sampler.view_counts} (--views); K is {views}"
+    for views in selection.views.counts:
+        if not sampler.view_counts.admits(views):
+            yield f"sampler {name} needs {sampler.view_counts} (--views); K is {views}"
     if sampler.groups is not None and labels is not None and len(labels) != sampler.groups:
         yield (
             f"sampler {name} draws from {sampler.groups} groups; grouping "

@@ -1,47 +1,84 @@
-"""When things happen, in optimizer steps (1-based: the first step is step 1)."""
+"""When things happen: counted in the views that the steps have drawn, or in the steps."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
 
-ScheduleMode = Literal["scaled", "absolute"]
+from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewPlan
 
-#: The length that every published figure is written for (3DGS).
-REFERENCE_STEPS = 30_000
+ScheduleMode = Literal["scaled", "absolute"]
+Unit = Literal["views", "steps"]
+
+#: The length that every published figure is written for (3DGS), which has one view per step.
+REFERENCE = 30_000
 #: Learning rates of colour, scale and opacity are not stretched with the run, so the first
 #: transient always takes some hundred steps. Gradients are large everywhere during it, and growing
 #: then copies Gaussians that only had to settle.
 SHORTEST_WARM_UP = 500
-#: The statistics of so many steps decide about growth, at least (the published interval).
+#: The statistics of so much decide about growth, at least (the published interval).
 SHORTEST_INTERVAL = 100
 #: The same for anchors, which count by offset and keep what was too rarely seen to be judged. Half
 #: the published interval: growth of anchors is what short runs lack (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
+#: Where edits are counted in views, a run has at least so many, however short it is: warm-up and
+#: interval, which are the least of a longer run, give way.
+FEWEST_EDITS = 6
+#: ... but not below this: what fewer views say of gradients makes nearly everything grow.
+LEAST_INTERVAL = 8
+
+
+@dataclass(frozen=True)
+class Counting:
+    """What a schedule counts, and what it has to know for that.
+
+    Attributes:
+        unit: Whether the schedule's numbers are views or steps.
+        views: How many views the steps have.
+        photos: Training photos: an edit has the statistics of at least so many views, where the
+            run is long enough.
+        reference: For which length the schedule counts, where that is not the run's own or the
+            published one.
+    """
+
+    unit: Unit = "steps"
+    views: ViewPlan = ONE_VIEW
+    photos: int = 1
+    reference: int | None = None
+
+
+IN_STEPS = Counting()
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """All schedule lengths of one run, in optimizer steps.
+    """All schedule lengths of one run, counted in views or in steps; `total` is in steps.
 
     Attributes:
         mode: Whether the published schedule was stretched with the run.
-        total: Length of the run.
-        lr_steps: Length of the log-linear learning-rate decay.
-        sh_interval: The SH degree grows by one every so many steps.
-        densify_from: Density control edits after this step ...
-        densify_until: ... and before this one.
+        total: Length of the run, in steps.
+        length: The length that the schedule is written for: the run's own where it was stretched.
+        lr_until: The log-linear learning-rate decay ends here.
+        sh_interval: The SH degree grows by one at every multiple of it.
+        densify_from: Density control edits after this: where views are counted, at every interval
+            from it on, where steps are, at multiples of the interval ...
+        densify_until: ... and before this.
         densify_every: Interval of edits.
         reset_every: Interval of opacity resets; None where there are none.
-        anchors_from: Anchor growing starts after this step.
+        anchors_from: Anchor growing starts after this.
         anchors_every: Interval of anchor growing.
-        coarse_until: Backbones that train from coarse to fine have all levels from this step on.
+        coarse_until: Backbones that train from coarse to fine have all levels from here on.
         sh_from: SH degree at the first step.
+        counting: What is counted.
+        pace: K of every step.
+        edits_before: Edits before `densify_from` in a run whose length followed the clock.
+        fewest_edits: Edits that another length of the run leaves, if there is room for them.
     """
 
     mode: ScheduleMode
     total: int
-    lr_steps: int
+    length: int
+    lr_until: int
     sh_interval: int
     densify_from: int
     densify_until: int
@@ -51,37 +88,85 @@ class Schedule:
     anchors_every: int
     coarse_until: int
     sh_from: int = 0
+    counting: Counting = IN_STEPS
+    pace: Pace = ONE_BY_ONE
+    edits_before: int = 0
+    fewest_edits: int = 0
 
     @classmethod
-    def for_run(cls, total: int, mode: ScheduleMode = "scaled") -> "Schedule":
+    def for_run(
+        cls, total: int, mode: ScheduleMode = "scaled", counting: Counting = IN_STEPS
+    ) -> "Schedule":
         """The schedule of a run of `total` steps.
 
-        `scaled` stretches the published 30,000-step schedule with floors; `absolute` keeps the
-        published numbers whatever the length.
+        `scaled` stretches the published schedule to the run, with floors; `absolute` keeps the
+        published numbers whatever the length, or has those of the reference length.
         """
-        if mode == "absolute":
-            coarse = min(REFERENCE_STEPS // 4, total // 2)
-            return cls(
-                mode, total, REFERENCE_STEPS, 1000, 500, 15_000, 100, 3000, 1500, 100, coarse
-            )
-        return cls(
+        pace = counting.views.paced(total)
+        own = pace.views(total) if counting.unit == "views" else total
+        length = own if mode == "scaled" else counting.reference or REFERENCE
+        published = mode == "absolute" and counting.reference is None
+        schedule = cls(
             mode=mode,
             total=total,
-            lr_steps=total,
-            sh_interval=max(100, total // 30),
-            densify_from=max(total // 60, SHORTEST_WARM_UP),
-            densify_until=total // 2,
-            densify_every=max(SHORTEST_INTERVAL, total // 300),
-            reset_every=total // 10 if total >= SHORTEST_RUN_WITH_RESET else None,
-            anchors_from=total // 20,
-            anchors_every=max(SHORTEST_ANCHOR_INTERVAL, total // 300),
-            coarse_until=total // 4,
+            length=length,
+            lr_until=length,
+            sh_interval=max(100, length // 30),
+            densify_from=max(length // 60, SHORTEST_WARM_UP),
+            densify_until=length // 2,
+            densify_every=max(SHORTEST_INTERVAL, length // 300),
+            reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
+            anchors_from=length // 20,
+            anchors_every=max(SHORTEST_ANCHOR_INTERVAL, length // 300),
+            coarse_until=min(length // 4, own // 2),
+            counting=counting,
+            pace=pace,
+            fewest_edits=FEWEST_EDITS if counting.unit == "views" and not published else 0,
         )
+        return schedule.with_edits(until=schedule.densify_until)
+
+    def with_edits(
+        self, *, until: int, start: int | None = None, every: int | None = None
+    ) -> "Schedule":
+        """The schedule with another window of density control.
+
+        Where edits are counted in views, interval and start are fitted to it: an interval is at
+        least a pass over the training photos, and there are at least `FEWEST_EDITS`.
+
+        Args:
+            until: Edits end before this.
+            start: They begin after this; by default where they do in 3DGS.
+            every: Their interval; by default that of 3DGS.
+        """
+        start = max(self.length // 60, SHORTEST_WARM_UP) if start is None else start
+        every = max(SHORTEST_INTERVAL, self.length // 300) if every is None else every
+        if self.fewest_edits:
+            start, every = _fitted(start, until - 1, every, self.counting.photos)
+        return replace(self, densify_from=start, densify_until=until, densify_every=every)
+
+    def counted(self, step: int) -> int:
+        """The count after a step: of the views drawn by then, or of the steps."""
+        return self.pace.views(step) if self.counting.unit == "views" else step
+
+    def step_of(self, count: int) -> int:
+        """The first step after which the count is at least `count`."""
+        return self.pace.step_of(count) if self.counting.unit == "views" else count
+
+    def reaches(self, step: int, every: int) -> bool:
+        """Whether the count reaches a multiple of `every` in this step."""
+        return self.counted(step) // every > self.counted(step - 1) // every
+
+    def progress(self, step: int) -> float:
+        """The share of the learning-rate decay that is over after a step; above 1 behind it."""
+        return self.counted(step) / self.lr_until
 
     def edits(self, after: int = 0) -> int:
-        """Number of steps behind `after` that density control follows with an edit."""
-        passed = max(after, self.densify_from) // self.densify_every
-        return max(0, (self.densify_until - 1) // self.densify_every - passed)
+        """Number of steps behind step `after` that density control follows with an edit."""
+        first = self.next_edit(self.counted(after))
+        ahead = range(first, self.densify_until, self.densify_every)
+        if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
+            return len(ahead)
+        return len({self.pace.step_of(count) for count in ahead})
 
     @property
     def grows(self) -> bool:
@@ -91,52 +176,114 @@ class Schedule:
     @property
     def first_edit(self) -> int:
         """The first step after which density control edits, where it edits at all."""
-        return (self.densify_from // self.densify_every + 1) * self.densify_every
+        return self.step_of(self.next_edit(0))
+
+    def next_edit(self, count: int) -> int:
+        """The count at which the first edit behind `count` is due, were there no end of them."""
+        # Steps are those that the interval divides, as published.
+        every, origin = self.densify_every, 0
+        if self.counting.unit == "views":
+            origin = self.densify_from
+        behind = max(count, self.densify_from)
+        return origin + ((behind - origin) // every + 1) * every
 
     def lengthened(self, wanted: "Schedule", step: int) -> "Schedule":
         """This schedule with the length of another one, from the end of a step on.
 
         The ends of the run, of the learning-rate decay and of density control move as far as they
-        are still ahead. Intervals stay, so that nothing happens twice or is left out; density
-        control that is over does not come back, and no level closes that was open.
+        are still ahead, and so does a change of K. Intervals stay, so that nothing happens twice or
+        is left out; density control that is over does not come back, and no level closes that was
+        open. Edits that are counted in views are planned anew: those that are left out before the
+        first one, and the interval of the others where there would be too few.
 
         Args:
             wanted: The schedule of a run that was as long from its start.
             step: The step that the run has reached.
         """
-        over = step >= self.densify_until
-        return replace(
+        over = self.counted(step) >= self.densify_until
+        longer = replace(
             self,
             total=wanted.total,
-            lr_steps=wanted.lr_steps,
-            densify_until=self.densify_until if over else max(step, wanted.densify_until),
+            length=wanted.length,
+            lr_until=wanted.lr_until,
+            pace=self.pace.moved(wanted.pace, step),
             coarse_until=min(self.coarse_until, wanted.coarse_until),
         )
+        if over:
+            return longer
+        if self.fewest_edits:
+            return _with_edits_ahead(longer, wanted, step)
+        return replace(longer, densify_until=max(self.counted(step), wanted.densify_until))
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
         """Active spherical-harmonics degree at a step."""
-        return min(maximum, self.sh_from + step // self.sh_interval)
+        return min(maximum, self.sh_from + self.counted(step) // self.sh_interval)
 
     def densifies(self, step: int) -> bool:
         """Whether density control edits the primitives after this step."""
-        inside = self.densify_from < step < self.densify_until
-        return inside and step % self.densify_every == 0
+        edit = self.next_edit(self.counted(step - 1))
+        return edit <= self.counted(step) and edit < self.densify_until
 
     def collects(self, step: int) -> bool:
         """Whether densification statistics of this step are still needed."""
-        return step < self.densify_until
+        return self.counted(step - 1) + 1 < self.densify_until
 
     def prunes_large(self, step: int) -> bool:
         """Whether an edit after this step removes what is large in the world.
 
         After the first opacity reset, as published, and never where there is none.
         """
-        return self.reset_every is not None and step > self.reset_every
+        return self.reset_every is not None and self.counted(step - 1) >= self.reset_every
 
     def resets(self, step: int) -> bool:
         """Whether opacities are reset after this step."""
         every = self.reset_every
-        return every is not None and step < self.densify_until and step % every == 0
+        if every is None or not self.reaches(step, every):
+            return False
+        return self.counted(step) // every * every < self.densify_until
+
+
+def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:
+    """The schedule from the end of a step on, with the edits of a run of the wanted length."""
+    now = schedule.counted(step)
+    done = schedule.edits_before + schedule.edits() - schedule.edits(step)
+    missing = max(0, schedule.fewest_edits - done)
+    every, until = wanted.densify_every, max(now, wanted.densify_until)
+    if done:
+        start = schedule.next_edit(now) - schedule.densify_every
+    else:
+        start = wanted.densify_from if wanted.next_edit(0) > now else now
+    needed = start + missing * every + 1
+    if needed > until:
+        # A run that turns out far shorter than it was planned still has its edits.
+        until = max(until, min(needed, (now + schedule.counted(schedule.total)) // 2))
+        every = max(LEAST_INTERVAL, (until - 1 - start) // missing)
+    return replace(
+        schedule,
+        densify_from=start,
+        densify_until=until,
+        densify_every=every,
+        edits_before=done,
+    )
+
+
+def _fitted(start: int, last: int, every: int, photos: int) -> tuple[int, int]:
+    """Start and interval with which `FEWEST_EDITS` come no later than `last`, if they can.
+
+    Args:
+        start: Wanted start.
+        last: Count of the last edit, at most.
+        every: Wanted interval.
+        photos: The interval is at least so long where that leaves enough edits.
+    """
+    every = max(every, photos)
+    wanted = start + FEWEST_EDITS * every
+    if wanted > last:
+        shrunk = every * max(0, last) // wanted
+        every = photos if shrunk < photos <= last // FEWEST_EDITS else shrunk
+        every = max(every, LEAST_INTERVAL)
+        start = max(0, min(start, last - FEWEST_EDITS * every))
+    return start, every
 
 
 @dataclass(frozen=True)
@@ -146,3 +293,8 @@ class Phase:
     step: int
     training: bool
     schedule: Schedule
+
+    @property
+    def count(self) -> int:
+        """The schedule's count after the step."""
+        return self.schedule.counted(self.step)

@@ -13,6 +13,7 @@ from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
@@ -34,11 +35,12 @@ class Selection:
         exporter: What writes the trained scene to a file.
         metrics: What is measured of held-out views, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
-        views_per_step: K.
+        views_per_step: K; the largest one where it changes.
         device: Torch device type.
         grouping: The grouping; None where the views have no groups.
         labels: Labels that training views have by the grouping; None where it is not known yet, or
             where there is no grouping.
+        view_plan: K over the run; None where it is always `views_per_step`.
     """
 
     backbone: Backbone
@@ -56,6 +58,12 @@ class Selection:
     device: str
     grouping: Grouping | None = None
     labels: tuple[str, ...] | None = None
+    view_plan: ViewPlan | None = None
+
+    @property
+    def views(self) -> ViewPlan:
+        """K over the run."""
+        return self.view_plan or ViewPlan((self.views_per_step,))
 
     @property
     def components(self) -> dict[str, Component]:

@@ -49,6 +49,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -171,18 +172,20 @@ def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]
 
 def with_defaults(config: RunConfig) -> RunConfig:
     """The configuration with scene and length filled in."""
-    if config.steps is not None and config.seconds is not None:
+    lengths = {"steps": config.steps, "views": config.max_views, "seconds": config.seconds}
+    given = {unit: length for unit, length in lengths.items() if length is not None}
+    if len(given) > 1:
         raise UserError(
-            "a run has either a number of steps or of seconds",
-            where="--steps, --seconds",
-            found=f"{config.steps} steps and {config.seconds:g} seconds",
-            todo="leave one of them out",
+            "a run has one length: in steps, in views or in seconds",
+            where="--steps, --max-views, --seconds",
+            found=listed(f"{length:g} {unit}" for unit, length in given.items()),
+            todo="leave all but one of them out",
         )
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
-        if config.steps is None and config.seconds is None:
+        if not given:
             config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
-    elif config.steps is None and config.seconds is None:
+    elif not given:
         config = config.model_copy(update={"steps": DEFAULT_STEPS})
     return config
 
@@ -192,7 +195,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     steps, note = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "revisions": ()}
     config = setup.config.model_copy(update=update)
-    schedule = schedule_of(config, setup.densifier, steps)
+    schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
 
 

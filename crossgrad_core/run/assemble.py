@@ -20,6 +20,7 @@ from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution
@@ -36,7 +37,7 @@ from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.schedules import schedule_of
+from crossgrad_core.training.schedules import counting_of, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on
 from crossgrad_core.wording import listed, plural
@@ -149,6 +150,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     answers = manager.hook.crossgrad_objections(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
+    config = _with_steps(config, selection.views)
+    counting = counting_of(config, selection.views, len(scene.train_views))
+    steps = config.steps or DEFAULT_STEPS
     setup = Setup(
         config=config,
         scene=scene,
@@ -156,7 +160,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         manager=manager,
         plugins=plugins,
         groups=groups,
-        schedule=schedule_of(config, selection.densifier, config.steps or DEFAULT_STEPS),
+        schedule=schedule_of(config, selection.densifier, steps, counting),
         device=choose_device(config.device),
         notes=tuple(notes),
     )
@@ -175,6 +179,26 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
         return config
     degree = build(Exporter, EXPORTER, {}).sh_degree_of(path)
     return config.model_copy(update={"sh_from": degree})
+
+
+def _with_steps(config: RunConfig, views: ViewPlan) -> RunConfig:
+    """The configuration with a length in views turned into one in steps.
+
+    Raises:
+        UserError: A single step draws more views.
+    """
+    if config.max_views is None:
+        return config
+    steps = views.steps_of(config.max_views)
+    if steps == 0:
+        raise UserError(
+            "the run is shorter than its first step",
+            where="--max-views",
+            expected=f"at least {views.counts[0]}, the views of a step",
+            found=str(config.max_views),
+            todo="ask for more --max-views, or for fewer --views",
+        )
+    return config.model_copy(update={"steps": steps, "max_views": None})
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
@@ -203,7 +227,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes += choosing
     options = _rasterizer_options(config, scene, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, options)
-    views = config.views_per_step or _usual_views(sampler, operator, notes)
+    views = config.view_plan or ViewPlan((_usual_views(sampler, operator, notes),))
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     names = {
         "backbone": config.backbone.name,
@@ -233,9 +257,10 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene),
         names=names,
-        views_per_step=views,
+        views_per_step=max(views.counts),
         device=device.type,
         grouping=grouping,
+        view_plan=views,
     )
     return selection, notes
 

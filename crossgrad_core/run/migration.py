@@ -51,6 +51,9 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest["operator"] = _operators(rest["operator"])
     if version == _FIRST and "reading" in rest:
         rest["reading"] = _reading(rest["reading"], rest.get("scene"))
+    if "revisions" in rest and "events" not in rest:
+        # What a run wrote before schedules counted views: it goes on, and is repeated, in steps.
+        rest["events"] = "steps"
     return rest
 
 

@@ -39,8 +39,9 @@ def resolved(setup: Setup) -> RunConfig:
             "scene": scene,
             "reading": config.reading.model_copy(update={"init": init}),
             "out": None,
-            "views_per_step": selection.views_per_step,
+            "views_per_step": selection.views.setting,
             "steps": config.steps or setup.schedule.total,
+            "events": setup.schedule.counting.unit,
             "final_decay": final_decay_of(config),
             "average": average_of(config),
         }

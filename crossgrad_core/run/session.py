@@ -199,4 +199,4 @@ def title(setup: Setup) -> str:
     """What the curve is called."""
     names = setup.selection.names
     parts = f"{names['backbone']}, {names['sampler']}, {names['operator']}"
-    return f"{setup.scene.name}: {parts}, K = {setup.selection.views_per_step}"
+    return f"{setup.scene.name}: {parts}, K = {setup.selection.views}"

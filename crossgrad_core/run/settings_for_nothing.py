@@ -52,6 +52,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     found = [
         *_of_components(config, setup),
         *_of_density_control(config, setup),
+        *_of_the_schedule(config),
         *_of_groups(config, setup),
         *_of_the_split(config),
         *_of_the_end(config, setup),
@@ -95,6 +96,11 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             yield setting, f"densifier {name} never edits"
     if config.reset_every is not None and not densifier.resets:
         yield "reset_every", f"densifier {name} resets no opacities"
+
+
+def _of_the_schedule(config: RunConfig) -> Iterator[tuple[str, str]]:
+    if config.reference is not None and config.schedule == "scaled":
+        yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -47,7 +47,9 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
         timed_step(probed, state)
         steps += 1
     each = state.clock.train / steps
-    total = _fitting(lambda steps: _cost(setup, steps), seconds / each)
+    # The probe's first step is the one before those that count.
+    views = _views(probed.schedule, 1, steps + 1)
+    total = _fitting(lambda steps: _cost(setup, steps), seconds * views / state.clock.train)
     note = (
         f"{total} steps planned for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms "
         "each; the length follows the clock as the run goes"
@@ -108,7 +110,8 @@ class Timed:
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that now fits; its configuration says so."""
-        newest = (state.clock.train - self._clock) / (state.step - self._step)
+        # Of a view, as a step may have another number of them later.
+        newest = (state.clock.train - self._clock) / _views(setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
         self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
@@ -132,13 +135,14 @@ def seconds_ahead(setup: Setup, step: int, each: float) -> float:
         step: Steps done.
         each: Seconds that a step takes now.
     """
-    left = setup.schedule.total - step
-    return left * each * _growth(setup, setup.schedule, step)
+    schedule = setup.schedule
+    views = _views(schedule, step, schedule.total) / schedule.pace.at(step)
+    return views * each * _growth(setup, schedule, step)
 
 
 def lengthened(setup: Setup, step: int, total: int) -> Setup:
     """The setup of a run that has reached `step` and is to have `total` steps in all."""
-    wanted = schedule_of(setup.config, setup.densifier, total)
+    wanted = _schedule_of(setup, total)
     setup.hook.crossgrad_length(step=step, total=total)
     schedule = setup.schedule.lengthened(wanted, step)
     return _with_notes(replace(setup, schedule=schedule), instead_of=setup)
@@ -170,8 +174,9 @@ def _told(before: Setup, after: Setup) -> Setup:
     """The later setup; says where its length brings density control about or leaves it out."""
     was, now = growth_note(before), growth_note(after)
     if was and not now:
-        start, end = after.schedule.densify_from, after.schedule.densify_until
-        text = f"density control after all: in {after.schedule.total} steps it lasts from step "
+        schedule = after.schedule
+        start, end = map(schedule.step_of, (schedule.densify_from, schedule.densify_until))
+        text = f"density control after all: in {schedule.total} steps it lasts from step "
         before.hook.crossgrad_message(text=f"{text}{start} to step {end}")
     elif now and not was:
         before.hook.crossgrad_message(text=now[0])
@@ -193,36 +198,47 @@ def _without_edits(schedule: Schedule) -> Schedule:
     )
 
 
+def _schedule_of(setup: Setup, steps: int) -> Schedule:
+    """The schedule that the run would have, were it so long from its start."""
+    return schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
+
+
+def _views(schedule: Schedule, after: int, until: int) -> int:
+    """Views drawn by the steps after one and up to another one."""
+    return schedule.pace.views(until) - schedule.pace.views(after)
+
+
 def _cost(setup: Setup, steps: int) -> float:
-    """Expected mean cost of a step in a run of so many steps, in units of one at its start."""
-    return _growth(setup, schedule_of(setup.config, setup.densifier, steps), 0)
+    """Expected cost of a run of so many steps, in units of a view at its start."""
+    schedule = _schedule_of(setup, steps)
+    return _views(schedule, 0, steps) * _growth(setup, schedule, 0)
 
 
 def _cost_ahead(setup: Setup, step: int, left: int) -> float:
-    """Expected mean cost of the `left` steps after `step`, in units of one now."""
-    wanted = schedule_of(setup.config, setup.densifier, step + left)
-    return _growth(setup, setup.schedule.lengthened(wanted, step), step)
+    """Expected cost of the `left` steps after `step`, in units of a view now."""
+    schedule = setup.schedule.lengthened(_schedule_of(setup, step + left), step)
+    return _views(schedule, step, step + left) * _growth(setup, schedule, step)
 
 
 def _growth(setup: Setup, schedule: Schedule, step: int) -> float:
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
-    done = schedule.edits() - ahead
+    done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
 def _fitting(cost: Callable[[int], float], affordable: float) -> int:
-    """The most steps that cost no more than `affordable` steps of unit cost, at least 1.
+    """The most steps that cost no more than `affordable`, at least 1.
 
     Args:
-        cost: Expected mean cost of a step for so many steps.
-        affordable: Steps of unit cost.
+        cost: Expected cost of so many steps, in views; at least one view for each of them.
+        affordable: Views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
     while too_many - fits > 1:
         steps = (fits + too_many) // 2
-        if steps * cost(steps) <= affordable:
+        if cost(steps) <= affordable:
             fits = steps
         else:
             too_many = steps

@@ -1,26 +1,60 @@
 """The schedule of a run, and what is said where it leaves density control out."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.schedule import Counting, Schedule, Unit
 from crossgrad_core.training.setup import Setup
 
+#: Times of density control that the user may set.
+_EDITS = ("densify_from", "densify_until", "densify_every")
 
-def schedule_of(config: RunConfig, densifier: Densifier, steps: int) -> Schedule:
+
+def counting_of(config: RunConfig, views: ViewPlan, photos: int) -> Counting:
+    """What the schedule of a run counts.
+
+    Args:
+        config: Its configuration.
+        views: How many views its steps have.
+        photos: Its training photos.
+    """
+    return Counting(unit_of(config), views, photos, config.reference)
+
+
+def unit_of(config: RunConfig) -> Unit:
+    """What events are counted in: steps where published numbers are to hold, elsewhere views."""
+    if config.events is not None:
+        return config.events
+    published = config.schedule == "absolute" and config.reference is None
+    return "steps" if published or config.preset == "inria" else "views"
+
+
+def schedule_of(
+    config: RunConfig, densifier: Densifier, steps: int, counting: Counting
+) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
-    names = ("densify_from", "densify_until", "densify_every", "reset_every", "sh_from")
-    given = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
-    return replace(densifier.window(Schedule.for_run(steps, config.schedule)), **given)
+    schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
+    edits = _given(config, _EDITS)
+    schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from")))
+    # What the user sets stays, whatever the length.
+    return replace(schedule, fewest_edits=0) if edits else schedule
+
+
+def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
+    return {name: getattr(config, name) for name in names if getattr(config, name) is not None}
 
 
 def growth_note(setup: Setup) -> tuple[str, ...]:
     """Says that density control is left out, where the run is too short for it."""
-    if not setup.densifier.edits or setup.schedule.grows:
+    schedule = setup.schedule
+    if not setup.densifier.edits or schedule.grows:
         return ()
-    start, end = setup.schedule.densify_from, setup.schedule.densify_until
+    start, end, unit = schedule.densify_from, schedule.densify_until, schedule.counting.unit
     return (
-        f"no density control: in {setup.schedule.total} steps it would end (step {end}) before the "
-        f"first transient is over (step {start}); --set densify_from=N forces it",
+        f"no density control: in {schedule.total} steps it would begin after {start} {unit} and "
+        f"end before {end}; --set densify_from=N forces it",
     )

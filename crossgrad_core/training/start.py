@@ -82,17 +82,17 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """
     _LOG.info("loading kernels")
     start = perf_counter()
-    setup = unwatched(setup)
-    steps = [1, *(setup.schedule.sh_interval * degree for degree in (1, 2, 3))]
+    setup, schedule = unwatched(setup), setup.schedule
+    steps = [1, *(schedule.step_of(schedule.sh_interval * degree) for degree in (1, 2, 3))]
     if setup.densifier.needs:
         # Once density control is over, its statistics are left out: other kernels.
-        steps.append(setup.schedule.densify_until)
-    if setup.schedule.grows:
+        steps.append(schedule.step_of(schedule.densify_until))
+    if schedule.grows:
         # An edit may draw, too.
-        steps.append(setup.schedule.first_edit - 1)
+        steps.append(schedule.first_edit - 1)
     with decoded_meanwhile(setup.scene):
         for step in steps:
-            if step < setup.schedule.total:
+            if step < schedule.total:
                 state = first_state(setup) if reached is None else deepcopy(reached)
                 state.step = step
                 timed_step(setup, state)

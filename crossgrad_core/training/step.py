@@ -84,14 +84,14 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
 def _sample(setup: Setup, state: TrainState) -> Draw:
     context = SampleContext(
         **context_fields(setup, state, "sampler"),
-        views_per_step=setup.selection.views_per_step,
+        views_per_step=setup.schedule.pace.at(state.step),
         groups=groups_of(setup, state),
         centers=setup.scene.centers,
         last=state.last,
     )
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
     state.commit(answer.states)
-    counts = setup.sampler.counts(setup.selection.views_per_step)
+    counts = setup.sampler.counts(context.views_per_step)
     if len(answer.draw.views) in counts:
         return answer.draw
     raise UserError(
@@ -164,7 +164,7 @@ def _finish(
 def _optimize(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> None:
-    progress = state.step / setup.schedule.lr_steps
+    progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     blocks = setup.trained_blocks
     fades = partial(faded, setup.config, step=state.step, total=setup.schedule.total)
@@ -211,7 +211,7 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
 def _means_lr(setup: Setup, step: int) -> float:
     rates = {block.name: block.lr for block in setup.blocks}
     rate = rates.get("means", LearningRate(0.0))
-    return rate.at(step / setup.schedule.lr_steps)
+    return rate.at(setup.schedule.progress(step))
 
 
 def _room(setup: Setup, state: TrainState, rendered: Rendered) -> int:

@@ -41,7 +41,14 @@ def test_each_flag_is_the_setting_s_name_but_two():
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("views", "int"), ("seconds", "float"), ("out", "path"), ("schedule", "str"), ("init", "str")],
+    [
+        ("views", "str"),
+        ("steps", "int"),
+        ("seconds", "float"),
+        ("out", "path"),
+        ("schedule", "str"),
+        ("init", "str"),
+    ],
 )
 def test_types_follow_the_schema(name, kind):
     (option,) = (each for each in OPTIONS if each.name == name)

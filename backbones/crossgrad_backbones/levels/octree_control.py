@@ -53,14 +53,17 @@ class OctreeControl(AnchorDensifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        length = _LENGTH if schedule.mode == "absolute" else schedule.total
+        published = schedule.mode == "absolute" and schedule.counting.reference is None
+        length = _LENGTH if published else schedule.length
+        edited = schedule.with_edits(
+            start=length * _FROM // _LENGTH,
+            until=length * _UNTIL // _LENGTH,
+            every=max(SHORTEST_ANCHOR_INTERVAL, length * _EVERY // _LENGTH),
+        )
         return replace(
-            schedule,
-            lr_steps=length,
-            coarse_until=min(length // 4, schedule.total // 2),
-            densify_from=length * _FROM // _LENGTH,
-            densify_until=length * _UNTIL // _LENGTH,
-            densify_every=max(SHORTEST_ANCHOR_INTERVAL, length * _EVERY // _LENGTH),
+            edited,
+            lr_until=length,
+            coarse_until=min(length // 4, schedule.counted(schedule.total) // 2),
             reset_every=None,
         )
 

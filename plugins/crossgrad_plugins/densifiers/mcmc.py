@@ -59,8 +59,8 @@ class MarkovChainMonteCarlo(Densifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        until = round(LAST_EDIT_SHARE * schedule.lr_steps)
-        return replace(schedule, densify_until=until, reset_every=None)
+        until = round(LAST_EDIT_SHARE * schedule.length)
+        return replace(schedule.with_edits(until=until), reset_every=None)
 
     @override
     def started(self, parameters: Parameters) -> Parameters:

@@ -46,9 +46,9 @@ class RevisingDensification(CloneSplit):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        until = round(LAST_EDIT_SHARE * schedule.lr_steps)
+        until = round(LAST_EDIT_SHARE * schedule.length)
         resets = schedule.reset_every if self.opacity_decrease == 0 else None
-        return replace(schedule, densify_until=until, reset_every=resets)
+        return replace(schedule.with_edits(until=until), reset_every=resets)
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:

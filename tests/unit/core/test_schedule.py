@@ -4,8 +4,18 @@ from dataclasses import replace
 
 import pytest
 
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate
-from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.schedule import (
+    FEWEST_EDITS,
+    SHORTEST_INTERVAL,
+    SHORTEST_WARM_UP,
+    Counting,
+    Schedule,
+)
+from crossgrad_core.registry.entries import build
+from crossgrad_core.training.schedules import schedule_of, unit_of
 
 
 def test_published_schedule_at_reference_length():
@@ -47,7 +57,7 @@ def test_edits_are_counted_without_looking_at_every_step(total):
 def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
     schedule = Schedule.for_run(20_000)
     longer = schedule.lengthened(Schedule.for_run(40_000), 3000)
-    assert (longer.total, longer.lr_steps, longer.densify_until) == (40_000, 40_000, 20_000)
+    assert (longer.total, longer.lr_until, longer.densify_until) == (40_000, 40_000, 20_000)
     for name in ("sh_interval", "densify_from", "densify_every", "reset_every", "coarse_until"):
         assert getattr(longer, name) == getattr(schedule, name)
 
@@ -85,3 +95,150 @@ def test_learning_rate_is_log_linear_and_clipped():
     assert rate.at(0.5) == pytest.approx(1e-3)
     assert rate.at(7.0) == pytest.approx(1e-4)
     assert LearningRate(0.0).at(0.3) == 0.0
+
+
+def in_views(text="1", photos=24, reference=None):
+    return Counting("views", ViewPlan.parsed(text), photos, reference)
+
+
+def view_counts(schedule, happens=Schedule.densifies):
+    """How many views are drawn by the end of each step after which something happens."""
+    steps = range(1, schedule.total + 1)
+    return [schedule.pace.views(step) for step in steps if happens(schedule, step)]
+
+
+def test_the_published_schedule_is_the_same_in_views():
+    steps, views = (Schedule.for_run(30_000, counting=each) for each in (Counting(), in_views()))
+    assert view_counts(views) == view_counts(steps) and len(view_counts(views)) == 144
+    resets = view_counts(views, Schedule.resets)
+    assert resets == view_counts(steps, Schedule.resets) == [3000, 6000, 9000, 12_000]
+    for step in (1, 999, 1000, 3000, 3001, 14_999, 15_000, 30_000):
+        for method in (Schedule.sh_degree, Schedule.collects, Schedule.prunes_large):
+            assert method(views, step) == method(steps, step)
+        assert views.progress(step) == steps.progress(step)
+
+
+@pytest.mark.parametrize("views", [600, 2400, 12_000])
+@pytest.mark.parametrize("densifier", ["adc", "mcmc", "revising", "anchor", "octree"])
+def test_one_view_and_two_have_the_same_events_after_as_many_views(views, densifier):
+    window = build("densifiers", densifier, {}).window
+    one = window(Schedule.for_run(views, counting=in_views("1")))
+    two = window(Schedule.for_run(views // 2, counting=in_views("2")))
+    for name in ("densifies", "resets", "prunes_large"):
+        happens = getattr(Schedule, name)
+        counts = view_counts(one, happens), view_counts(two, happens)
+        if name == "prunes_large":  # From the step after the first reset on.
+            counts = tuple(each[:1] for each in counts)
+        # A step of two views reaches an odd count one view later.
+        assert [count + count % 2 for count in counts[0]][: len(counts[1])] == counts[1]
+        assert len(counts[0]) == len(counts[1])
+    for step in range(0, views // 2, 7):
+        assert two.sh_degree(step) == one.sh_degree(2 * step)
+        assert two.progress(step) == one.progress(2 * step)
+    assert two.coarse_until == one.coarse_until and two.lr_until == one.lr_until
+
+
+@pytest.mark.parametrize("text", ["1", "2", "3", "1..2@0.5", "4..1@0.2"])
+@pytest.mark.parametrize("steps", [100, 601, 1200, 2500])
+@pytest.mark.parametrize("photos", [1, 24, 112, 3000])
+def test_any_run_has_six_edits_of_a_pass_each_where_it_is_long_enough(text, steps, photos):
+    schedule = Schedule.for_run(steps, counting=in_views(text, photos))
+    counts = view_counts(schedule)
+    assert len(counts) == schedule.edits() >= FEWEST_EDITS
+    last = schedule.pace.views(steps) // 2
+    assert counts[-1] - max(schedule.pace.counts) < last == schedule.densify_until
+    if FEWEST_EDITS * photos < last:
+        assert schedule.densify_every >= photos and schedule.densify_from >= 0
+    long = SHORTEST_WARM_UP + FEWEST_EDITS * max(SHORTEST_INTERVAL, photos) < last
+    if long:
+        assert schedule.densify_from >= SHORTEST_WARM_UP
+        assert schedule.densify_every >= SHORTEST_INTERVAL
+
+
+@pytest.mark.parametrize(
+    ("total", "k", "edits"),
+    [(1, 2, 0), (17, 1, 0), (18, 1, 1), (10, 2, 1), (97, 1, 5), (98, 1, 6), (49, 2, 6)],
+)
+def test_a_run_of_a_few_steps_has_as_many_edits_as_it_has_steps_for(total, k, edits):
+    assert Schedule.for_run(total, counting=in_views(str(k))).edits() == edits
+
+
+@pytest.mark.parametrize("text", ["1", "2", "5", "1..2@0.5", "3..1@0.4"])
+@pytest.mark.parametrize("total", [30, 61, 400, 1201])
+def test_edits_in_views_are_counted_without_looking_at_every_step(text, total):
+    schedule = Schedule.for_run(total, counting=in_views(text))
+    edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
+    assert edits[:1] == [schedule.first_edit]
+    assert all(schedule.collects(step) for step in range(1, edits[-1] + 1))
+    for after in (0, 1, edits[0] - 1, edits[0], edits[-1] - 1, edits[-1], total):
+        assert schedule.edits(after) == sum(step > after for step in edits)
+
+
+def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
+    short = Schedule.for_run(1200, counting=in_views())
+    flat = Schedule.for_run(2400, "absolute", in_views(reference=1200))
+    stretched = Schedule.for_run(2400, counting=in_views())
+    assert view_counts(flat) == view_counts(short) != view_counts(stretched)
+    for step in (1, 300, 1200):
+        assert flat.progress(step) == short.progress(step)
+        assert flat.sh_degree(step) == short.sh_degree(step)
+    assert flat.progress(2400) == 2.0 and flat.coarse_until == short.coarse_until
+    assert LearningRate(1e-2, 1e-4).at(flat.progress(1800)) == pytest.approx(1e-4)
+
+
+def test_a_flat_schedule_in_steps_has_the_floors_of_before():
+    flat = Schedule.for_run(4000, "absolute", Counting(reference=2000))
+    short = Schedule.for_run(2000)
+    assert view_counts(flat) == view_counts(short) == [600, 700, 800, 900]
+
+
+def test_absolute_without_a_reference_keeps_the_published_numbers_whatever_the_photos():
+    steps = Schedule.for_run(20_000, "absolute")
+    views = Schedule.for_run(20_000, "absolute", in_views(photos=3000))
+    assert view_counts(views) == view_counts(steps) == list(range(600, 15_000, 100))
+
+
+@pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
+@pytest.mark.parametrize(("planned", "actual"), [(3000, 900), (900, 3000), (3000, 400), (300, 480)])
+@pytest.mark.parametrize("after", [1, 20, 200])
+def test_a_run_whose_length_follows_the_clock_keeps_its_edits(text, planned, actual, after):
+    counting = in_views(text, photos=24)
+    schedule = Schedule.for_run(planned, counting=counting)
+    done = [step for step in range(1, after + 1) if schedule.densifies(step)]
+    lengths = [planned + (actual - planned) * k // 5 for k in range(1, 6)]
+    for k, length in enumerate(lengths):
+        step = after + k * after // 10
+        schedule = schedule.lengthened(Schedule.for_run(length, counting=counting), step)
+        reached = after + (k + 1) * after // 10
+        done += [s for s in range(step + 1, reached + 1) if schedule.densifies(s)]
+    step = after + 5 * after // 10
+    edits = [s for s in range(step + 1, actual + 1) if schedule.densifies(s)]
+    assert schedule.edits(step) == len(edits)
+    if step < actual // 2:
+        assert schedule.edits_before + schedule.edits() >= FEWEST_EDITS
+        assert len(done) + len(edits) >= FEWEST_EDITS
+
+
+def test_times_that_the_user_set_stay_whatever_the_length():
+    counting = in_views("2")
+    config = RunConfig(steps=600, densify_from=30, densify_every=40, densify_until=400)
+    densifier = build("densifiers", "adc", {})
+    schedule = schedule_of(config, densifier, 600, counting)
+    assert view_counts(schedule) == list(range(70, 400, 40))
+    other = schedule.lengthened(schedule_of(config, densifier, 900, counting), 100)
+    assert view_counts(other) == view_counts(schedule)
+
+
+@pytest.mark.parametrize(
+    ("settings", "unit"),
+    [
+        ({}, "views"),
+        ({"schedule": "absolute"}, "steps"),
+        ({"schedule": "absolute", "reference": 600}, "views"),
+        ({"preset": "inria"}, "steps"),
+        ({"events": "steps"}, "steps"),
+        ({"preset": "inria", "events": "views"}, "views"),
+    ],
+)
+def test_published_rules_count_steps_and_all_others_views(settings, unit):
+    assert unit_of(RunConfig(**settings)) == unit

@@ -248,7 +248,7 @@ def test_new_anchors_start_as_large_as_their_cells():
 @pytest.mark.parametrize(("total", "mode"), [(40_000, "scaled"), (30_000, "absolute")])
 def test_published_times_at_the_published_length_and_on_request(total, mode):
     schedule = OctreeControl().window(Schedule.for_run(total, mode))
-    assert schedule.lr_steps == 40_000
+    assert schedule.lr_until == 40_000
     edits = [step for step in range(1, 40_001) if schedule.densifies(step)]
     assert edits == list(range(1600, 25_000, 100))
     assert not any(schedule.resets(step) for step in range(1, 40_001))

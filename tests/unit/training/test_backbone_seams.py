@@ -10,6 +10,7 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.schedule import Counting
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.errors import IncompatibleSelectionError
@@ -115,7 +116,7 @@ def test_the_densifier_decides_when_it_acts_and_how_it_starts(assembled):
 
 def test_what_the_user_sets_wins_over_the_densifier(assembled):
     config = RunConfig(steps=10, densify_every=3, densifier=ComponentChoice(name="reversing"))
-    schedule = assembling.schedule_of(config, Reversing(), 10)
+    schedule = assembling.schedule_of(config, Reversing(), 10, Counting())
     assert (schedule.densify_from, schedule.densify_every) == (1, 3)
 
 

@@ -116,7 +116,7 @@ def grown(step, schedule):
 def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
     run, seconds = timed(140.0, planned, cost)
     assert seconds == pytest.approx(140.0, rel=0.01)
-    assert run.schedule.total == run.schedule.lr_steps
+    assert run.schedule.total == run.schedule.lr_until
     assert run.notes == (
         "a note on the scene",
         f"the length followed the clock: {run.schedule.total} steps instead of {planned}",

@@ -45,7 +45,7 @@ class AnchorDensifier(Densifier):
     success_threshold: float = Field(
         0.8,
         ge=0,
-        description="an anchor is judged after more views than this share of the interval's steps, "
+        description="an anchor is judged after more views than this share of the interval, "
         "an offset after more renders than half of it",
     )
     prune_opacity: float = Field(0.005, ge=0, description="prune below; sum over the offsets")
@@ -72,7 +72,7 @@ class AnchorDensifier(Densifier):
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
         # Published: statistics from step 500, edits from step 1500 on.
-        if context.step > context.schedule.densify_from // 3:
+        if context.schedule.counted(context.step) > context.schedule.densify_from // 3:
             state = observed(context, state)
         if not (state.per_primitive and context.schedule.densifies(context.step)):
             return NO_EDIT, state

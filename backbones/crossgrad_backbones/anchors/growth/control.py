@@ -32,12 +32,12 @@ class AnchorControl(AnchorDensifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        return replace(
-            schedule,
-            densify_from=schedule.anchors_from,
-            densify_every=schedule.anchors_every,
-            reset_every=None,
+        edited = schedule.with_edits(
+            start=schedule.anchors_from,
+            until=schedule.densify_until,
+            every=schedule.anchors_every,
         )
+        return replace(edited, reset_every=None)
 
     @override
     def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:

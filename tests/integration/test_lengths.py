@@ -1,0 +1,161 @@
+"""Lengths in views, events in views or steps, a K that changes: their schedule and counts."""
+
+import csv
+
+import pytest
+import torch
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.run import app
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.opening import parsed
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.budget import _cost, _cost_ahead, seconds_ahead
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    return write_tiny_scene(folder, views=9)
+
+
+def run(scene, out, **settings):
+    given = {"scene": str(scene), "out": str(out), "eval_every": 6, "threads": 1}
+    assert app.run({**given, **settings}, verbosity=-1) == 0
+    with (out / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def assembled(**settings):
+    return assemble(parsed(settings), sample_scene(), "none")
+
+
+class Watching:
+    """Keeps the numbers of views and the events of every step."""
+
+    def __init__(self):
+        self.views, self.edits = [], []
+
+    @hookimpl
+    def crossgrad_step_end(self, record):
+        self.views.append(len(record.views))
+        if {"cloned", "split", "pruned"} & record.counts.keys():
+            self.edits.append(sum(self.views))
+
+
+def trained(**settings):
+    """A run without a folder: its setup, state and what a plugin saw."""
+    setup = assembled(**settings)
+    state, seen = first_state(setup), Watching()
+    while state.step < setup.schedule.total:
+        seen.crossgrad_step_end(timed_step(setup, state))
+    return setup, state, seen
+
+
+@pytest.mark.parametrize(
+    ("views", "length", "steps", "drawn"),
+    [(1, 13, 13, 13), (2, 13, 6, 12), ("1..2@0.5", 13, 8, 12), (3, 12, 4, 12)],
+)
+def test_a_length_in_views_is_one_in_steps(views, length, steps, drawn):
+    setup, state, seen = trained(views=views, max_views=length)
+    assert (setup.schedule.total, setup.config.steps) == (steps, steps)
+    assert setup.config.max_views is None
+    assert sum(seen.views) == state.counters.views == drawn
+    assert resolved(setup).views_per_step == views
+
+
+def test_a_run_shorter_than_a_step_is_refused():
+    with pytest.raises(UserError, match="at least 4, the views of a step"):
+        assembled(views=4, max_views=3)
+
+
+@pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "max_views": 4}])
+def test_a_run_has_one_length(lengths):
+    with pytest.raises(UserError, match="one length"):
+        app.with_defaults(RunConfig(**lengths))
+
+
+def test_one_view_and_two_edit_after_as_many_views():
+    one, two = (trained(views=k, max_views=144)[2] for k in (1, 2))
+    assert len(one.edits) == len(two.edits) == 6
+    assert [count + count % 2 for count in one.edits] == two.edits
+    assert max(one.edits) < 72
+
+
+def test_events_in_steps_are_those_of_before():
+    setup, _, seen = trained(views=2, steps=72, events="steps")
+    assert seen.edits == [] and setup.schedule.densify_from == 500
+    given = {"densify_from": 10, "densify_every": 20, "densify_until": 60}
+    assert trained(views=2, steps=72, events="steps", **given)[2].edits == [40, 80]
+    assert trained(views=2, steps=72, **given)[2].edits == [30, 50]
+
+
+def test_k_follows_its_plan_and_repeats_bit_for_bit(scene, tmp_path):
+    settings = {"views": "1..2@0.5", "steps": 20, "sampler": {"name": "epoch"}}
+    rows = run(scene, tmp_path / "whole", **settings)
+    assert [(row["step"], row["views"]) for row in rows] == [
+        ("6", "6"), ("12", "14"), ("18", "26"), ("20", "30"),
+    ]  # fmt: skip
+    stored = read_config(tmp_path / "whole")
+    assert stored["views_per_step"] == "1..2@0.5" and stored["events"] == "views"
+    run(scene, tmp_path / "parts", stop_after=8, **settings)
+    assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
+    assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
+    states = [load(latest(tmp_path / name)).parameters for name in ("whole", "parts", "again")]
+    for other in states[1:]:
+        assert all(torch.equal(states[0][name], other[name]) for name in other)
+
+
+@pytest.mark.parametrize("operator", ["gradvac", "gradnorm"])
+def test_operators_that_remember_go_on_when_k_changes(operator):
+    _, state, seen = trained(
+        views="1..3@0.3..2@0.6", steps=10, operator={"name": operator}, grouping={"name": "radial"}
+    )
+    assert seen.views == [1] * 3 + [3] * 3 + [2] * 4
+    assert all(torch.isfinite(t).all() for t in state.parameters.values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"sampler": {"name": "near-far"}}, "sampler near-far needs .*; K is 1"),
+        ({"operator": {"name": "anchors"}}, "operator anchors needs K = 2 .*; K is 1"),
+    ],
+)
+def test_every_k_needs_a_meaning(settings, why):
+    with pytest.raises(IncompatibleSelectionError, match=why):
+        assembled(views="1..2@0.5", steps=10, **settings)
+
+
+@pytest.mark.parametrize(("text", "form"), [("1..2", "A..B@SHARE"), ("1..1@0.5", "change")])
+def test_what_is_no_k_is_refused_with_its_form(text, form):
+    with pytest.raises(UserError, match=form):
+        parsed({"views": text})
+
+
+def test_views_that_are_ahead_cost_what_they_cost():
+    settings = {"steps": 1000, "densifier": {"name": "none"}}
+    plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
+    assert _cost(plain, 500) == _cost(changing, 500) == 1000
+    assert _cost_ahead(changing, 500, 400) == 1200
+    assert seconds_ahead(plain, 200, 0.5) == 400.0
+    assert seconds_ahead(changing, 200, 0.5) == (300 + 1500) * 0.5
+    assert seconds_ahead(changing, 500, 0.5) == 1500 * 0.5
+
+
+def test_runs_of_before_go_on_in_steps(scene, tmp_path):
+    out = tmp_path / "run"
+    run(scene, out, steps=12, stop_after=6)
+    config = out / "config.yaml"
+    lines = config.read_text().splitlines(keepends=True)
+    config.write_text("".join(line for line in lines if not line.startswith("events:")))
+    assert read_config(out)["events"] == "steps"
+    assert app.run({}, resume=out, verbosity=-1) == 0
