@@ -46,9 +46,10 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys):
+def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys, drawn):
     out = tmp_path / "run"
     assert run(scene, out) == 0
+    assert (out / "curve.png").stat().st_size > 10_000
     names = {path.name for path in out.iterdir()}
     assert names >= {
         "config.yaml", "metrics.csv", "summary.json", "per_view.csv", "curve.png", "renders",

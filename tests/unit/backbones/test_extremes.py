@@ -42,6 +42,7 @@ def test_a_million_gaussians_in_one_pixel(backbone):
     assert found.image.shape == (4, 4, 3)
 
 
+@pytest.mark.slow
 def test_the_reference_survives_a_million_gaussians_in_one_pixel():
     model = build("backbones", "vanilla", {"sh_degree": 0})
     case = extreme("crowded pixel", model, 1_000_000)

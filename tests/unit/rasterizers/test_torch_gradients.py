@@ -41,9 +41,13 @@ def check_gradients(gaussians, names, *, every_entry=True):
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_gradcheck_of_geometry_opacity_and_rgb(response):
+@pytest.mark.parametrize(
+    "every_entry", [False, pytest.param(True, marks=pytest.mark.slow, id="every entry")]
+)
+def test_gradcheck_of_geometry_opacity_and_rgb(response, every_entry):
     gaussians = smooth_gaussians(20, CAMERA, response=response)
-    check_gradients(gaussians, ("means", "quats", "scales", "opacities", "colors"))
+    names = ("means", "quats", "scales", "opacities", "colors")
+    check_gradients(gaussians, names, every_entry=every_entry)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
