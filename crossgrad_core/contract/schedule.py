@@ -30,7 +30,7 @@ LEAST_INTERVAL = 8
 
 @dataclass(frozen=True)
 class Counting:
-    """What a schedule counts, and what it has to know for that.
+    """The unit in which a schedule counts, and the numbers that it needs for that.
 
     Attributes:
         unit: Whether the schedule's numbers are views or steps.
