@@ -160,6 +160,21 @@ class RunConfig(BaseModel):
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
+    density_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
+        Field(
+            "all",
+            description="Whose statistics density control gets: of all views of a step, of one of "
+            "them, or of all and an extra one that trains nothing. Default: all.",
+        )
+    )
+    rate_factor: Annotated[float, Flag("F", TRAINING)] = Field(
+        1.0, gt=0, description="Multiplies all learning rates of the backbone. Default: 1."
+    )
+    batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
+        "none",
+        description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "
+        "over as many views as with one. Default: none.",
+    )
     preset: Annotated[Literal["default", "inria"], Flag("NAME", CONFIGURATION)] = Field(
         "default",
         description="Training rules: default, or inria (order of a step, 3-sigma footprint and "

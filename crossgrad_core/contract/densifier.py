@@ -23,6 +23,7 @@ class Densifier(Component):
         tensors: Names of the parameter tensors that it needs a backbone to have.
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.
+        observes: Whether it gathers statistics of the views that the steps render.
     """
 
     slot: ClassVar[str] = "densifiers"
@@ -30,6 +31,7 @@ class Densifier(Component):
     tensors: ClassVar[frozenset[str]] = frozenset()
     edits: ClassVar[bool] = True
     resets: ClassVar[bool] = True
+    observes: ClassVar[bool] = True
 
     def window(self, schedule: Schedule) -> Schedule:
         """The schedule with the times at which this method edits; what the user set wins over it.

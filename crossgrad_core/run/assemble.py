@@ -35,6 +35,7 @@ from crossgrad_core.registry.slots import LISTS
 from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
+from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.schedules import counting_of, schedule_of
@@ -396,6 +397,9 @@ def reasons_against(
             f"--backward joint makes one gradient of all views, but operator "
             f"{selection.names['operator']} needs them apart"
         )
+    views = selection.views_per_step
+    if config.batch_rule == "sqrt" and views > MOST_VIEWS:
+        reasons.append(f"--batch-rule sqrt has a meaning for K <= {MOST_VIEWS}; K is {views}")
     return tuple(sorted(set(reasons)))
 
 

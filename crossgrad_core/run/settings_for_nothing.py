@@ -52,6 +52,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     found = [
         *_of_components(config, setup),
         *_of_density_control(config, setup),
+        *_of_views(config, setup),
         *_of_the_schedule(config),
         *_of_groups(config, setup),
         *_of_the_split(config),
@@ -96,6 +97,18 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             yield setting, f"densifier {name} never edits"
     if config.reset_every is not None and not densifier.resets:
         yield "reset_every", f"densifier {name} resets no opacities"
+
+
+def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """What depends on the views of a step."""
+    densifier, name = setup.densifier, setup.selection.names["densifier"]
+    one = setup.selection.views_per_step == 1
+    if config.density_views != "all" and not (densifier.edits and densifier.observes):
+        yield "density_views", f"densifier {name} gathers no statistics of views"
+    elif config.density_views == "one" and one:
+        yield "density_views", "a step has one view; ask for more --views"
+    if config.batch_rule != "none" and one:
+        yield "batch_rule", "a step has one view; ask for more --views"
 
 
 def _of_the_schedule(config: RunConfig) -> Iterator[tuple[str, str]]:

@@ -2,12 +2,12 @@
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
 
-from crossgrad_core.contract.blocks import LearningRate
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -25,16 +25,18 @@ from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.density_views import observed_views
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.on_request import render_counted
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
+from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import average_of, faded, follow, restart
+from crossgrad_core.training.steady import average_of, follow, restart
 from crossgrad_core.training.views import (
     Rendered,
     TensorGradients,
@@ -57,6 +59,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     draw = _sample(setup, state)
     scales = _scales(setup, state, draw)
     rendered = render_views(setup, state, draw, scales)
+    rendered = replace(rendered, observed=observed_views(setup, state, rendered.records))
     context = _aggregate_context(setup, state, draw, rendered)
     aggregated = _aggregate(setup, state, context)
     of_step: TensorGradients = {}
@@ -166,10 +169,8 @@ def _optimize(
 ) -> None:
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
-    blocks = setup.trained_blocks
-    fades = partial(faded, setup.config, step=state.step, total=setup.schedule.total)
-    rates = {n: block.lr.at(progress) * fades(block.lr) for block in blocks for n in block.tensors}
-    adam_step(state.parameters, gradients, state.adam, rates, scales=scale.to_sum)
+    rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
+    adam_step(state.parameters, gradients, state.adam, rates, rule, scale.to_sum)
     state.laps.lap("optimizer")
 
 
@@ -179,8 +180,8 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         parameters=state.parameters,
         backbone=setup.backbone,
         rasterizer=setup.rasterizer,
-        views=rendered.records,
-        means_lr=_means_lr(setup, state.step),
+        views=rendered.observed,
+        means_lr=means_rate_at(setup, state.step),
         room=_room(setup, state, rendered) if setup.schedule.densifies(state.step) else 0,
         render=partial(render_counted, setup, state),
     )
@@ -198,7 +199,7 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
         **context_fields(setup, state, "after_step"),
         parameters=state.parameters,
         backbone=setup.backbone,
-        means_lr=_means_lr(setup, state.step),
+        means_lr=means_rate_at(setup, state.step),
         edited=edited,
     )
     for answer in setup.hook.crossgrad_after_step(context=context):
@@ -206,12 +207,6 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):
             restart(state)
-
-
-def _means_lr(setup: Setup, step: int) -> float:
-    rates = {block.name: block.lr for block in setup.blocks}
-    rate = rates.get("means", LearningRate(0.0))
-    return rate.at(setup.schedule.progress(step))
 
 
 def _room(setup: Setup, state: TrainState, rendered: Rendered) -> int:

@@ -42,12 +42,14 @@ class Rendered:
         gradients: Their gradients, apart or summed up as the operator needs them.
         regular: Sum of the gradients of the views' regularisation terms, apart from the above.
         photos: Position of each view and the values of its photo, with their gradients.
+        observed: The records that density control gets.
     """
 
     records: tuple[ViewRecord, ...]
     gradients: Gradients
     regular: TensorGradients
     photos: tuple[tuple[int, Leaves], ...]
+    observed: tuple[ViewRecord, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +149,30 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
         mask=target.mask,
     )
     return _Drawn(record, gaussians, loss, leaves)
+
+
+def is_observed(setup: Setup, state: TrainState, slot: int, views: int) -> bool:
+    """Whether density control gets the statistics of a view of the step.
+
+    Of one view where the run says so: each place of a draw in turn, as samplers may always put the
+    same group first.
+    """
+    return setup.config.density_views != "one" or slot == state.step % views
+
+
+def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:
+    """Renders the one view of `draw` for its statistics: nobody takes its gradients.
+
+    Raises:
+        NonFiniteError: Its loss is not finite.
+    """
+    drawn = _draw_view(setup, state, draw, 0, scale)
+    state.laps.lap("loss")
+    _backward(drawn.loss)
+    _clear(state.parameters)
+    state.counters.backward_passes += 1
+    state.laps.lap("backward")
+    return drawn.record
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
-#: Density control within a few dozen steps; by default it waits for step 500.
+#: Density control within a few dozen steps; by default a run has to be longer.
 GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}
 QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
 
@@ -123,7 +123,8 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
 def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkeypatch, capsys):
     # The plan is too short for density control (it would end in step 14), the run is not.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps"))
-    settings = {"densify_from": 13, "densify_every": 1, "steps": None, "seconds": 3.0}
+    times = {"events": "steps", "densify_from": 13, "densify_every": 1}
+    settings = {**times, "steps": None, "seconds": 3.0}
     given = {"scene": str(scene), "out": str(tmp_path / "timed"), "threads": 1, **settings}
     assert app.run(given, verbosity=0) == 0
     summary = json.loads((tmp_path / "timed" / "summary.json").read_text())
@@ -215,7 +216,7 @@ def test_published_order_differs_and_runs(scene, tmp_path):
 
 
 def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
-    run(scene, tmp_path / "run")
+    run(scene, tmp_path / "run", steps=4)
     assert quality(tmp_path / "run")[-1]["primitives"] == "200"
     assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
 

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.training.adam.coefficients import (
-    EPS,
     LARGEST,
     SMALLEST_NORMAL,
     TINY,
     Coefficients,
+    Rule,
 )
 
 
@@ -23,7 +23,7 @@ def adam_step(
     grads: Mapping[str, Tensor | None],
     state: AdamState,
     lrs: Mapping[str, float],
-    betas: tuple[float, float] = (0.9, 0.999),
+    rule: Rule = Rule(),  # noqa: B008 - a frozen value
     scales: Mapping[str, float] | None = None,
 ) -> None:
     """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
@@ -38,7 +38,7 @@ def adam_step(
         grads: Gradients of the same shapes and types.
         state: Moments and step counts; missing ones start at zero.
         lrs: Learning rate of every tensor that has a gradient.
-        betas: Decay of the first and the second moment, each in [0, 1).
+        rule: Decay of the moments, and what is added to the root of the second.
         scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
 
     Raises:
@@ -46,7 +46,7 @@ def adam_step(
 
     Source: Kingma and Ba 2015, algorithm 1.
     """
-    _check(params, grads, betas)
+    _check(params, grads, rule.betas)
     for name, param in params.items():
         grad = grads.get(name)
         if grad is None:
@@ -56,7 +56,7 @@ def adam_step(
             state.exp_avg_sq[name] = torch.zeros_like(state.exp_avg[name])
             state.steps[name] = 0
         state.steps[name] += 1
-        coefficients = _coefficients(state.steps[name], lrs[name], betas)
+        coefficients = _coefficients(state.steps[name], lrs[name], rule)
         if scales is not None:
             coefficients = replace(coefficients, scale=scales[name])
         update_tensor(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
@@ -100,14 +100,14 @@ def _without(values: Tensor, floor: float) -> Tensor:
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 
-def _coefficients(count: int, lr: float, betas: tuple[float, float]) -> Coefficients:
-    beta1, beta2 = betas
+def _coefficients(count: int, lr: float, rule: Rule) -> Coefficients:
+    (beta1, beta2), age = rule.betas, count * rule.age
     return Coefficients(
         beta1=beta1,
         beta2=beta2,
-        step_size=lr / (1 - beta1**count),
-        root_scale=1 / math.sqrt(1 - beta2**count),
-        eps=EPS,
+        step_size=lr / (1 - beta1**age),
+        root_scale=1 / math.sqrt(1 - beta2**age),
+        eps=rule.eps,
         square_floor=math.sqrt(SMALLEST_NORMAL / (1 - beta2)),
     )
 

@@ -43,6 +43,7 @@ class MarkovChainMonteCarlo(Densifier):
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
     resets: ClassVar[bool] = False
+    observes: ClassVar[bool] = False
 
     cap: int = Field(1_000_000, ge=0, description="most Gaussians")
     growth: float = Field(0.05, ge=0, le=1, description="share added per pass")

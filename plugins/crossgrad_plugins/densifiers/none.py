@@ -12,6 +12,7 @@ class NoDensification(Densifier):
 
     edits: ClassVar[bool] = False
     resets: ClassVar[bool] = False
+    observes: ClassVar[bool] = False
 
     @override
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:

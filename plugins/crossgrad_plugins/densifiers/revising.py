@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import log
+from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -35,6 +36,8 @@ class RevisingDensification(CloneSplit):
     spread over the training views. Clones and children share their opacity, and instead of
     opacity resets all opacities are lowered a little at every edit.
     """
+
+    observes: ClassVar[bool] = False
 
     error: ErrorKind = Field("ssim", description="error of a pixel: ssim (1 - SSIM) or l1")
     error_threshold: float = Field(0.1, gt=0, description="share of the error to grow at, pixels")

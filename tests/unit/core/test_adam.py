@@ -6,7 +6,7 @@ import torch
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.training.adam.adam import adam_step, update_reference, update_tensor
-from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients
+from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients, Rule
 
 SHAPES = {"means": (50, 3), "f_rest": (50, 15, 3), "opacities": (50,), "empty": (0, 3)}
 RATES = {"means": 1e-2, "f_rest": 1e-3, "opacities": 5e-2, "empty": 1.0}
@@ -178,7 +178,7 @@ def test_a_graph_over_old_values_notices_the_step():
     [
         (torch.ones(4), {}),
         (torch.ones(3).double(), {}),
-        (torch.ones(3), {"betas": (0.9, 1.0)}),
+        (torch.ones(3), {"rule": Rule(betas=(0.9, 1.0))}),
     ],
 )
 def test_wrong_arguments_are_refused(grad, options):

@@ -1,0 +1,175 @@
+"""Controls of learning rates and of density statistics: what they change, and nothing else."""
+
+from math import prod, sqrt
+
+import pytest
+import torch
+
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.opening import parsed
+from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.adam.coefficients import BETAS, EPS, Rule
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
+from crossgrad_core.training.start import first_state
+
+
+def assembled(**settings):
+    return assemble(parsed({"steps": 40, **settings}), sample_scene(), "none")
+
+
+def trained(number, *plugins, **settings):
+    setup = assembled(**settings)
+    for k, plugin in enumerate(plugins):
+        setup.manager.register(plugin, name=f"watch{k}")
+    state = first_state(setup)
+    for _ in range(number):
+        timed_step(setup, state)
+    return setup, state
+
+
+@pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
+@pytest.mark.parametrize("step", [1, 20, 40])
+def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
+    plain = assembled(backbone={"name": backbone})
+    doubled = assembled(backbone={"name": backbone}, rate_factor=2.0)
+    rates = {
+        name: block.lr.at(step / 40) for block in plain.trained_blocks for name in block.tensors
+    }
+    assert rates_at(plain, step) == rates and len(rates) >= 5
+    assert rates_at(doubled, step) == {name: 2.0 * rate for name, rate in rates.items()}
+    assert means_rate_at(doubled, step) == 2.0 * means_rate_at(plain, step)
+    assert rule_at(doubled, step) == Rule()
+
+
+def test_a_first_step_goes_as_much_farther():
+    start = first_state(assembled()).parameters
+    one, three = (trained(1, rate_factor=f)[1].parameters for f in (1.0, 3.0))
+    for name in ("scales", "opacities", "f_dc"):
+        moved, farther = ((each[name] - start[name]).detach().abs() for each in (one, three))
+        assert float(moved.max()) > 0
+        assert torch.allclose(farther, 3 * moved, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("views", [2, 4, 10])
+def test_the_batch_rule_follows_the_views(views):
+    setup, plain = (assembled(views=views, batch_rule=rule) for rule in ("sqrt", "none"))
+    for step in (1, 7, 40):
+        rule = rule_at(setup, step)
+        assert rule.betas == pytest.approx([1 - views * (1 - beta) for beta in BETAS], abs=1e-15)
+        assert (rule.eps, rule.age) == (EPS / sqrt(views), 1.0)
+        wanted = {name: sqrt(views) * rate for name, rate in rates_at(plain, step).items()}
+        assert rates_at(setup, step) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_adam_by_the_rule_is_torch_s():
+    rng = torch.Generator().manual_seed(3)
+    start = torch.randn(50, generator=rng)
+    rule, rate = Rule.for_views(4), 1e-2 * 2.0
+    theirs = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([theirs], lr=rate, betas=rule.betas, eps=rule.eps)
+    ours, state = {"x": start.clone()}, AdamState()
+    for _ in range(20):
+        theirs.grad = torch.randn(50, generator=rng)
+        adam_step(ours, {"x": theirs.grad.clone()}, state, {"x": rate}, rule)
+        optimizer.step()
+    assert torch.allclose(ours["x"], theirs.detach(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("plan", ["1..2@0.5", "4..1@0.3"])
+def test_where_k_changes_the_bias_is_that_of_all_steps_so_far(plan):
+    setup = assembled(views=plan, steps=600, batch_rule="sqrt")
+    for step in (100, 310, 600):
+        rule = rule_at(setup, step)
+        for index in (0, 1):
+            betas = (rule_at(setup, each).betas[index] for each in range(1, step + 1))
+            wanted = 1.0 - prod(betas)
+            assert 1.0 - rule.betas[index] ** (step * rule.age) == pytest.approx(wanted, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"views": 1, "batch_rule": "sqrt"}, "batch_rule"),
+        ({"views": 1, "density_views": "one"}, "density_views"),
+        ({"views": 2, "density_views": "extra", "densifier": {"name": "mcmc"}}, "density_views"),
+        ({"views": 2, "density_views": "one", "densifier": {"name": "none"}}, "density_views"),
+        ({"reference": 600}, "reference"),
+    ],
+)
+def test_a_control_that_would_do_nothing_is_refused(settings, name):
+    config = parsed({"steps": 40, **settings})
+    with pytest.raises(UserError, match=f"do nothing(.|\n)*{name}"):
+        refuse_settings_for_nothing(config, assembled(**settings))
+
+
+def test_the_batch_rule_has_a_meaning_for_ten_views():
+    with pytest.raises(IncompatibleSelectionError, match="K <= 10; K is 11"):
+        assembled(views=11, batch_rule="sqrt")
+
+
+class Observed:
+    """Keeps which views density control got."""
+
+    def __init__(self):
+        self.drawn, self.got = [], []
+
+    @hookimpl(wrapper=True)
+    def crossgrad_sample_views(self, context):
+        answer = yield
+        self.drawn.append(answer.draw.views)
+        return answer
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        self.got.append(tuple(view.index for view in context.views))
+        assert all(view.screen.mean_gradient is not None for view in context.views)
+        return (yield)
+
+
+def test_statistics_of_one_view_are_those_of_each_place_in_turn():
+    seen = Observed()
+    _, state = trained(12, seen, views=3, density_views="one")
+    assert seen.got == [(views[(k + 1) % 3],) for k, views in enumerate(seen.drawn)]
+    assert (state.counters.views, state.counters.backward_passes) == (36, 36)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_an_extra_view_is_rendered_while_density_control_lasts(views):
+    seen = Observed()
+    setup, state = trained(40, seen, views=views, density_views="extra")
+    last = 20  # of 40: density control ends in the middle
+    assert [setup.schedule.collects(step) for step in (last - 1, last + 1)] == [True, False]
+    extra = sum(map(setup.schedule.collects, range(1, 41)))
+    assert [len(got) - views for got in seen.got] == [1] * extra + [0] * (40 - extra)
+    assert [got[:views] for got in seen.got] == seen.drawn
+    assert state.counters.views == state.counters.backward_passes == 40 * views + extra
+    assert len({got[views] for got in seen.got[:extra]}) > 4
+
+
+@pytest.mark.parametrize("operator", ["sum", "pcgrad"])
+@pytest.mark.parametrize("choice", ["one", "extra"])
+def test_before_the_first_edit_they_change_no_bit(choice, operator):
+    settings = {"views": 2, "steps": 400, "operator": {"name": operator}}
+    (setup, state), (_, other) = (
+        trained(8, density_views=each, **settings) for each in ("all", choice)
+    )
+    assert setup.schedule.first_edit > 8
+    assert all(torch.equal(t, other.parameters[n]) for n, t in state.parameters.items())
+    for n, moment in state.adam.exp_avg_sq.items():
+        assert torch.equal(moment, other.adam.exp_avg_sq[n])
+    rngs = (each.rngs["sampler"].bit_generator.state for each in (state, other))
+    assert next(rngs) == next(rngs)
+
+
+@pytest.mark.parametrize("choice", ["one", "extra"])
+def test_other_statistics_are_other_edits(choice):
+    edited = [trained(40, views=2, density_views=each)[1] for each in ("all", choice)]
+    shapes = [state.parameters["means"].shape[0] for state in edited]
+    sums = [float(state.parameters["means"].sum()) for state in edited]
+    assert shapes[0] != shapes[1] or sums[0] != sums[1]
