@@ -107,6 +107,30 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     assert rows == quality(tmp_path / "whole")
 
 
+def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scene, tmp_path):
+    settings = {"steps": 20, "average": 0.5, "final_decay": 0.5, "eval_every": 4}
+    run(scene, tmp_path / "raw", **{**settings, "average": 0.0})
+    run(scene, tmp_path / "whole", **settings)
+    assert run(scene, tmp_path / "parts", stop_after=15, **settings) == 0
+    assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
+    whole, parts = load(latest(tmp_path / "whole")), load(latest(tmp_path / "parts"))
+    assert same(whole.parameters, parts.parameters)
+    assert same(whole.parameters, load(latest(tmp_path / "raw")).parameters)
+    assert same(whole.plugins["average"].tensors, parts.plugins["average"].tensors)
+    rows = [row for row in quality(tmp_path / "parts") if row["step"] != "15"]
+    assert rows == quality(tmp_path / "whole")
+    # The average of steps 11 to 20 begins after the evaluation of step 8.
+    raw = quality(tmp_path / "raw")
+    assert rows[:2] == raw[:2] and all(
+        a["psnr"] != b["psnr"] for a, b in zip(rows[2:], raw[2:], strict=True)
+    )
+    exported = read_ply(tmp_path / "whole" / "point_cloud.ply").logit_opacities
+    sums, count = whole.plugins["average"].tensors["opacities"], 10
+    assert np.allclose(
+        np.sort(exported.ravel()), np.sort((sums / count).numpy().ravel()), atol=1e-5
+    )
+
+
 def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_path, monkeypatch):
     # Whatever the probe of this machine says, the first plan is wrong.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps"))

@@ -115,6 +115,17 @@ IDLE = [
         "rasterizer.dilation",
     ),
     ({"reading": {"split": "none", "test_every": 4}}, "reading.test_every"),
+    ({"final_rate": 0.5}, "final_rate"),
+    (
+        {
+            "backbone": {
+                "name": "scaffold",
+                **dict.fromkeys(("lr_features_final", "lr_scales_final", "lr_cov_final"), 1e-5),
+            },
+            "final_decay": 0.5,
+        },
+        "final_decay",
+    ),
 ]
 #: The same settings where they do something.
 AT_WORK = [
@@ -128,6 +139,8 @@ AT_WORK = [
     {"grouping": {"name": "gmm"}, "observers": [{"name": "diagnostics"}]},
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
+    {"final_decay": 0.5, "final_rate": 0.5},
+    {"backbone": {"name": "scaffold"}, "final_decay": 0.5},
     # A value that is the default is never refused.
     {"operator": {"name": "chain", "links": ["mean"], "granularity": "block"}},
     {"backbone": {"name": "scaffold", "lr_bank": 0.01}},
