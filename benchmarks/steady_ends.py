@@ -41,11 +41,12 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
-def arm(run: RunResults) -> tuple[str, float, float]:
+def arm(run: RunResults) -> tuple[str, str, str]:
     """Scene and what is done at the end of a run."""
     shares = (run.config.get(name) or 0.0 for name in ("final_decay", "average"))
     fades, averages = map(float, shares)
-    return Path(str(run.config["scene"])).name, fades, averages
+    left = f" to {run.config['final_rate']:g}" if fades else ""
+    return Path(str(run.config["scene"])).name, f"{fades:.0%}{left}", f"{averages:.0%}"
 
 
 def main() -> None:
@@ -66,7 +67,7 @@ def main() -> None:
     for (scene, fades, averages), runs in sorted(found.items()):
         jitters, last, counts = zip(*runs, strict=True)
         print(
-            f"| {scene} | {fades:.0%} | {averages:.0%} | {len(runs)} | {min(counts)} | "
+            f"| {scene} | {fades} | {averages} | {len(runs)} | {min(counts)} | "
             f"{mean(jitters):.3f} (at most {max(jitters):.3f}) | {mean(last):.2f} |"
         )
 

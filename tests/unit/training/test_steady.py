@@ -20,8 +20,8 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import step as stepping
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.state import Snapshot
-from crossgrad_core.training.steady import STATE, faded, follow, restart, shown
+from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_core.training.steady import STATE, faded, follow, shown
 
 CONSTANT, DECAYING = LearningRate(0.05), LearningRate(1.0, 0.01)
 STEPS = 10
@@ -80,48 +80,56 @@ def test_what_is_left_of_a_rate_is_an_option():
     assert faded(config, CONSTANT, 75, 100) == 0.5
 
 
-def rates_of(monkeypatch, setup):
-    """The rates that every step hands to the optimizer."""
-    seen, real = [], stepping.adam_step
+def recorded(setup):
+    """The state after a run, the parameters after each step, and the rates of each."""
+    rates, real = [], stepping.adam_step
 
     def adam_step(params, grads, state, lrs, *more, **named):
-        seen.append(dict(lrs))
+        rates.append(dict(lrs))
         real(params, grads, state, lrs, *more, **named)
 
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stepping, "adam_step", adam_step)
-        trained(setup)
-    return seen
+        return *trained(setup), rates
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(backbone, monkeypatch):
-    published = rates_of(monkeypatch, setup_of(backbone))
-    faster = rates_of(monkeypatch, setup_of(backbone, final_decay=0.5))
-    blocks = setup_of(backbone).trained_blocks
+@pytest.fixture(scope="module", params=BACKBONES)
+def runs(request):
+    """Runs of a backbone: as published, averaged, and with both; the last one also in two parts."""
+    setups = {
+        "plain": setup_of(request.param),
+        "averaged": setup_of(request.param, average=0.4),
+        "both": setup_of(request.param, average=0.5, final_decay=0.5),
+    }
+    found = {name: recorded(setup) for name, setup in setups.items()}
+    half, _ = trained(setups["both"], steps=7)
+    again = from_checkpoint(setups["both"], to_checkpoint(half))
+    return SimpleNamespace(setups=setups, again=trained(setups["both"], state=again)[0], **found)
+
+
+def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(runs):
+    blocks = runs.setups["plain"].trained_blocks
     of = {name: block.lr for block in blocks for name in block.tensors}
-    assert len(published) == len(faster) == STEPS
-    for step, (plain, fading) in enumerate(zip(published, faster, strict=True), start=1):
+    published, fading = runs.plain[2], runs.both[2]
+    assert len(published) == len(fading) == STEPS
+    for step, (plain, faster) in enumerate(zip(published, fading, strict=True), start=1):
         for name, rate in of.items():
             left = 1.0 if rate.decays else 0.01 ** max(0.0, (step - 5) / 5)
-            assert fading[name] == pytest.approx(plain[name] * left, rel=1e-12)
+            assert faster[name] == pytest.approx(plain[name] * left, rel=1e-12)
             if step <= STEPS / 2:
-                assert fading[name] == plain[name]
+                assert faster[name] == plain[name]
     constant = [name for name, rate in of.items() if not rate.decays]
     assert constant and all(published[0][n] == published[-1][n] for n in constant)
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_average_is_that_of_the_last_steps_and_changes_no_training(backbone):
-    plain, _ = trained(setup_of(backbone))
-    setup = setup_of(backbone, average=0.4)
-    state, seen = trained(setup)
+def test_the_average_is_that_of_the_last_steps_and_changes_no_training(runs):
+    (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
     assert STATE not in plain.states
     assert state.states[STATE].values["count"] == 4
     found = shown(state)
     assert found.keys() == state.parameters.keys()
-    averaged = {name for block in setup.trained_blocks for name in block.tensors}
+    averaged = {n for block in runs.setups["averaged"].trained_blocks for n in block.tensors}
     for name, tensor in found.items():
         if name in averaged:
             expected = torch.stack([each[name].double() for each in seen[-4:]]).mean(dim=0)
@@ -130,30 +138,21 @@ def test_the_average_is_that_of_the_last_steps_and_changes_no_training(backbone)
             assert tensor is state.parameters[name]
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_what_is_drawn_is_the_average(backbone):
-    setup = setup_of(backbone, average=0.4)
-    state, _ = trained(setup)
+def test_what_is_drawn_is_the_average(runs):
+    setup, state = runs.setups["averaged"], runs.averaged[0]
     view = sample_scene().test_views[0]
+    raw = TrainState(state.parameters, state.adam, state.rngs, step=state.step)
+    mean = TrainState(shown(state), state.adam, state.rngs, step=state.step)
     with torch.no_grad():
-        drawn = renderer(setup, state)(view)
-        raw = first_state(setup)
-        raw.step, raw.parameters = state.step, shown(state)
-        assert torch.equal(drawn, renderer(setup, raw)(view))
-        restart(state)
-        assert not torch.equal(drawn, renderer(setup, state)(view))
+        drawn, expected, other = (renderer(setup, s)(view) for s in (state, mean, raw))
+    assert torch.equal(drawn, expected) and not torch.equal(drawn, other)
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(backbone):
-    settings = {"average": 0.5, "final_decay": 0.5}
-    whole, _ = trained(setup_of(backbone, **settings))
-    setup = setup_of(backbone, **settings)
-    half, _ = trained(setup, steps=7)
-    again, _ = trained(setup, state=from_checkpoint(setup, to_checkpoint(half)))
-    assert same(whole.parameters, again.parameters)
-    assert whole.states[STATE].values == again.states[STATE].values == {"count": 5}
-    assert same(whole.states[STATE].tensors, again.states[STATE].tensors)
+def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
+    whole = runs.both[0]
+    assert same(whole.parameters, runs.again.parameters)
+    assert whole.states[STATE].values == runs.again.states[STATE].values == {"count": 5}
+    assert same(whole.states[STATE].tensors, runs.again.states[STATE].tensors)
 
 
 def test_a_snapshot_keeps_the_average_of_its_moment():
@@ -216,13 +215,6 @@ def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
     state.step = 96
     follow(longer, state)
     assert STATE not in state.states
-
-
-class Once:
-    """Answers one step with an edit, as a densifier does."""
-
-    def __init__(self, at, edit):
-        self.at, self.edit = at, edit
 
 
 @pytest.mark.parametrize(
