@@ -53,7 +53,7 @@ from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.poses import altitudes, footprint_of, radial_distances, upward
+from crossgrad_core.contract.poses import footprint_of, radial_distances
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution
@@ -161,7 +161,6 @@ __all__ = [
     "ViewCounts",
     "ViewRecord",
     "Weighting",
-    "altitudes",
     "apply_to_parameters",
     "atomic_file",
     "bimodality",
@@ -188,5 +187,4 @@ __all__ = [
     "shows_bar",
     "size_text",
     "unit_range",
-    "upward",
 ]

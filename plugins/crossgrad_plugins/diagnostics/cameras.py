@@ -9,11 +9,9 @@ from crossgrad_core.commands import names
 from crossgrad_core.plugin import (
     Scene,
     UserError,
-    altitudes,
     bimodality,
     footprint_of,
     radial_distances,
-    upward,
 )
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
@@ -21,6 +19,7 @@ from crossgrad_plugins.diagnostics.probe import Measurement
 from crossgrad_plugins.diagnostics.ratios import gradient_ratio
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict
 from crossgrad_plugins.diagnostics.variance import variance_split
+from crossgrad_plugins.groupings.heights import altitudes, upward
 
 #: Groupings that the one probe is also read by (the paper's prediction P4).
 GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")

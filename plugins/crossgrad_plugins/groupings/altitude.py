@@ -15,9 +15,8 @@ from crossgrad_core.plugin import (
     Rule,
     Scene,
     View,
-    altitudes,
-    upward,
 )
+from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
