@@ -64,6 +64,11 @@ def go_on(folder):
     finish(folder)
 
 
+def nap(folder):
+    time.sleep(2.0)
+    finish(folder)
+
+
 def hang(folder):
     def stop(number, _frame):
         ended(folder, "stopped")
@@ -86,7 +91,9 @@ def ended(folder, status, error=None):
     (folder / "summary.json").write_text(json.dumps(summary))
 
 
-ACTS = {each.__name__: each for each in (finish, fail, refuse, die, die_once, go_on, hang, eat)}
+ACTS = {
+    each.__name__: each for each in (finish, fail, refuse, die, die_once, go_on, hang, nap, eat)
+}
 
 if __name__ == "__main__":
     main()

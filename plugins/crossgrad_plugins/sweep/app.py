@@ -14,7 +14,7 @@ from crossgrad_core.commands import (
     locked,
     writer_of,
 )
-from crossgrad_plugins.sweep.engines import Stop, Work, engine
+from crossgrad_plugins.sweep.engines import Work, engine
 from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, read_grid, with_scenes
 from crossgrad_plugins.sweep.layout import Layout
@@ -109,6 +109,10 @@ class Sweep:
         ids = {each.job.id for each in left}
         _say(listing([cell for cell in self.plan.cells if cell.id in ids], found))
         _say([self._forecast(left)])
+        if self.request.engine == "slurm":
+            from crossgrad_plugins.sweep.engines.slurm import script
+
+            _say(["", script(self._work(found))])
         return 0
 
     def carry_out(self) -> int:
@@ -132,9 +136,18 @@ class Sweep:
 
     def _watched(self, before: Sequence[Standing]) -> list[int]:
         """Carries out what is left and shows how; answers the signals that came."""
-        request, stop = self.request, Stop()
         screen = Screen(Watch(self.layout, before), self.at_a_time)
-        work = Work(
+        work = self._work(before)
+        with noted(work.stop) as signals:
+            for _ in engine(self.request.engine)(work):
+                screen.show()
+            screen.close()
+        return signals
+
+    def _work(self, before: Sequence[Standing]) -> Work:
+        """What is to be done."""
+        request = self.request
+        return Work(
             jobs=[each.job for each in before if each.state != "finished"],
             out=self.layout.out,
             folder=request.path.resolve().parent,
@@ -143,13 +156,7 @@ class Sweep:
             memory=request.memory,
             options=dict(request.options),
             machine=self.machine,
-            stop=stop,
         )
-        with noted(stop) as signals:
-            for _ in engine(request.engine)(work):
-                screen.show()
-            screen.close()
-        return signals
 
     def _result(self, signals: Sequence[int]) -> int:
         """Prints what was found and what failed; the exit code."""

@@ -38,6 +38,7 @@ class Worker:
         threads: Threads of a run.
         cores: Numbers of its cores; any where there are none.
         memory: Bytes that a run may take; None where there is no bound.
+        command: What trains a run.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Worker:
     threads: int = 1
     cores: tuple[int, ...] = ()
     memory: int | None = None
+    command: tuple[str, ...] = COMMAND
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,14 @@ class Attempt:
         worker = self.worker
         cores = ",".join(map(str, worker.cores)) or "-"
         return subprocess.Popen(
-            [*COMMAND, cores, *self._arguments(), "--threads", str(worker.threads), "--quiet"],
+            [
+                *worker.command,
+                cores,
+                *self._arguments(),
+                "--threads",
+                str(worker.threads),
+                "--quiet",
+            ],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,

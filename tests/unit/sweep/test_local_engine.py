@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from support import fake_run
 
-from crossgrad_plugins.sweep import attempt
 from crossgrad_plugins.sweep.engines import Stop, Work, engine
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
@@ -19,16 +18,16 @@ GIB = 2**30
 
 
 @pytest.fixture
-def work(tmp_path, monkeypatch):
+def work(tmp_path):
     """Makes the work of runs that do what they are told; so many at a time."""
-    monkeypatch.setattr(attempt, "COMMAND", (sys.executable, fake_run.__file__))
 
     def make(*acts, workers=2, memory=None):
         layout = Layout(tmp_path / "out")
         layout.make()
         jobs = [Job(f"{act}-{n}", act, "scene", n, {"do": act}) for n, act in enumerate(acts)]
         cores = ((min(os.sched_getaffinity(0)),),) * workers
-        return Work(jobs, layout.out, tmp_path, 1, machine=Machine(cores, memory))
+        machine, command = Machine(cores, memory), (sys.executable, fake_run.__file__)
+        return Work(jobs, layout.out, tmp_path, 1, machine=machine, command=command)
 
     return make
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, Protocol
 
+from crossgrad_plugins.sweep.attempt import COMMAND, Worker
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.machine import Machine
 
@@ -45,6 +46,7 @@ class Work:
         options: Options of the engine as the user gave them.
         machine: How this machine is divided; None for an engine that runs elsewhere.
         stop: Whether to stop.
+        command: What trains a run; the numbers of cores and arguments of `crossgrad` follow.
     """
 
     jobs: Sequence[Job]
@@ -56,6 +58,19 @@ class Work:
     options: Mapping[str, str] = field(default_factory=dict)
     machine: Machine | None = None
     stop: Stop = field(default_factory=Stop)
+    command: tuple[str, ...] = COMMAND
+
+    def worker(self, name: str, cores: tuple[int, ...] = (), memory: int | None = None) -> Worker:
+        """Somebody who carries out runs of this work.
+
+        Args:
+            name: His name.
+            cores: Numbers of his cores; any where there are none.
+            memory: Bytes that a run of his may take; by default what the user named.
+        """
+        if memory is None and self.memory is not None:
+            memory = int(self.memory * 2**30)
+        return Worker(name, self.out, self.folder, self.threads, cores, memory, self.command)
 
 
 class Engine(Protocol):

@@ -69,6 +69,6 @@ def _workers(work: Work) -> list[Worker]:
     if machine is None:
         raise ValueError("this machine is not divided")
     return [
-        Worker(str(number), work.out, work.folder, work.threads, cores, machine.memory)
+        work.worker(str(number), cores, machine.memory)
         for number, cores in enumerate(machine.cores, 1)
     ]

@@ -1,0 +1,127 @@
+"""The machines of a Ray cluster: a task for each run; a machine that is lost costs only time.
+
+Options: `address` of the cluster (default: RAY_ADDRESS, else this machine).
+"""
+
+import logging
+import signal
+from collections import deque
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any, Final
+
+from crossgrad_core.commands import UserError, listed, listened_to
+from crossgrad_plugins.sweep.attempt import Outcome, Worker
+from crossgrad_plugins.sweep.elsewhere import carried_out
+from crossgrad_plugins.sweep.engines import Work
+from crossgrad_plugins.sweep.job import Job
+from crossgrad_plugins.sweep.tries import Tries
+
+OPTIONS: Final = ("address",)
+#: Seconds between two looks.
+_PAUSE = 0.25
+
+
+def carry_out(work: Work) -> Iterator[None]:
+    """Carries out runs as tasks; Ray repeats those of a machine that it has lost."""
+    ray = _connected(work)
+    try:
+        crew = _Crew(work, ray)
+        while crew.is_busy():
+            crew.look()
+            yield
+    finally:
+        ray.shutdown()
+
+
+class _Crew:
+    """The tasks of a sweep.
+
+    Args:
+        work: What is to be done.
+        ray: The library, connected.
+    """
+
+    def __init__(self, work: Work, ray: ModuleType) -> None:
+        self._work, self._ray = work, ray
+        self._waiting = deque(work.jobs)
+        self._tries = Tries(work.out)
+        self._under_way: dict[Any, Job] = {}
+        self._asked = 0
+        needs: dict[str, Any] = {"num_cpus": work.threads, "max_retries": -1}
+        if (memory := work.worker("").memory) is not None:
+            needs["memory"] = memory
+        self._task = ray.remote(scheduling_strategy="SPREAD", **needs)(_carried_out)
+
+    def is_busy(self) -> bool:
+        """Whether anything is under way or to be begun."""
+        return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
+
+    def look(self) -> None:
+        """Hands out runs, and takes what has ended."""
+        work, most = self._work, self._work.workers
+        while self._waiting and not work.stop.count and len(self._under_way) < (most or 10**6):
+            job = self._waiting.popleft()
+            self._under_way[self._task.remote(job, work.worker("ray"))] = job
+        if self._asked < work.stop.count:
+            self._asked = work.stop.count
+            for task in self._under_way:
+                self._ray.cancel(task, force=False)
+        done, _ = self._ray.wait(list(self._under_way), timeout=_PAUSE)
+        for task in done:
+            job = self._under_way.pop(task)
+            if self._tries.once_more(job, self._outcome(task)):
+                self._waiting.appendleft(job)
+
+    def _outcome(self, task: object) -> Outcome:
+        try:
+            found: Outcome = self._ray.get(task)
+        except self._ray.exceptions.TaskCancelledError:
+            return Outcome("stopped")
+        except self._ray.exceptions.RayError as error:
+            return Outcome("died", str(error))
+        return found
+
+
+def _carried_out(job: Job, worker: Worker) -> Outcome:
+    """The task: its worker is called after its machine and process."""
+    import os
+
+    import ray
+
+    node = ray.get_runtime_context().get_node_id()
+    return carried_out(job, worker, f"ray-{node[:8]}-{os.getpid()}")
+
+
+def _connected(work: Work) -> ModuleType:
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError(
+            "Ray is not installed",
+            where="--engine ray",
+            found=str(error),
+            todo="pip install 'crossgrad[ray]'",
+        ) from error
+    if unknown := work.options.keys() - set(OPTIONS):
+        raise UserError(
+            "the engine ray has no such option",
+            where="--engine-option",
+            expected=listed(OPTIONS),
+            found=listed(sorted(unknown)),
+            todo="leave it out",
+        )
+    handlers = {number: signal.getsignal(number) for number in listened_to()}
+    try:
+        ray.init(work.options.get("address"), log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise UserError(
+            "the Ray cluster does not answer",
+            where="--engine-option address",
+            found=" ".join(str(error).split()),
+            todo="start it with `ray start --head`, and name the address that it prints",
+        ) from error
+    for number, handler in handlers.items():  # Ray puts its own in their place.
+        signal.signal(number, handler)
+    found: ModuleType = ray
+    return found

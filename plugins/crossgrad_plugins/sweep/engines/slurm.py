@@ -1,0 +1,212 @@
+"""A Slurm cluster, through submitit: a job for each run.
+
+Options: `cluster` (slurm, or local to try it out on this machine), `time` in minutes (1440), and
+those of sbatch: `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
+`comment`.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from time import sleep
+from types import ModuleType
+from typing import Any, Final
+
+from crossgrad_core.commands import UserError, listed
+from crossgrad_plugins.sweep.attempt import Outcome, Worker
+from crossgrad_plugins.sweep.elsewhere import carried_out
+from crossgrad_plugins.sweep.engines import Work
+from crossgrad_plugins.sweep.job import Job
+from crossgrad_plugins.sweep.tries import Tries
+
+#: Options that sbatch is given as they are.
+SBATCH: Final = (
+    *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "comment"),
+)
+OPTIONS: Final = ("cluster", "time", *SBATCH)
+_NAME: Final = "crossgrad"
+#: Minutes that a job may take, where the user does not say.
+_TIME: Final = 1440
+#: Seconds between two looks.
+_PAUSE: Final = 0.5
+#: Jobs of one array that run at a time, where the user does not say.
+_MOST: Final = 256
+
+
+def carry_out(work: Work) -> Iterator[None]:
+    """Carries out runs as jobs; one that Slurm preempts goes on when it is started again."""
+    crew = _Crew(work)
+    while crew.is_busy():
+        crew.look()
+        yield
+        sleep(_PAUSE)
+
+
+def script(work: Work) -> str:
+    """What sbatch would be given for the whole sweep."""
+    _submitit(work)
+    from submitit.slurm.slurm import _convert_mem, _make_sbatch_string
+
+    parameters: dict[str, Any] = {
+        "job_name": _NAME,
+        "time": _minutes(work),
+        "cpus_per_task": work.threads,
+    }
+    if work.memory is not None:
+        parameters["mem"] = _convert_mem(work.memory)
+    parameters |= {name: work.options[name] for name in SBATCH if name in work.options}
+    command = "python -u -m submitit.core._submit " + str(work.out / "slurm")
+    found: str = _make_sbatch_string(
+        command,
+        folder=work.out / "slurm" / "%j",
+        map_count=max(1, len(work.jobs)),
+        array_parallelism=work.workers or _MOST,
+        **parameters,
+    )
+    return found
+
+
+class Task:
+    """What a job does; submitit hands it in again where Slurm preempts it.
+
+    Args:
+        job: The run.
+        worker: Who carries it out.
+    """
+
+    def __init__(self, job: Job, worker: Worker) -> None:
+        self.job, self.worker = job, worker
+
+    def __call__(self) -> Outcome:
+        """Carries out the run."""
+        import submitit
+
+        return carried_out(self.job, self.worker, f"slurm-{submitit.JobEnvironment().job_id}")
+
+    def checkpoint(self) -> object:
+        """The job that goes on; the run finds its own checkpoint."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self)
+
+
+class _Crew:
+    """The jobs of a sweep.
+
+    Args:
+        work: What is to be done.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+        self._submitit = _submitit(work)
+        self._executor = _executor(work, self._submitit)
+        # Only Slurm has a queue; elsewhere everything that is handed in begins at once.
+        queued = self._executor.cluster == "slurm"
+        self._most = len(work.jobs) if queued else work.workers or 1
+        self._waiting = deque(work.jobs)
+        self._tries = Tries(work.out)
+        self._under_way: list[tuple[Any, Job]] = []
+        self._asked = 0
+
+    def is_busy(self) -> bool:
+        """Whether anything is under way or to be begun."""
+        return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
+
+    def look(self) -> None:
+        """Hands in runs, and takes what has ended."""
+        stop = self._work.stop
+        if self._waiting and not stop.count:
+            self._hand_in()
+        if self._asked < stop.count:
+            self._asked = stop.count
+            for handed, _ in self._under_way:
+                handed.cancel(check=False)
+        for handed, job in [each for each in self._under_way if each[0].done()]:
+            self._under_way.remove((handed, job))
+            if self._tries.once_more(job, self._outcome(handed)) and not stop.count:
+                self._waiting.appendleft(job)
+
+    def _hand_in(self) -> None:
+        room = self._most - len(self._under_way)
+        jobs = [self._waiting.popleft() for _ in range(min(room, len(self._waiting)))]
+        if jobs:
+            tasks = [Task(job, self._work.worker("slurm")) for job in jobs]
+            with self._executor.batch():
+                handed = [self._executor.submit(task) for task in tasks]
+            self._under_way += zip(handed, jobs, strict=True)
+
+    def _outcome(self, handed: Any) -> Outcome:  # noqa: ANN401 - a job of submitit
+        if self._asked:
+            return Outcome("stopped")
+        try:
+            found: Outcome = handed.result()
+        except self._submitit.core.utils.UncompletedJobError as error:
+            return Outcome("died", str(error).splitlines()[0])
+        except self._submitit.core.utils.FailedJobError as error:
+            return Outcome("died", str(error).splitlines()[-1])
+        return found
+
+
+def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an executor of submitit
+    cluster = work.options.get("cluster", "slurm")
+    try:
+        executor = submitit.AutoExecutor(folder=work.out / "slurm" / "%j", cluster=cluster)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(
+            "there is no such cluster here",
+            where="--engine slurm",
+            found=" ".join(str(error).split()),
+            todo="start the sweep where sbatch and srun are, or try it out with "
+            "--engine-option cluster=local",
+        ) from error
+    sbatch = {f"slurm_{name}": work.options[name] for name in SBATCH if name in work.options}
+    executor.update_parameters(
+        **_general(work), **sbatch, slurm_array_parallelism=work.workers or _MOST
+    )
+    return executor
+
+
+def _general(work: Work) -> dict[str, Any]:
+    """Parameters that every executor of submitit knows."""
+    found: dict[str, Any] = {
+        "name": _NAME,
+        "timeout_min": _minutes(work),
+        "cpus_per_task": work.threads,
+    }
+    return found if work.memory is None else {**found, "mem_gb": work.memory}
+
+
+def _minutes(work: Work) -> int:
+    text = work.options.get("time", str(_TIME))
+    if text.isdecimal() and int(text):
+        return int(text)
+    raise UserError(
+        "the time of a job is no number of minutes",
+        where="--engine-option time",
+        expected="a whole number above 0",
+        found=text,
+        todo="write for example --engine-option time=120",
+    )
+
+
+def _submitit(work: Work) -> ModuleType:
+    """The library, once it is known that all options are."""
+    try:
+        import submitit
+    except ImportError as error:
+        raise UserError(
+            "submitit is not installed",
+            where="--engine slurm",
+            found=str(error),
+            todo="pip install 'crossgrad[slurm]'",
+        ) from error
+    if unknown := work.options.keys() - set(OPTIONS):
+        raise UserError(
+            "the engine slurm has no such option",
+            where="--engine-option",
+            expected=listed(OPTIONS),
+            found=listed(sorted(unknown)),
+            todo="leave it out",
+        )
+    found: ModuleType = submitit
+    return found

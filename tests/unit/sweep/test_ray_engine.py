@@ -1,0 +1,34 @@
+"""Ray: a local cluster of two nodes, one of which is killed midway."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support import fake_run
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.sweep.engines import Work, engine
+
+pytest.importorskip("ray")
+TWO_NODES = Path(fake_run.__file__).with_name("two_nodes.py")
+
+
+def test_a_node_that_is_killed_costs_only_time(tmp_path):
+    command = [sys.executable, str(TWO_NODES), str(tmp_path / "grid"), str(tmp_path / "out")]
+    command += ["kill", sys.executable, fake_run.__file__]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout.splitlines()[-1])
+    assert said["killed"] and said["nodes"] >= 2
+    assert said["states"] == ["finished"] * 6
+    assert said["begins"] >= 7
+
+
+@pytest.mark.parametrize(
+    ("options", "found"), [({"adress": "x"}, "adress"), ({"address": "127.0.0.1:1"}, "answer")]
+)
+def test_what_is_not_there_is_refused(tmp_path, options, found):
+    with pytest.raises(UserError, match=found):
+        next(engine("ray")(Work([], tmp_path, tmp_path, 1, options=options)))

@@ -1,0 +1,78 @@
+"""Slurm through submitit: the script, and runs by its local executor."""
+
+import sys
+
+import pytest
+from support import fake_run
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.sweep.engines import Work, engine
+from crossgrad_plugins.sweep.job import Job
+from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.records import read_records
+from crossgrad_plugins.sweep.standing import standings
+
+pytest.importorskip("submitit")
+
+
+def made(folder, acts, options, **more):
+    layout = Layout(folder / "out")
+    layout.make()
+    jobs = [Job(f"{act}-{n}", act, "scene", n, {"do": act}) for n, act in enumerate(acts)]
+    command = (sys.executable, fake_run.__file__)
+    return Work(jobs, layout.out, folder, 2, options=options, command=command, **more)
+
+
+def states(work):
+    layout = Layout(work.out)
+    found = standings(work.jobs, layout, read_records(layout.records), alive=False)
+    return [each.state for each in found]
+
+
+def test_the_local_executor_carries_out_runs_and_stops_for_none(tmp_path):
+    work = made(tmp_path, ["finish", "fail", "die_once"], {"cluster": "local"}, workers=3)
+    for _ in engine("slurm")(work):
+        pass
+    assert states(work) == ["finished", "failed", "finished"]
+    workers = {each.worker for each in read_records(work.out / "workers")}
+    assert all(name.startswith("slurm-") for name in workers)
+    assert len(workers) == 4  # A job for each attempt.
+
+
+def test_asked_to_stop_its_jobs_stop(tmp_path):
+    work = made(tmp_path, ["hang", "finish"], {"cluster": "local"})
+    for _ in engine("slurm")(work):
+        if (work.out / "runs" / "hang-0" / "ready").exists():
+            work.stop.count = 1
+    assert states(work) == ["interrupted", "waiting"]
+
+
+def test_the_script_says_what_is_asked_of_slurm(tmp_path):
+    from crossgrad_plugins.sweep.engines.slurm import script
+
+    options = {"partition": "gpu", "time": "90"}
+    text = script(made(tmp_path, ["finish"] * 5, options, workers=3, memory=4.0))
+    for line in (
+        "#SBATCH --job-name=crossgrad",
+        "#SBATCH --array=0-4%3",
+        "#SBATCH --cpus-per-task=2",
+        "#SBATCH --mem=4GB",
+        "#SBATCH --partition=gpu",
+        "#SBATCH --time=90",
+    ):
+        assert line in text.splitlines()
+    assert "srun" in text and "submitit.core._submit" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ({"cluster": "slurm"}, "srun"),
+        ({"partitoin": "x"}, "partitoin"),
+        ({"cluster": "local", "time": "1h"}, "1h"),
+    ],
+)
+def test_what_is_not_there_is_refused(tmp_path, monkeypatch, options, found):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=found):
+        next(engine("slurm")(made(tmp_path, ["finish"], options)))
