@@ -2,6 +2,7 @@
 
 import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def environment(device: str = "cpu") -> dict[str, Json]:
     packages: dict[str, Json] = {name: _version(name) for name in _PACKAGES}
     return {
         "crossgrad": VERSION,
+        "commit": commit(),
         "python": platform.python_version(),
         "packages": packages,
         "platform": platform.platform(),
@@ -31,6 +33,32 @@ def environment(device: str = "cpu") -> dict[str, Json]:
         "device": device,
         "gpu": torch.cuda.get_device_name(device) if device.startswith("cuda") else None,
     }
+
+
+def commit(package: Path = Path(__file__).parents[2]) -> str | None:
+    """The commit of the checkout that the code comes from, with a `+` where files differ from it.
+
+    None of an installed package, wherever that lies, and where there is no git.
+
+    Args:
+        package: Folder of the package `crossgrad_core`.
+    """
+    root = package.parent
+    if not ((root / ".git").exists() and (root / "pyproject.toml").is_file()):
+        return None
+    try:
+        head = _git(root, "rev-parse", "--short=7", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return head + ("+" if changed else "")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    # Without locks: a run only looks on while others may commit.
+    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
+    return done.stdout.strip()
 
 
 def _version(package: str) -> str | None:
