@@ -5,6 +5,7 @@ Options: `address` of the cluster (default: RAY_ADDRESS, else this machine).
 
 import logging
 import signal
+import socket
 from collections import deque
 from collections.abc import Iterator
 from types import ModuleType
@@ -20,6 +21,8 @@ from crossgrad_plugins.sweep.tries import Tries
 OPTIONS: Final = ("address",)
 #: Seconds between two looks.
 _PAUSE = 0.25
+#: Seconds in which a cluster has to answer.
+_PATIENCE = 10.0
 
 
 def carry_out(work: Work) -> Iterator[None]:
@@ -111,10 +114,12 @@ def _connected(work: Work) -> ModuleType:
             found=listed(sorted(unknown)),
             todo="leave it out",
         )
+    address = work.options.get("address")
     handlers = {number: signal.getsignal(number) for number in listened_to()}
     try:
-        ray.init(work.options.get("address"), log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+        _knock(address)
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
             "the Ray cluster does not answer",
             where="--engine-option address",
@@ -125,3 +130,10 @@ def _connected(work: Work) -> ModuleType:
         signal.signal(number, handler)
     found: ModuleType = ray
     return found
+
+
+def _knock(address: str | None) -> None:
+    """Raises an OSError within seconds where nobody answers; Ray would wait for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
