@@ -1,4 +1,4 @@
-"""A run on another machine: what a task of a cluster does, from its start to its end."""
+"""Runs on the machines of a cluster: a task from its start to its end."""
 
 from dataclasses import replace
 from time import sleep

@@ -66,7 +66,7 @@ def script(work: Work) -> str:
 
 
 class Task:
-    """What a job does; submitit hands it in again where Slurm preempts it.
+    """A run as a job of Slurm; submitit hands it in again where Slurm preempts it.
 
     Args:
         job: The run.
