@@ -112,6 +112,7 @@ __all__ = [
     "view_gradients",
     "with_steps",
     "write_atomically",
+    "write_mapping",
     "write_settings",
     "write_table",
     "writer_of",
@@ -170,9 +171,19 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
         UserError: The disk is full, or the folder is read-only.
     """
     from crossgrad_core.run.migration import marked
+
+    write_mapping(path, marked(settings))
+
+
+def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes a YAML file that `read_settings` gets the mapping back from.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
+    """
     from crossgrad_core.system.yaml_values import write_yaml
 
-    write_atomically(path, write_yaml(marked(settings)).encode())
+    write_atomically(path, write_yaml(content).encode())
 
 
 def layered(

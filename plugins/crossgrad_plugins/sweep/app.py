@@ -8,12 +8,15 @@ from pathlib import Path
 from crossgrad_core.commands import (
     FAILED,
     UserError,
+    check_file,
     check_folder,
     exit_code,
     finish,
     locked,
+    write_mapping,
     writer_of,
 )
+from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.engines import Work, engine
 from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, read_grid, with_scenes
@@ -113,6 +116,19 @@ class Sweep:
             from crossgrad_plugins.sweep.engines.slurm import script
 
             _say(["", script(self._work(found))])
+        return 0
+
+    def write_best(self, path: Path) -> int:
+        """Writes a grid with the best parameters of each arm and scene, for other seeds.
+
+        Raises:
+            UserError: They are not known yet, or the file cannot be written.
+        """
+        check_file(path)
+        found = self.standings(alive=writer_of(self.layout.out) is not None)
+        content, notes = best_grid(self.plan.grid, self.plan.cells, found, path.parent)
+        write_mapping(path, content)
+        _say([*notes, f"the grid with the best parameters is in {path}"])
         return 0
 
     def carry_out(self) -> int:

@@ -102,13 +102,22 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
         bool,
         typer.Option("--list", help="Lists all runs and how far they are.", rich_help_panel=_SHOW),
     ] = False,
+    best: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Writes a grid with the best parameters of each arm and scene, for other seeds.",
+            rich_help_panel=_SHOW,
+        ),
+    ] = None,
 ) -> None:
     """Run a grid of configurations, scenes and seeds; resume it after any interruption.
 
     Every run is one of `crossgrad run` in a folder of its own; its name is a hash of its
     configuration, scene and seed, so that what is finished is never repeated.
     """
-    announce(quiet=list_runs or dry_run)
+    looks_only = list_runs or dry_run or best is not None
+    announce(quiet=looks_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
     from crossgrad_plugins.sweep.engines import ENGINES
 
@@ -132,10 +141,12 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
             engine=engine,
             options=[_option(each) for each in engine_option or ()],
         ),
-        looks_only=list_runs or dry_run,
+        looks_only=looks_only,
     )
     if list_runs:
         raise typer.Exit(found.tell())
+    if best is not None:
+        raise typer.Exit(found.write_best(best))
     raise typer.Exit(found.foretell() if dry_run else found.carry_out())
 
 

@@ -61,6 +61,12 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
     return Standing(job, "interrupted" if begun(folder) else "waiting")
 
 
+def figure(standing: Standing, name: str) -> float | None:
+    """A figure of all held-out views of a finished run; None where there is none."""
+    value = ((standing.summary or {}).get("overall") or {}).get(name)
+    return float(value) if isinstance(value, int | float) else None
+
+
 def begun(folder: Path) -> bool:
     """Whether a run has a folder to go on in."""
     return (folder / "config.yaml").is_file()

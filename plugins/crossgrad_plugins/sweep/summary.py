@@ -7,7 +7,7 @@ from crossgrad_core.commands import write_table
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.standing import Standing
+from crossgrad_plugins.sweep.standing import Standing, figure
 
 
 def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
@@ -24,12 +24,11 @@ def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -
 
     The best mean of each scene has an asterisk.
     """
-    summaries = {each.job.id: each.summary for each in standings if each.summary is not None}
+    values = {each.job.id: figure(each, metric.name) for each in standings}
     found: dict[tuple[str, str], list[float]] = {}
     for job in cells:
-        value = (summaries.get(job.id, {}).get("overall") or {}).get(metric.name)
-        if isinstance(value, int | float):
-            found.setdefault((job.label, job.scene), []).append(float(value))
+        if (value := values[job.id]) is not None:
+            found.setdefault((job.label, job.scene), []).append(value)
     labels = list(dict.fromkeys(job.label for job in cells))
     scenes = list(dict.fromkeys(job.scene for job in cells))
     best = {scene: _best(found, scene, metric) for scene in scenes}
