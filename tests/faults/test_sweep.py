@@ -33,7 +33,7 @@ SHORT, LONG, SEEDS = 2, 20, 6
 
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
-    """24 short runs; 3 in the short version."""
+    """24 short runs; 2 in the short version."""
     folder = tmp_path_factory.mktemp("sweep")
     write_tiny_scene(folder / "tiny", views=6, suffix=".jpg")
     content = {"scenes": ["tiny"], "base": BASE, "seeds": list(range(SEEDS))}
@@ -42,7 +42,7 @@ def grid(tmp_path_factory):
         "backbone": {"values": ["vanilla", "mip"]},
     }
     if "FAULTS" not in os.environ:
-        content |= {"seeds": [0, 1, 2], "parameters": {}}
+        content |= {"seeds": [0, 1], "parameters": {}}
     path = folder / "grid.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
@@ -99,6 +99,7 @@ def finished(out):
     return found
 
 
+@pytest.mark.timeout(3600 if "FAULTS" in os.environ else 300)
 def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
     out = tmp_path / "sweep"
     draw = random.Random(0)
@@ -118,7 +119,7 @@ def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
         seen |= {name: when for name, when in finished(out).items() if name not in seen}
     assert start(grid, out).wait() == 0, said(out)
     after = finished(out)
-    assert len(after) == len(list((out / "runs").iterdir())) == (24 if long else 3)
+    assert len(after) == len(list((out / "runs").iterdir())) == (24 if long else 2)
     assert {name: after[name] for name in seen} == seen
     for name in after:
         events = [each for each in read_records(out / "workers") if each.run == name]

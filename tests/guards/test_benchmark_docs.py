@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crossgrad_core.commands import build, chosen, configured, layered
+from crossgrad_plugins.sweep.grid import choices, read_grid, scene_name
+
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = ROOT / "benchmarks"
 DOCS = {
@@ -40,21 +43,33 @@ def test_every_script_that_a_document_names_is_there(name):
 @pytest.mark.parametrize("title", SECTIONS)
 def test_every_section_has_its_command_and_its_date_or_commits(title):
     text = SECTIONS[title]
-    assert re.search(r"^    python benchmarks/\w+\.py", text, re.MULTILINE)
+    assert re.search(r"^    (python benchmarks/\w+\.py|crossgrad sweep )", text, re.MULTILINE)
     assert re.search(r"commit\s+\w{7}\b", text)
 
 
-def test_the_table_of_backbones_has_a_commit_in_every_row_and_is_the_one_of_its_rows(tmp_path, ran):
+def test_the_table_of_backbones_has_a_commit_in_every_row():
     rows = BENCHMARKS / "results" / "backbones.csv"
     with rows.open(encoding="utf-8", newline="") as file:
         codes = {row["code"] for row in csv.DictReader(file)}
     assert all(re.fullmatch(r"\w{7}\+?", code) for code in codes)
-    table = tmp_path / "table.md"
-    ran("backbones.py", "boruszyn_kap", "city_hybrid", "--seconds", 140, "--table", table)
     shown = (BENCHMARKS / "results" / "backbones.md").read_text(encoding="utf-8")
-    assert table.read_text(encoding="utf-8") == shown
     assert (f"{len(codes)} versions of the code" in shown) == (len(codes) > 1)
     assert all(code in PAGE for code in codes)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(BENCHMARKS.glob("grids/*.yaml")), ids=lambda path: path.stem
+)
+def test_each_grid_is_one_and_has_settings_that_there_are(path):
+    grid = read_grid(path)
+    for scene in grid.scenes:
+        for choice in choices(grid):
+            arm = choice.arm
+            own = arm.by_scene.get(scene_name(scene), {})
+            layers = (grid.base, arm.settings, choice.parameters, own)
+            config = configured({**layered(layers), "scene": scene})
+            for slot, part in chosen(config):
+                build(slot, part.name, part.options)
 
 
 def test_a_made_up_case_is_seen_by_its_camera(tmp_path, ran):
