@@ -244,7 +244,7 @@ def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeyp
 
 
 def test_noise_after_every_step_does_not_keep_the_average_from_growing():
-    setup = setup_of(densifier="mcmc", average=0.5)
+    setup = setup_of(densifier="mcmc", densify_until=2, average=0.5)
     state, _ = trained(setup)
     assert state.states[STATE].values["count"] == 5
 
