@@ -29,7 +29,7 @@ USUAL = (
     *("--set", "reset_every=30", "--set", "eval_every=20", "--stop-after", "30"),
 )
 #: Columns of metrics.csv that no two runs share.
-CLOCKS = {"train_seconds", "peak_memory_mib"}
+CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 
 #: Runs in the environment under test: command lines come as JSON, exit codes go back as JSON.
 CHILD = """

@@ -127,6 +127,11 @@ class RunConfig(BaseModel):
     seconds: Annotated[float | None, Flag("S", TRAINING)] = Field(
         None, gt=0, description="Training seconds; the number of steps follows the clock."
     )
+    clock: Annotated[Literal["wall", "cpu"], Flag("wall|cpu", TRAINING)] = Field(
+        "wall",
+        description="What --seconds counts: the clock on the wall, or CPU time of the process, "
+        "with --threads 1 where a machine is not quiet. Default: wall.",
+    )
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (), description="(step, steps in all from there on) of a run that followed the clock"
     )

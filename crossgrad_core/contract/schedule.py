@@ -254,7 +254,7 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
     else:
         start = wanted.densify_from if wanted.next_edit(0) > now else now
     needed = start + missing * every + 1
-    if needed > until:
+    if missing and needed > until:
         # A run that turns out far shorter than it was planned still has its edits.
         until = max(until, min(needed, (now + schedule.counted(schedule.total)) // 2))
         every = max(LEAST_INTERVAL, (until - 1 - start) // missing)

@@ -13,6 +13,7 @@ from typing import Any, cast
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import DEFAULT_STEPS
+from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
@@ -147,7 +148,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     length: Length = Forecast(Planned(config.revisions))
     if config.seconds is not None:
         setup = _within(setup, config.seconds)
-        length = Timed(config.seconds)
+        length = Timed(config.seconds, config.clock)
     setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds, compile_seconds
@@ -165,6 +166,7 @@ def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
     setup, load_seconds = set_up(config, verbosity)
+    check_clock(config)
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
     return setup, load_seconds + _held_out_decoded(setup)
@@ -238,6 +240,7 @@ def _train(
     """Trains from `state` on and finishes the run's folder whatever happens."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
+    setup.manager.register(session.machine, name="machine")
     stopper = Stopper()
     with stopper.installed():
         course = Course(setup, state, session, log, stopper)

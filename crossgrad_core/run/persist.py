@@ -1,6 +1,7 @@
 """TrainState to checkpoint and back."""
 
 from dataclasses import asdict
+from math import nan
 from typing import Any, cast
 
 from crossgrad_core.contract.adam_state import AdamState
@@ -84,8 +85,9 @@ def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
 
 
 def _clock(plain: dict[str, Any]) -> Clock:
-    """The clock; checkpoints of earlier versions do not tell training seconds by phase."""
+    """The clock; checkpoints of earlier versions tell neither training seconds by phase nor CPU."""
     phases = _figures(plain.get("phases", {}))
+    plain = {"cpu": nan, **plain}
     rest = {name: value for name, value in plain.items() if name != "phases"}
     return Clock(**_figures(rest), phases=phases)
 

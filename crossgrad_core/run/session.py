@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import isnan
 from pathlib import Path
 from time import perf_counter
 
@@ -14,6 +15,7 @@ from crossgrad_core.run.export import Exported, described, export_scene, rendere
 from crossgrad_core.run.persist import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
+from crossgrad_core.run.results.machine import Machine
 from crossgrad_core.run.results.metrics_csv import (
     MetricsCsv,
     columns_for,
@@ -40,10 +42,14 @@ class Session:
     Args:
         folder: The run's folder.
         table: Its metrics.csv.
+
+    Attributes:
+        machine: Watches the machine while the run trains.
     """
 
     def __init__(self, folder: Path, table: MetricsCsv) -> None:
         self.folder = folder
+        self.machine = Machine()
         self._table = table
         self._result: tuple[int, EvaluationResult] | None = None
         self._exported: Exported | None = None
@@ -140,6 +146,8 @@ class Session:
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None
     ) -> None:
         """Writes what describes the run as a whole."""
+        with reporting(state):
+            machine = self.machine.figures(state.clock.train)
         summary = Summary(
             status=status,
             scene=setup.scene.name,
@@ -149,7 +157,7 @@ class Session:
             rows=read_metrics(self.folder),
             seconds=state.clock,
             config=setup.config.model_dump(mode="json"),
-            environment=environment(str(setup.device)),
+            environment={**environment(str(setup.device)), **machine},
             notes=setup.notes,
             error=error,
         )
@@ -175,6 +183,8 @@ def totals(setup: Setup, state: TrainState) -> Totals:
         primitives=state.primitives(setup),
         peak_memory_mib=peak_mebibytes(setup.device),
         loss=sum(losses) / len(losses) if losses else None,
+        cpu_seconds=None if isnan(state.clock.cpu) else state.clock.cpu,
+        peak_primitives=max(state.counters.peak_primitives, state.primitives(setup)),
     )
 
 

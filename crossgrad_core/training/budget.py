@@ -7,6 +7,7 @@ from math import ceil
 from typing import Protocol
 
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.training.clock import ClockKind
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.schedules import growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
@@ -33,7 +34,7 @@ SMOOTHING = 0.25
 
 
 def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
-    """How many steps fit into `seconds` of training, and on what evidence.
+    """How many steps fit into `seconds` of training by the run's clock, and on what evidence.
 
     Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
     """
@@ -41,18 +42,18 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
     state = first_state(probed)
     timed_step(probed, state)
-    state.clock.train = 0.0
-    steps = 0
-    while steps < PROBE_STEPS or (state.clock.train < PROBE_SHARE * seconds):
+    kind, start, steps, taken = setup.config.clock, state.clock.copy(), 0, 0.0
+    while steps < PROBE_STEPS or taken < PROBE_SHARE * seconds:
         timed_step(probed, state)
         steps += 1
-    each = state.clock.train / steps
+        taken = state.clock.trained(kind) - start.trained(kind)
     # The probe's first step is the one before those that count.
     views = _views(probed.schedule, 1, steps + 1)
-    total = _fitting(lambda steps: _cost(setup, steps), seconds * views / state.clock.train)
+    total = _fitting(lambda steps: _cost(setup, steps), seconds * views / taken)
+    unit = " of CPU time" if kind == "cpu" else ""
     note = (
-        f"{total} steps planned for {seconds:g} s: {steps} probed steps took {each * 1000:.1f} ms "
-        "each; the length follows the clock as the run goes"
+        f"{total} steps planned for {seconds:g} s{unit}: {steps} probed steps took "
+        f"{taken / steps * 1000:.1f} ms each; the length follows the clock as the run goes"
     )
     return total, note
 
@@ -93,10 +94,12 @@ class Timed:
 
     Args:
         seconds: The budget.
+        kind: The clock that it counts on.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, kind: ClockKind = "wall") -> None:
         self._seconds = seconds
+        self._kind = kind
         self._step = 0
         self._clock = 0.0
         self._each: float | None = None
@@ -105,17 +108,18 @@ class Timed:
         """After some steps and a share of the budget."""
         if state.step < self._step:  # The loop went back to the last good state.
             self._look(state)
-        seconds = state.clock.train - self._clock
+        seconds = state.clock.trained(self._kind) - self._clock
         return state.step - self._step >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that now fits; its configuration says so."""
         # Of a view, as a step may have another number of them later.
-        newest = (state.clock.train - self._clock) / _views(setup.schedule, self._step, state.step)
+        seconds = state.clock.trained(self._kind) - self._clock
+        newest = seconds / _views(setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
         self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
-        affordable = (self._seconds - state.clock.train) / each
+        affordable = (self._seconds - state.clock.trained(self._kind)) / each
         total = state.step + _fitting(lambda left: _cost_ahead(setup, state.step, left), affordable)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
@@ -124,7 +128,7 @@ class Timed:
         return _told(setup, lengthened(replace(setup, config=config), state.step, total))
 
     def _look(self, state: TrainState) -> None:
-        self._step, self._clock = state.step, state.clock.train
+        self._step, self._clock = state.step, state.clock.trained(self._kind)
 
 
 def seconds_ahead(setup: Setup, step: int, each: float) -> float:

@@ -1,9 +1,11 @@
 """Seconds by what they were spent on, and what a training step spends them on."""
 
 from dataclasses import dataclass, field, replace
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Final, Literal
 
+#: What a budget counts: seconds of the clock on the wall, or of CPU time of the process.
+ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
     "decode",
@@ -42,6 +44,8 @@ class Clock:
         report: Writing results.
         phases: Training seconds by phase of the step; together they are `train`. On a GPU work is
             counted in the phase that waits for it.
+        cpu: Seconds of CPU time that the process took while it trained, all threads together; NaN
+            where an earlier version, which did not count them, trained a part.
     """
 
     train: float = 0.0
@@ -50,6 +54,11 @@ class Clock:
     evaluate: float = 0.0
     report: float = 0.0
     phases: dict[str, float] = field(default_factory=dict)
+    cpu: float = 0.0
+
+    def trained(self, kind: ClockKind) -> float:
+        """Training seconds of that kind."""
+        return self.cpu if kind == "cpu" else self.train
 
     def copy(self) -> "Clock":
         """A copy that stays as it is."""
@@ -58,6 +67,7 @@ class Clock:
     def count(self, laps: "Laps") -> None:
         """Adds a complete step."""
         self.train += laps.total
+        self.cpu += laps.cpu
         for phase in PHASES:
             self.phases[phase] = self.phases.get(phase, 0.0) + laps.spent.get(phase, 0.0)
 
@@ -70,11 +80,15 @@ class Laps:
         border: When the present phase began.
         total: Seconds from the start of the step to the last border, without what was left out.
         spent: Phase -> seconds.
+        cpu: CPU seconds of the process from the start of the step to the last border, likewise.
+        cpu_border: CPU time of the process at the last border.
     """
 
     border: float = field(default_factory=perf_counter)
     total: float = 0.0
     spent: dict[str, float] = field(default_factory=dict)
+    cpu: float = 0.0
+    cpu_border: float = field(default_factory=process_time)
 
     def lap(self, phase: Phase) -> None:
         """Ends a phase here: the seconds since the last border were spent on it."""
@@ -83,7 +97,16 @@ class Laps:
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
         self.total += seconds
         self.border = now
+        cpu = process_time()
+        self.cpu += cpu - self.cpu_border
+        self.cpu_border = cpu
 
-    def leave_out(self, seconds: float) -> None:
-        """Does not count seconds of the present phase: they belong to another clock."""
+    def leave_out(self, seconds: float, cpu: float) -> None:
+        """Does not count seconds of the present phase: they belong to another clock.
+
+        Args:
+            seconds: Seconds on the wall.
+            cpu: Seconds of CPU time in them.
+        """
         self.border += seconds
+        self.cpu_border += cpu

@@ -23,11 +23,13 @@ class Counters:
         views: Rendered training views.
         backward_passes: Backward passes.
         dropped: Blocks of views that were dropped because their gradient was not finite.
+        peak_primitives: The most primitives that there were after a step.
     """
 
     views: int = 0
     backward_passes: int = 0
     dropped: int = 0
+    peak_primitives: int = 0
 
 
 @dataclass

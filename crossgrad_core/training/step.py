@@ -71,13 +71,15 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     state.laps.lap("aggregation")
     counts = _finish(setup, state, rendered, gradients, scale)
     follow(setup, state)
+    primitives = state.primitives(setup)
+    state.counters.peak_primitives = max(state.counters.peak_primitives, primitives)
     return StepRecord(
         step=state.step,
         views=draw.views,
         names=tuple(record.view.name for record in rendered.records),
         labels=draw.labels,
         losses=tuple(record.loss for record in rendered.records),
-        primitives=state.primitives(setup),
+        primitives=primitives,
         counts={**aggregated.counts, **counts},
         train_seconds=state.clock.train,
         scales=scales,

@@ -5,7 +5,7 @@ import json
 from collections.abc import Collection
 from pathlib import Path
 
-CLOCKS = {"train_seconds", "peak_memory_mib"}
+CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 
 
 def bits(folder: Path, steps: Collection[str] | None = None) -> dict[str, object]:

@@ -19,9 +19,11 @@ FILE = "metrics.csv"
 #: Column -> value; None where it was not measured.
 Row: TypeAlias = dict[str, int | float | None]
 
-_FIRST = ("step", "views", "backward_passes", "train_seconds")
+_FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
 _MILLISECONDS = 3
+#: Columns that tables of earlier versions lack.
+_LATER = frozenset({"cpu_seconds"})
 _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 
 
@@ -36,6 +38,8 @@ def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
     """The row of one evaluation."""
     row: Row = dict(asdict(totals))
     row["train_seconds"] = round(totals.train_seconds, _MILLISECONDS)
+    cpu = totals.cpu_seconds
+    row["cpu_seconds"] = None if cpu is None else round(cpu, _MILLISECONDS)
     peak = totals.peak_memory_mib
     row["peak_memory_mib"] = None if peak is None else round(peak, 1)
     row |= result.overall.values
@@ -74,7 +78,7 @@ class MetricsCsv:
         if not path.is_file():
             return cls.create(folder, columns)
         table = cls(path, columns)
-        lines = _lines(path)
+        lines = _with_later_columns(_lines(path), columns)
         if not lines or tuple(lines[0]) != table.columns:
             raise UserError(
                 "cannot continue the table of another run",
@@ -150,6 +154,15 @@ def _is_step(number: float | None) -> bool:
 
 def _unreadable(path: Path, found: str) -> UserError:
     return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
+
+
+def _with_later_columns(lines: list[list[str]], columns: tuple[str, ...]) -> list[list[str]]:
+    """The lines of a table of an earlier version with empty cells in the columns that it lacks."""
+    if not lines or tuple(lines[0]) != tuple(name for name in columns if name not in _LATER):
+        return lines
+    whole = [line for line in lines[1:] if len(line) == len(lines[0])]
+    known = [dict(zip(lines[0], line, strict=True)) for line in whole]
+    return [list(columns), *([line.get(name, "") for name in columns] for line in known)]
 
 
 def _append(path: Path, content: bytes) -> None:

@@ -113,7 +113,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         **_metrics(summary.result),
         "best": _best(summary.rows),
         "ply": None if summary.ply is None else dict(summary.ply),
-        "seconds": asdict(summary.seconds),
+        "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
         "definitions": _definitions(summary.result),

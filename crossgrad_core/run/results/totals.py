@@ -15,6 +15,9 @@ class Totals:
         primitives: Number of primitives.
         peak_memory_mib: Peak memory, MiB; None where the system does not say.
         loss: Mean photometric loss of the last step, None before the first.
+        cpu_seconds: CPU seconds of the process in the training seconds, all threads together; None
+            where they were not counted.
+        peak_primitives: The most primitives that there were after a step; None where unknown.
     """
 
     step: int
@@ -24,3 +27,5 @@ class Totals:
     primitives: int
     peak_memory_mib: float | None
     loss: float | None
+    cpu_seconds: float | None = None
+    peak_primitives: int | None = None

@@ -13,7 +13,7 @@ from PIL import Image
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 #: Columns of metrics.csv that no two runs share.
-CLOCKS = frozenset({"train_seconds", "peak_memory_mib"})
+CLOCKS = frozenset({"train_seconds", "cpu_seconds", "peak_memory_mib"})
 CHECKPOINT_FILES = ("state.json", "tensors.safetensors")
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
@@ -217,6 +218,26 @@ def test_a_run_whose_length_follows_the_clock_keeps_its_edits(text, planned, act
     if step < actual // 2:
         assert schedule.edits_before + schedule.edits() >= FEWEST_EDITS
         assert len(done) + len(edits) >= FEWEST_EDITS
+
+
+@pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
+@pytest.mark.parametrize("seed", range(20))
+def test_any_lengths_in_turn_keep_what_was_and_what_is_ahead(text, seed):
+    rng, counting = np.random.default_rng(seed), in_views(text, photos=9)
+    schedule, step = Schedule.for_run(int(rng.integers(1, 1000)), counting=counting), 0
+    while step + 1 < schedule.total:
+        step = int(rng.integers(step + 1, schedule.total))
+        length = step + int(rng.integers(1, 1500))
+        later = schedule.lengthened(Schedule.for_run(length, counting=counting), step)
+        assert later.total == length and later.pace.views(step) == schedule.pace.views(step)
+        edits = schedule.edits_before + schedule.edits() - schedule.edits(step)
+        assert later.edits_before == edits or later.counted(step) >= later.densify_until
+        assert later.edits(step) == sum(map(later.densifies, range(step + 1, length + 1)))
+        if schedule.counted(step) >= schedule.densify_until:
+            assert later.edits(step) == 0 and not later.collects(step + 1)
+        schedule = later if length < 5000 else schedule
+        if rng.random() < 0.1:
+            return
 
 
 def test_times_that_the_user_set_stay_whatever_the_length():

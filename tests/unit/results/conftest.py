@@ -63,4 +63,6 @@ def _totals() -> Totals:
         primitives=111_785,
         peak_memory_mib=1523.04,
         loss=0.061234567890123456,
+        cpu_seconds=36.7504,
+        peak_primitives=120_000,
     )

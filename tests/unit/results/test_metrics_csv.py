@@ -16,7 +16,7 @@ from crossgrad_core.run.results.metrics_csv import (
 )
 
 HEADER = (
-    "step,views,backward_passes,train_seconds,psnr,ssim,ssim_skimage,lpips,"
+    "step,views,backward_passes,train_seconds,cpu_seconds,psnr,ssim,ssim_skimage,lpips,"
     "psnr_far,ssim_far,psnr_near,ssim_near,primitives,peak_memory_mib,loss"
 )
 
@@ -31,7 +31,7 @@ def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
     assert lines == [
         HEADER,
-        "700,1400,1400,38.21,24.0,0.7000000000000001,0.7833333333333333,,"
+        "700,1400,1400,38.21,36.75,24.0,0.7000000000000001,0.7833333333333333,,"
         "30.0,0.9,21.0,0.6,111785,1523.0,0.06123456789012346",
     ]
 
@@ -50,7 +50,7 @@ def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
         (tmp_path / "metrics.csv")
         .read_text()
         .splitlines()[1]
-        .startswith("700,1400,1400,38.21,,,,,")
+        .startswith("700,1400,1400,38.21,36.75,,,,,")
     )
 
 

@@ -124,7 +124,7 @@ def test_phases_of_a_step_add_up_and_leave_out_what_is_left_out():
     laps.lap("decode")
     laps.lap("render")
     laps.lap("decode")
-    laps.leave_out(5.0)
+    laps.leave_out(5.0, 0.0)
     laps.lap("loss")
     clock.count(laps)
     assert list(clock.phases) == list(PHASES)
