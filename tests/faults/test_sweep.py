@@ -30,6 +30,9 @@ BASE = {
 #: Kills in the short version and in the long one, and seeds of four configurations in it.
 SHORT, LONG, SEEDS = 2, 20, 6
 
+#: A cluster of two nodes, one of which is killed midway.
+TWO_NODES = Path(__file__).parents[1] / "support" / "two_nodes.py"
+
 
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
@@ -134,6 +137,23 @@ def undisturbed(out, name, folder):
     """The same run by itself, in this process."""
     crossgrad_core.run(config=Layout(out).settings(name), out=folder / name, threads=1, quiet=True)
     return folder / name
+
+
+@pytest.mark.skipif("FAULTS" not in os.environ, reason="minutes: `make faults`")
+@pytest.mark.timeout(3600)
+def test_on_a_ray_cluster_that_loses_a_node_the_bits_are_the_same(grid, tmp_path):
+    pytest.importorskip("ray")
+    content = yaml.safe_load(grid.read_text())
+    few = grid.with_name("few.yaml")
+    few.write_text(yaml.safe_dump({**content, "seeds": [0]}))
+    out = tmp_path / "ray"
+    command = [sys.executable, str(TWO_NODES), str(few), str(out), "kill"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["killed"]
+    assert told["states"] == ["finished"] * 4
+    for run in (out / "runs").iterdir():
+        laws.same_bits(undisturbed(out, run.name, tmp_path / "undisturbed"), run)
 
 
 @pytest.fixture

@@ -143,7 +143,11 @@ class Sweep:
         """
         check_folder(self.layout.out)
         self.layout.make()
-        with locked(self.layout.out, "sweeping"):
+        with locked(self.layout.out, "sweeping") as held:
+            if not held:
+                _note(
+                    "the file system has no locks: nothing keeps a second sweep out of the folder"
+                )
             write_plan(self.layout, self.plan.cells)
             found = self.standings(alive=False)
             _note(self._forecast([each for each in found if each.state != "finished"]))

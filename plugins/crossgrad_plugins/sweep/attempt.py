@@ -23,6 +23,8 @@ PAUSE = 0.1
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
 #: What says how many threads a library takes.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+#: Exit status of a run that was refused.
+_REFUSED = 2
 #: Lines of a process that are kept as the reason of its failure, at most.
 _MOST_LINES = 12
 
@@ -155,12 +157,13 @@ class Attempt:
             return Outcome("stopped")
         if name := _signal(code):
             return Outcome("died", f"ended by {name}")
-        return Outcome("failed", self._reason(folder) or f"ended with exit status {code}")
+        return Outcome("failed", self._reason(folder, code) or f"ended with exit status {code}")
 
-    def _reason(self, folder: Path) -> str:
+    def _reason(self, folder: Path, code: int) -> str:
         """Why the run failed: what it says itself, or the end of what its process printed."""
         error = (summary_of(folder) or {}).get("error")
-        if isinstance(error, str):
+        # One that was refused has not touched the summary, which may be of an earlier attempt.
+        if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:
             output.seek(self._from)

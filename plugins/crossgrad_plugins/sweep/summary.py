@@ -3,11 +3,13 @@
 from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, stdev
 
-from crossgrad_core.commands import write_table
+from crossgrad_core.commands import read_rows, write_table
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.standing import Standing, figure
+
+_COLUMNS = ("run", "scene", "configuration", "seed")
 
 
 def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
@@ -58,9 +60,13 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Writes runs.csv: which run is what."""
-    rows: list[dict[str, str | int | float]] = [
-        {"run": job.id, "scene": job.scene, "configuration": job.label, "seed": job.seed}
-        for job in cells
-    ]
-    write_table(layout.plan, rows)
+    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay in it."""
+    rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
+    if layout.plan.is_file():
+        earlier = [tuple(row) for row in read_rows(layout.plan, "the table of runs", "remove it")]
+        rows += [
+            (run, scene, label, seed)
+            for run, scene, label, seed in (row for row in earlier[1:] if len(row) == len(_COLUMNS))
+            if (run, scene, label, seed) not in rows and layout.run(run).is_dir()
+        ]
+    write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])

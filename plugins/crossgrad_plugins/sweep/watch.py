@@ -39,18 +39,19 @@ class Watch:
     before: Sequence[Standing]
     ended: dict[str, Record] = field(default_factory=dict)
     under_way: tuple[UnderWay, ...] = ()
-    _known: int = field(init=False)
+    _known: set[Record] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._known = len(read_records(self.layout.records))
+        self._known = set(read_records(self.layout.records))
         self._jobs = {each.job.id: each.job for each in self.before}
         self._begun: dict[str, Record] = {}
 
     def look(self) -> list[Record]:
         """Reads what is new; answers how runs ended since the last look."""
-        records = read_records(self.layout.records)
-        new = [each for each in records[self._known :] if each.run in self._jobs]
-        self._known = len(records)
+        # The clocks of several machines differ: what is new need not be the latest.
+        found = [each for each in read_records(self.layout.records) if each not in self._known]
+        self._known.update(found)
+        new = [each for each in found if each.run in self._jobs]
         for record in new:
             if record.event == "begun":
                 self._begun[record.run] = record

@@ -66,6 +66,14 @@ def test_a_failure_stops_nothing_and_has_its_reason(work):
     assert found["refuse-1"].error == "error: there is no such thing\n  where:    here"
 
 
+def test_a_refused_run_has_the_reason_of_its_last_attempt(work):
+    given = work("refuse")
+    folder = given.out / "runs" / "refuse-0"
+    folder.mkdir()
+    (folder / "summary.json").write_text('{"status": "failed", "error": "long ago"}')
+    assert carried_out(given)["refuse-0"].error.startswith("error: there is no such thing")
+
+
 def test_a_process_that_dies_is_tried_again(work):
     given = work("die_once", workers=1)
     assert carried_out(given)["die_once-0"].state == "finished"

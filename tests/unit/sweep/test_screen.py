@@ -1,5 +1,6 @@
 """What a sweep shows: a live table on a terminal, lines elsewhere, and a table at the end."""
 
+import json
 import sys
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.records import append, read_records
 from crossgrad_plugins.sweep.screen import Screen
 from crossgrad_plugins.sweep.standing import Standing
-from crossgrad_plugins.sweep.summary import table
+from crossgrad_plugins.sweep.summary import table, write_plan
 from crossgrad_plugins.sweep.watch import Watch
 
 JOBS = [Job(f"id{n}", "arm", "city", n, {}) for n in range(4)]
@@ -106,3 +107,27 @@ def test_the_table_has_means_over_seeds_and_marks_the_best():
         "b                      13.000 (1) *",
     ]
     assert list(table(jobs, found, Metric(goal="minimize")))[1].endswith("*")
+
+
+def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
+    layout = Layout(tmp_path)
+    layout.make()
+    write_plan(layout, JOBS[:2])
+    layout.run("id0").mkdir()
+    write_plan(layout, [Job("id2", "arm, k=1", "city", 2, {})])
+    assert layout.plan.read_text().splitlines() == [
+        "run,scene,configuration,seed",
+        'id2,city,"arm, k=1",2',
+        "id0,city,arm,0",
+    ]
+
+
+def test_a_record_of_a_clock_that_is_behind_is_seen(sweep, monkeypatch):
+    ended(sweep, "id1", "finished")
+    assert len(sweep.watch.look()) == 1
+    (line,) = [each for each in read_records(sweep.layout.records) if each.event == "ended"]
+    path = sweep.layout.records / "far.jsonl"
+    late = {"event": "ended", "run": "id2", "worker": "far", "status": "finished", "host": "far"}
+    path.write_text(json.dumps({**late, "time": line.time.replace("20", "19", 1)}) + "\n")
+    assert [each.run for each in sweep.watch.look()] == ["id2"]
+    assert sweep.watch.finished == 3
