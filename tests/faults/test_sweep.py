@@ -107,16 +107,20 @@ def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
     out = tmp_path / "sweep"
     draw = random.Random(0)
     long = "FAULTS" in os.environ
-    seen = {}
+    seen, pace = {}, 0.0
     for number in range(LONG if long else SHORT):
         known = len(begins(out)) if out.exists() else 0
         process = start(grid, out)
         wait_for(lambda known=known, process=process: len(begins(out)) > known
                  or process.poll() is not None)  # fmt: skip
-        time.sleep(draw.uniform(0.0, 12.0 if long else 5.0))
+        began = time.monotonic()
+        if number == 0:  # From the first checkpoint it is known how fast this machine is.
+            wait_for(lambda: any(out.glob("runs/*/checkpoints/step-*")))
+            pace = time.monotonic() - began
+        time.sleep(draw.uniform(0.0, 2.0 * pace) if number else 0.0)
         kill(process, ("all", "sweep", "run")[number % 3])
         if number % 3 == 2:
-            time.sleep(draw.uniform(0.0, 5.0))
+            time.sleep(draw.uniform(0.0, pace))
             kill(process, "all")
         process.wait()
         seen |= {name: when for name, when in finished(out).items() if name not in seen}
