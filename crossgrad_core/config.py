@@ -92,6 +92,11 @@ class RunConfig(BaseModel):
         description="What cameras do to light between render and photo. "
         f"Default: {defaults.EXPOSURE}.",
     )
+    exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
+        None,
+        description="exposure.json of another run on these photos: the exposure starts from its "
+        "values.",
+    )
     resolution: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.RESOLUTION),
         description=f"At which scale a step renders its views. Default: {defaults.RESOLUTION}.",

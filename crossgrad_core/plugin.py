@@ -35,7 +35,7 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.exposure import Exposure, PerPhoto
+from crossgrad_core.contract.exposure import Exposure, Fitted, PerPhoto
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
@@ -77,6 +77,7 @@ from crossgrad_core.run.results.lines import (
     progress_line,
 )
 from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.scene.exif import exposure_value
 from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.terminal import shows_bar
 from crossgrad_core.system.text_files import read_rows
@@ -105,6 +106,7 @@ __all__ = [
     "Exposure",
     "Field",
     "Figure",
+    "Fitted",
     "Gaussians",
     "GradientProbe",
     "GramianOperator",
@@ -169,6 +171,7 @@ __all__ = [
     "diagonals",
     "eight_bit",
     "evaluation_line",
+    "exposure_value",
     "figures",
     "footprint_of",
     "hookimpl",

@@ -1,7 +1,7 @@
 """The exposure slot: what a camera does to light between the render and its photo."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,12 +17,32 @@ class PerPhoto:
     """A parameter that every training photo has a value of.
 
     Attributes:
-        start: [P, ...] float32, the values at the start, in the order of `scene.train_views`.
+        start: [P, ...] float32, the values at the start, in the order of `scene.train_views`; or
+            what works them out, where that takes long: a run that goes on does not ask.
         lr: Its learning rate.
     """
 
-    start: Tensor
+    start: Tensor | Callable[[], Tensor]
     lr: LearningRate
+
+    def first(self) -> Tensor:
+        """The values at the start."""
+        return self.start if isinstance(self.start, Tensor) else self.start()
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What an exposure makes of itself for a scene.
+
+    Attributes:
+        exposure: The exposure that the run takes.
+        name: The name under which that one is installed; None where it is the one that was asked.
+        notes: What was decided, and on what evidence.
+    """
+
+    exposure: "Exposure"
+    name: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 class Exposure(Component):
@@ -34,6 +54,17 @@ class Exposure(Component):
     """
 
     slot: ClassVar[str] = "exposures"
+
+    def fitted_to(self, scene: Scene) -> Fitted:
+        """The exposure that the scene calls for; by default this one.
+
+        What a run takes is written to its config.yaml, so a run that goes on asks that one.
+        """
+        return Fitted(self)
+
+    def remarks(self, scene: Scene) -> tuple[str, ...]:
+        """What the user should know about this exposure and the scene; asked of new runs only."""
+        return ()
 
     def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
         """The parameters by name; by default there are none."""

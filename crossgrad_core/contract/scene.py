@@ -77,6 +77,18 @@ class Camera(Pinhole):
         pose = self.world_to_camera.numpy()
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
+    def project(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """[N, 2] pixels (x right, y down) and [N] depths of [N, 3] points of the local frame.
+
+        Pixels of points that do not lie in front of the camera mean nothing, but are numbers.
+        """
+        x, y, depth = self.local(points).T
+        inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
+        across, down = self.fx * x * inverse, self.fy * y * inverse
+        return np.column_stack([across + self.cx, down + self.cy]), depth
+
 
 class Photo(Protocol):
     """A photo that is decoded when it is asked for."""

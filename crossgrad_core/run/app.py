@@ -45,6 +45,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.photo_parameters import check_known
 from crossgrad_core.training.schedules import growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
@@ -117,7 +118,7 @@ def run(
             todo="leave it out, or name the run with --resume",
         )
     if dry_run:
-        _print_dry_run(_checked(settings, verbosity)[0])
+        _print_dry_run(_with_remarks(_checked(settings, verbosity)[0])[0])
         return 0
     return new(settings, Way(verbosity, _print_results)).exit_code
 
@@ -150,14 +151,22 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
         setup = _within(setup, config.seconds)
         length = Timed(config.seconds, config.clock)
     setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
+    setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
-    state.clock.load, state.clock.compile = load_seconds, compile_seconds
+    state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config)
         _write_scene(folder, setup)
         with way_on(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
+
+
+def _with_remarks(setup: Setup) -> tuple[Setup, float]:
+    """The setup with what its exposure says about the scene, and the seconds that it took."""
+    start = perf_counter()
+    notes = (*setup.notes, *setup.exposure.remarks(setup.scene))
+    return replace(setup, notes=notes), perf_counter() - start
 
 
 def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]:
@@ -169,6 +178,7 @@ def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]
     check_clock(config)
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
+    check_known(setup)
     return setup, load_seconds + _held_out_decoded(setup)
 
 

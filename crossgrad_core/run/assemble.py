@@ -230,6 +230,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.view_plan or ViewPlan((_usual_views(sampler, operator, notes),))
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
+    fitted = _built(Exposure, config.exposure).fitted_to(scene)
+    notes += fitted.notes
     names = {
         "backbone": config.backbone.name,
         "sampler": config.sampler.name,
@@ -237,7 +239,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "densifier": densifier_choice.name,
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
-        "exposure": config.exposure.name,
+        "exposure": fitted.name or config.exposure.name,
         "resolution": config.resolution.name,
         "exporter": config.exporter.name,
         "reader": reader,
@@ -253,7 +255,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         densifier=densifier,
         rasterizer=rasterizer,
         loss=_built(Loss, config.loss),
-        exposure=_built(Exposure, config.exposure),
+        exposure=fitted.exposure,
         resolution=_built(Resolution, config.resolution),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene),

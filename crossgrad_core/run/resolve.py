@@ -29,6 +29,7 @@ def resolved(setup: Setup) -> RunConfig:
     scene = None if config.scene is None else Path(config.scene).resolve()
     path = config.reading.init_file
     init = config.reading.init if path is None else str(path.resolve())
+    known = config.exposure_from
     return config.model_copy(
         update={
             **chosen,
@@ -38,6 +39,7 @@ def resolved(setup: Setup) -> RunConfig:
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,
             "reading": config.reading.model_copy(update={"init": init}),
+            "exposure_from": None if known is None else known.resolve(),
             "out": None,
             "views_per_step": selection.views.setting,
             "steps": config.steps or setup.schedule.total,

@@ -27,6 +27,8 @@ from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.training.memory import peak_mebibytes
+from crossgrad_core.training.photo_file import FILE as PHOTO_VALUES
+from crossgrad_core.training.photo_parameters import write_photos
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -139,6 +141,7 @@ class Session:
         path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
         with reporting(state):
             self._exported = export_scene(setup, state, path)
+            write_photos(setup, state, self.folder / PHOTO_VALUES)
         for line in described(self._exported, path):
             setup.hook.crossgrad_message(text=line)
 

@@ -55,6 +55,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_views(config, setup),
         *_of_the_schedule(config),
         *_of_groups(config, setup),
+        *_of_exposure(config, setup),
         *_of_the_split(config),
         *_of_the_end(config, setup),
     ]
@@ -132,6 +133,16 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             f"sampler {selection.names['sampler']} draws from all views alike, and operator "
             f"{selection.names['operator']} reads no labels; --sampler {GROUP_SAMPLER} "
             "draws from groups",
+        )
+
+
+def _of_exposure(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.exposure_from is not None and not setup.per_photo:
+        name = setup.selection.names["exposure"]
+        yield (
+            "exposure_from",
+            f"exposure {name} has no values of photos; --exposure NAME takes the one that wrote "
+            "the file",
         )
 
 

@@ -17,7 +17,7 @@ _ROUNDING = 1e-5
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
     """Each parameter starts with one finite float32 row for each training photo, and learns."""
     for name, each in make().per_photo(sample_scene()).items():
-        _require_rows(f"the start of {name}", each.start)
+        _require_rows(f"the start of {name}", each.first())
         require(each.lr.initial > 0, f"the learning rate of {name} is {each.lr.initial}")
 
 
@@ -85,7 +85,7 @@ def same_input_same_bits(make: Make[Exposure]) -> None:
 
 
 def _starts(exposure: Exposure) -> dict[str, Tensor]:
-    return {name: each.start for name, each in exposure.per_photo(sample_scene()).items()}
+    return {name: each.first() for name, each in exposure.per_photo(sample_scene()).items()}
 
 
 def _first(values: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -5,6 +5,7 @@ The state is a value like that of a plugin, so that snapshots, rewinding and che
 
 from collections.abc import Iterable, Mapping
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,8 +16,10 @@ from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.photo_file import read_values, write_values
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
 
 #: The name among the states of plugins.
 STATE = "photos"
@@ -35,16 +38,54 @@ def started(setup: Setup) -> PluginState | None:
     parameters = setup.per_photo
     if not parameters:
         return None
-    for name, each in parameters.items():
-        _check(setup, f"starts parameter {name} with", each.start)
+    starts = {name: each.first() for name, each in parameters.items()}
+    for name, start in starts.items():
+        _check(setup, f"starts parameter {name} with", start)
     tensors = {}
-    for name, each in parameters.items():
-        start = each.start.detach().to(setup.device).clone()
+    for name, each in _with_known(setup, starts).items():
+        start = each.detach().to(setup.device).clone()
         tensors[f"{_VALUE}.{name}"] = start
         tensors[f"{_FIRST}.{name}"] = torch.zeros_like(start)
         tensors[f"{_SECOND}.{name}"] = torch.zeros_like(start)
     tensors[_COUNT] = torch.zeros(len(setup.train_views), dtype=torch.int64)
     return PluginState({"photos": [view.name for view in setup.train_views]}, tensors)
+
+
+def check_known(setup: Setup) -> None:
+    """Refuses a file of values that are of no training photo, or do not fit.
+
+    Raises:
+        UserError: It is such a file.
+    """
+    if setup.config.exposure_from is not None and setup.per_photo:
+        _with_known(setup, {name: each.first() for name, each in setup.per_photo.items()})
+
+
+def _with_known(setup: Setup, starts: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """The starts with the values of photos that the user has a file of.
+
+    Photos that are not in it keep what they differ by from those that are, on average.
+    """
+    path = setup.config.exposure_from
+    if path is None:
+        return starts
+    known = read_values(path, starts)
+    names = [view.name for view in setup.train_views]
+    rows = [row for row, name in enumerate(names) if name in known]
+    if not rows:
+        raise UserError(
+            "the file has values of no training photo",
+            where=path,
+            expected=f"photos such as {names[0]}",
+            found=listed(list(known)[:3]),
+            todo="name the exposure.json of a run on this scene, or leave --exposure-from out",
+        )
+    merged = {}
+    for name, start in starts.items():
+        values = torch.stack([known[names[row]][name] for row in rows])
+        merged[name] = start + (values - start[rows]).mean(dim=0)
+        merged[name][rows] = values
+    return setup.exposure.projected(merged)
 
 
 def check_photos_are(setup: Setup, state: TrainState) -> None:
@@ -61,6 +102,15 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
             where=f"exposure {setup.selection.names['exposure']}",
             todo="go on with the photos and the split of that run",
         )
+
+
+def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
+    """Writes the values of all training photos, where there are any; says whether it did."""
+    values = _values(setup, state)
+    if values:
+        photos = [view.name for view in setup.train_views]
+        write_values(path, setup.selection.names["exposure"], photos, values)
+    return bool(values)
 
 
 def leaves_of(setup: Setup, state: TrainState, index: int) -> Leaves:

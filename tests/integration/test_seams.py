@@ -28,7 +28,7 @@ PLUGINS = {
     "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
     "densifiers": {"unseen": "support.seam_plugins:PrunesTheUnseen"},
     "samplers": {"one-then-two": "support.seam_plugins:OneThenTwo"},
-    "exposures": {"gain": "support.seam_plugins:GainPerPhoto"},
+    "exposures": {"stops": "support.seam_plugins:GainPerPhoto"},
     "losses": {"centre": "support.seam_plugins:CentreWeighted"},
     "metrics": {"brightness": "support.seam_plugins:BrightnessError"},
 }
@@ -97,7 +97,7 @@ def test_each_plugin_keeps_the_contract_of_its_slot(slot, name, check):
 
 ALTOGETHER = {
     "resolution": {"name": "near-at-half"},
-    "exposure": {"name": "gain"},
+    "exposure": {"name": "stops"},
     "loss": {"name": "centre"},
     "metrics": [{"name": "psnr"}, {"name": "brightness"}],
 }
@@ -160,7 +160,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
     build = assemble.make_manager
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(assemble, "make_manager", lambda plugins: build({**plugins, "asks": Asks()}))
-        assert run(scene, tmp_path / "run", steps=3, exposure={"name": "gain"}) == 0
+        assert run(scene, tmp_path / "run", steps=3, exposure={"name": "stops"}) == 0
     assert len(asked) == 3
     assert all(loss == expected and differentiable for loss, expected, differentiable in asked)
     assert rows(tmp_path / "run")[-1]["views"] == "6"
@@ -238,7 +238,7 @@ def stops_of(out):
 def test_gains_per_photo_find_the_photos_that_are_darker(scene, tmp_path, views, backbone):
     dark = dimmed(scene, tmp_path / "dark", 1.0)
     settings = {"steps": 90 // views, "views": views, "reset_every": None}
-    exposure = {"name": "gain", "lr": 0.1}
+    exposure = {"name": "stops", "lr": 0.1}
     chosen = {"backbone": {"name": backbone}, "operator": {"name": "mean"}, "exposure": exposure}
     assert run(dark, tmp_path / "run", **settings, **chosen) == 0
     stops = stops_of(tmp_path / "run")
@@ -250,7 +250,7 @@ def test_gains_per_photo_find_the_photos_that_are_darker(scene, tmp_path, views,
 
 
 def test_photos_that_a_step_did_not_draw_move_by_the_projection_only(scene, tmp_path):
-    assert run(scene, tmp_path / "run", steps=1, exposure={"name": "gain"}, views=1) == 0
+    assert run(scene, tmp_path / "run", steps=1, exposure={"name": "stops"}, views=1) == 0
     stops = stops_of(tmp_path / "run")
     drawn = load(latest(tmp_path / "run")).scalars["last"]["names"]
     rest = {value for name, value in stops.items() if name not in drawn}

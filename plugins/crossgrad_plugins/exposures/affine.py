@@ -1,0 +1,47 @@
+"""An affine map of colours per photo."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_plugins.exposures.light import mapped
+from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
+from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET
+
+
+class Affine(ExposurePerPhoto):
+    """Each photo has A x + b for the render's sRGB value x; the mean of all maps is the identity.
+
+    Twelve numbers a photo can also take in what is no exposure: they suit many photos with much
+    overlap.
+
+    Source: the exposure compensation of 3D Gaussian Splatting (2024).
+    """
+
+    parameter: ClassVar[str] = "matrix"
+
+    @override
+    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return mapped(image, values[self.parameter])
+
+    @override
+    def of_stops(self, stops: Tensor) -> Tensor:
+        # What a gain in linear light is for all but dark values: s (x + o) - o.
+        scale = torch.exp2(stops / EXPONENT)[..., None, None]
+        ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
+        diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
+        return torch.cat([scale * diagonal, (scale - 1.0) * OFFSET * ones], dim=-1)
+
+    @override
+    def beside(self, values: Tensor, stops: Tensor) -> Tensor:
+        inner = self.of_stops(stops)
+        linear = values[..., :3] @ inner[..., :3]
+        constant = values[..., :3] @ inner[..., 3:] + values[..., 3:]
+        return torch.cat([linear, constant], dim=-1)
+
+    @override
+    def neutral(self) -> Tensor:
+        return torch.eye(3, 4)

@@ -1,0 +1,33 @@
+"""One gain per photo and channel, in linear light."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_plugins.exposures.light import with_gain
+from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
+
+
+class ChannelGain(ExposurePerPhoto):
+    """As `gain`, with stops of its own for red, green and blue: exposure and white balance."""
+
+    parameter: ClassVar[str] = "stops"
+
+    @override
+    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return with_gain(image, values[self.parameter])
+
+    @override
+    def of_stops(self, stops: Tensor) -> Tensor:
+        return stops[..., None].expand(*stops.shape, 3)
+
+    @override
+    def beside(self, values: Tensor, stops: Tensor) -> Tensor:
+        return values + stops[:, None]
+
+    @override
+    def neutral(self) -> Tensor:
+        return torch.zeros(3)

@@ -1,0 +1,37 @@
+"""One gain per photo, in linear light."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_plugins.exposures.light import with_gain
+from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
+
+
+class Gain(ExposurePerPhoto):
+    """Each photo has 2^stops times the light of the scene; the stops of all have a mean of 0.
+
+    The render is decoded from sRGB, multiplied, and encoded again: what shutter, aperture and
+    sensitivity of a camera on automatic exposure do.
+    """
+
+    parameter: ClassVar[str] = "stops"
+
+    @override
+    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return with_gain(image, values[self.parameter])
+
+    @override
+    def of_stops(self, stops: Tensor) -> Tensor:
+        return stops
+
+    @override
+    def beside(self, values: Tensor, stops: Tensor) -> Tensor:
+        return values + stops
+
+    @override
+    def neutral(self) -> Tensor:
+        return torch.zeros(())

@@ -1,0 +1,171 @@
+"""Gains in linear light on sRGB values, and their gradients (CPU, float32, one thread).
+
+sRGB's curve has a straight part for dark values, and a power above it. Where a value is in the
+power part before and after, decoding, multiplying by G and encoding again is a straight line: with
+o = 0.055 it makes G^(1/2.4) (x + o) - o of x. In the straight part before and after it makes G x.
+Only values that change sides need a power; eight values at a time are looked through for them.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import device, kernel
+from crossgrad_core.numerics.simd import (
+    LANES,
+    Lanes,
+    bits,
+    load,
+    lowest_bit,
+    splat,
+    store,
+    where,
+)
+from crossgrad_plugins.exposures.srgb import (
+    EXPONENT,
+    OFFSET,
+    SLOPE,
+    STRETCH,
+    THRESHOLD,
+    THRESHOLD_LINEAR,
+)
+
+_Floats: TypeAlias = NDArray[np.float32]  # 1-D
+_Sums: TypeAlias = NDArray[np.float64]  # [3]
+
+#: Values after which channels and lanes begin together again.
+PERIOD = 3 * LANES
+# Sums in float32 stay this short before they go on in float64.
+_ROUNDS = 32
+_ALL = np.uint64(2**LANES - 1)
+
+_ZERO = np.float32(0)
+_OFFSET, _STRETCH = np.float32(OFFSET), np.float32(STRETCH)
+_SLOPE, _EXPONENT = np.float32(SLOPE), np.float32(EXPONENT)
+_ROOT = np.float32(1.0 / EXPONENT)
+_THRESHOLD, _THRESHOLD_LINEAR = np.float32(THRESHOLD), np.float32(THRESHOLD_LINEAR)
+# df/dstops over f + o in the power part of the curve, and over f in its straight part.
+_OF_POWER, _OF_LINE = np.log(2.0) / EXPONENT, np.log(2.0)
+
+
+@device
+def _exposed(value: np.float32, gain: np.float32) -> np.float32:
+    """One value as taken."""
+    if value <= _THRESHOLD:
+        light = gain * value / _SLOPE
+    else:
+        light = gain * ((value + _OFFSET) / _STRETCH) ** _EXPONENT
+    if light <= _THRESHOLD_LINEAR:
+        return _SLOPE * light
+    return _STRETCH * light**_ROOT - _OFFSET
+
+
+@device
+def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32:
+    """The derivative of one value as taken by the value itself; needs no power."""
+    if taken <= _THRESHOLD:
+        if value <= _THRESHOLD:
+            return gain
+        return _EXPONENT * taken / (value + _OFFSET)
+    if value <= _THRESHOLD:
+        return (taken + _OFFSET) / (_EXPONENT * value)
+    return (taken + _OFFSET) / (value + _OFFSET)
+
+
+@device
+def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np.uint64]:
+    """Which of eight values are in the straight part before and after, and which in the power."""
+    dark = splat(_THRESHOLD)
+    both = bits(values <= dark) & bits(straight <= dark)
+    return both, _ALL & ~bits(values <= dark) & ~bits(bright <= dark)
+
+
+@kernel
+def expose(image: _Floats, gains: _Floats, slopes: _Floats, taken: _Floats) -> None:
+    """Writes the values as taken.
+
+    Args:
+        image: Values in the order R, G, B, R ...
+        gains: [24] the channels' gains, again and again.
+        slopes: [24] the gains to the power of 1 / 2.4.
+        taken: Receives as many values.
+    """
+    offset, dark = splat(_OFFSET), splat(_THRESHOLD)
+    whole = len(image) // PERIOD * PERIOD
+    for start in range(0, whole, PERIOD):
+        for lane in range(0, PERIOD, LANES):
+            values = load(image, start + lane)
+            straight = load(gains, lane) * values
+            bright = load(slopes, lane) * (values + offset) - offset
+            store(taken, start + lane, where(values <= dark, straight, bright))
+            on_line, on_power = _sides(values, straight, bright)
+            crossing = _ALL & ~(on_line | on_power)
+            while crossing != 0:
+                j = lane + lowest_bit(crossing)
+                taken[start + j] = _exposed(image[start + j], gains[j])
+                crossing &= crossing - np.uint64(1)
+    for j in range(whole, len(image)):
+        taken[j] = _exposed(image[j], gains[j - whole])
+
+
+@kernel
+def expose_back(
+    image: _Floats, taken: _Floats, upstream: _Floats, gains: _Floats, gradient: _Floats,
+    sums: _Sums,
+) -> None:  # fmt: skip
+    """Writes the gradient by the values, and adds up the gradient by the stops of each channel.
+
+    Args:
+        image: As for `expose`; likewise `gains`.
+        taken: What `expose` wrote.
+        upstream: The gradient by what it wrote.
+        gains: [24].
+        gradient: Receives the gradient by the values.
+        sums: [3] receives the gradient by the stops; must be zero.
+    """
+    partial = np.zeros((2, PERIOD), dtype=np.float32)
+    flat = partial.ravel()
+    zero, dark, offset, exponent = (
+        splat(_ZERO), splat(_THRESHOLD), splat(_OFFSET), splat(_EXPONENT),
+    )  # fmt: skip
+    whole = len(image) // PERIOD * PERIOD
+    for start in range(0, whole, PERIOD):
+        for lane in range(0, PERIOD, LANES):
+            values, after = load(image, start + lane), load(taken, start + lane)
+            given = load(upstream, start + lane)
+            before_line, after_line = values <= dark, after <= dark
+            # A value on the line is divided by itself times the exponent where it leaves it.
+            below = where(before_line, exponent * values, values + offset)
+            above = where(after_line, exponent * after, after + offset)
+            slope = where(
+                before_line, where(after_line, load(gains, lane), above / below), above / below
+            )
+            store(gradient, start + lane, given * slope)
+            of_line, of_power = given * after, given * (after + offset)
+            store(flat, lane, load(flat, lane) + where(after_line, of_line, zero))
+            rest = PERIOD + lane
+            store(flat, rest, load(flat, rest) + where(after_line, zero, of_power))
+        if start // PERIOD % _ROUNDS == 0:
+            _settle(partial, sums)
+    _settle(partial, sums)
+    for j in range(whole, len(image)):
+        gradient[j] = upstream[j] * _slope(image[j], taken[j], gains[j - whole])
+        sums[j % 3] += _by_stops(taken[j]) * upstream[j]
+
+
+@device
+def _by_stops(taken: np.float32) -> float:
+    """The derivative of one value as taken by the stops."""
+    if taken <= _THRESHOLD:
+        return _OF_LINE * taken
+    return _OF_POWER * (taken + _OFFSET)
+
+
+@device
+def _settle(partial: _Floats, sums: _Sums) -> None:
+    """Moves sums over the straight part and over the power part to the channels' sums."""
+    for j in range(PERIOD):
+        of_line, of_power = np.float64(partial[0, j]), np.float64(partial[1, j])
+        sums[j % 3] += _OF_LINE * of_line + _OF_POWER * of_power
+        partial[0, j], partial[1, j] = _ZERO, _ZERO

@@ -1,0 +1,91 @@
+"""What exposures with values per photo share: start, rates, and the values of unseen photos."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import Exposure, LearningRate, PerPhoto, Scene, Selection, View
+from crossgrad_plugins.exposures.exif import exposure_values
+from crossgrad_plugins.exposures.starts import Start, starts_of
+
+
+class ExposurePerPhoto(Exposure):
+    """An exposure with one parameter of which every training photo has a value.
+
+    Values start from the gains that SfM tracks or EXIF tell, learn at rates of their own, and keep
+    a neutral mean over the training photos: so the scene keeps its own brightness and colours.
+
+    Attributes:
+        parameter: Name of the parameter.
+    """
+
+    parameter: ClassVar[str]
+
+    rate: float = Field(
+        0.002, ge=0, description="learning rate at the start of the run; 0 keeps the start"
+    )
+    decay: float = Field(0.01, gt=0, le=1, description="what is left of the rate at the end")
+    start: Start = Field(
+        "auto",
+        description="where the values start: tracks (SfM observations), exif, none (neutral), or "
+        "auto: tracks, else EXIF",
+    )
+
+    @abstractmethod
+    def of_stops(self, stops: Tensor) -> Tensor:
+        """Values [..., V] that stand for gains of so many stops [...]."""
+
+    @abstractmethod
+    def beside(self, values: Tensor, stops: Tensor) -> Tensor:
+        """Values [P, V] of photos that differ from those of `values` by stops [P]."""
+
+    @abstractmethod
+    def neutral(self) -> Tensor:
+        """What the mean of the values is held at."""
+
+    @override
+    def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
+        def start() -> Tensor:
+            stops = torch.from_numpy(starts_of(scene, self.start).stops)
+            return self._centred(self.of_stops(stops))
+
+        return {self.parameter: PerPhoto(start, LearningRate(self.rate, self.rate * self.decay))}
+
+    @override
+    def remarks(self, scene: Scene) -> tuple[str, ...]:
+        return starts_of(scene, self.start).remarks
+
+    @override
+    def projected(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        return {name: self._centred(each.double()) for name, each in values.items()}
+
+    def _centred(self, values: Tensor) -> Tensor:
+        """The values [P, V] in float64 with their mean where it belongs, in float32."""
+        return (values - values.mean(dim=0) + self.neutral().to(values)).float()
+
+    @override
+    def unseen(
+        self, view: View, scene: Scene, values: Mapping[str, Tensor]
+    ) -> Mapping[str, Tensor]:
+        """By EXIF, where the view and training photos have it, else the mean of the regime."""
+        told = exposure_values(scene)
+        rows = [row for row, each in enumerate(scene.train_views) if each.name in told]
+        if view.name not in told or not rows:
+            return super().unseen(view, scene, values)
+        # Sensors differ, and a regime often has one of its own.
+        rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
+        stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
+        own = values[self.parameter][rows]
+        moved = self.beside(own, torch.tensor(stops, dtype=own.dtype, device=own.device))
+        return {self.parameter: moved.mean(dim=0)}
+
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """`decay` without a rate."""
+        if self.rate:
+            return {}
+        return {"decay": "exposure.rate is 0: the values stay where they start"}

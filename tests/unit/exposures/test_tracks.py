@@ -1,0 +1,196 @@
+"""Gains of photos from SfM tracks: planted ones are found, and the rule tells scenes apart."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from crossgrad_core.plugin import Camera
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.exposures import srgb
+from crossgrad_plugins.exposures.auto import Auto
+from crossgrad_plugins.exposures.none import NoExposure
+from crossgrad_plugins.exposures.tracks.fit import fitted
+from crossgrad_plugins.exposures.tracks.gains import track_gains, training_gains
+from crossgrad_plugins.exposures.tracks.light import light_at
+from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
+
+RNG = np.random.default_rng(0)
+SIZE = 64
+
+
+def observed(gains, points, per_photo, noise=0.1, seed=0):
+    """Observations of random points with noise and, of one in twenty, an outlier."""
+    rng = np.random.default_rng(seed)
+    brightness = rng.normal(-2, 1, points)
+    photos = np.repeat(np.arange(len(gains)), per_photo)
+    numbers = np.concatenate([np.sort(rng.choice(points, per_photo, replace=False)) for _ in gains])
+    stops = gains[photos] + brightness[numbers] + rng.normal(0, noise, len(photos))
+    stops += (rng.random(len(photos)) < 0.05) * rng.normal(3, 2, len(photos))
+    return Observations(photos, numbers, stops)
+
+
+def test_planted_gains_are_found_among_outliers():
+    planted = RNG.normal(0, 1.5, 12)
+    fit = fitted(observed(planted, 60, 40), 12)
+    assert np.abs(fit.gains - (planted - planted.mean())).max() < 0.08
+    assert fit.reduction > 0.3
+
+
+def test_a_long_chain_of_photos_is_solved_to_its_ends():
+    # Each photo shares points with its neighbours only: what alternating fits do not cross.
+    count = 200
+    planted = np.linspace(-3, 3, count)
+    photos = np.repeat(np.arange(count), 10)
+    points = (5 * np.repeat(np.arange(count), 10) + np.tile(np.arange(10), count)).astype(np.int64)
+    fit = fitted(Observations(photos, points, planted[photos]), count)
+    assert np.abs(fit.gains - planted).max() < 1e-3
+
+
+def test_parts_that_share_no_point_have_a_mean_of_zero_each():
+    one = observed(np.array([1.0, 3.0]), 20, 20, noise=0.0)
+    other = observed(np.array([-5.0, -5.5]), 20, 20, noise=0.0)
+    joined = Observations(
+        np.concatenate([one.photos, other.photos + 2]),
+        np.concatenate([one.points, other.points + 20]),
+        np.concatenate([one.stops, other.stops]),
+    )
+    gains = fitted(joined, 4).gains
+    assert gains[:2].mean() == pytest.approx(0.0, abs=0.05)
+    assert gains[1] - gains[0] == pytest.approx(2.0, abs=0.05)
+    assert gains[3] - gains[2] == pytest.approx(-0.5, abs=0.05)
+
+
+def test_without_observations_there_is_nothing_to_tell():
+    none = np.zeros(0, dtype=np.int64)
+    fit = fitted(Observations(none, none, np.zeros(0)), 3)
+    assert fit.gains.tolist() == [0.0] * 3
+    assert fit.reduction == 0.0
+
+
+@dataclass(frozen=True)
+class Grey:
+    """A photo of one brightness in linear light, with a wall of noise around its middle."""
+
+    light: float
+
+    def image(self) -> Tensor:
+        value = float(srgb.encoded(torch.tensor(self.light, dtype=torch.float64)))
+        return torch.full((SIZE, SIZE, 3), round(255 * min(value, 1.0)), dtype=torch.uint8)
+
+    def mask(self) -> Tensor | None:
+        return None
+
+
+def grey_scene(lights, points=60, seen=None):
+    """Cameras side by side that look at a cloud; each photo has its own brightness."""
+    rng = np.random.default_rng(1)
+    cloud = np.column_stack([rng.uniform(-0.3, 0.3, points), np.full(points, 2.0),
+                             rng.uniform(-0.3, 0.3, points)])  # fmt: skip
+    views = []
+    for number, light in enumerate(lights):
+        shows = range(points) if seen is None else seen[number]
+        view = posed_view((0.05 * number, 0, 0), f"{number:02}.png", seen=shows)
+        camera = replace(view.camera, width=SIZE, height=SIZE, fx=80.0, fy=80.0, cx=32.0, cy=32.0)
+        views.append(replace(view, camera=camera, photo=Grey(light)))
+    return posed_scene(views, cloud)
+
+
+def test_light_is_taken_where_the_camera_sees_the_point():
+    camera = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
+    points = np.array([[0.0, 0, 1], [0.2, -0.1, 1], [0, 0, -1], [9, 0, 1], [-0.39, 0, 1]])
+    image = torch.zeros(6, 8, 3, dtype=torch.uint8)
+    image[1:4, 5:8] = 255
+    found = light_at(image, None, camera, points)
+    assert found.rows.tolist() == [0, 1]  # behind, outside, and without all neighbours
+    assert found.brightness.tolist() == pytest.approx([2 / 9, 1.0])
+    mask = torch.ones(6, 8, dtype=torch.bool)
+    mask[3, 5] = False
+    assert light_at(image, mask, camera, points).rows.tolist() == []
+    as_floats = light_at(image.float() / 255, None, camera, points)
+    assert as_floats.brightness.tolist() == pytest.approx(found.brightness.tolist())
+
+
+def test_photos_of_one_wall_differ_by_their_light():
+    scene = grey_scene([0.1, 0.2, 0.4, 0.8])
+    gains = track_gains(scene, scene.train_views)
+    assert gains.gains == pytest.approx([-1.5, -0.5, 0.5, 1.5], abs=0.03)
+    assert gains.counts.tolist() == [60] * 4
+    assert gains.differ
+    assert "4 photos at 240 observations" in gains.evidence
+
+
+def test_black_white_and_unconnected_photos_tell_nothing():
+    seen = [range(60)] * 4 + [range(3)]
+    scene = grey_scene([0.2, 0.4, 0.0, 1.0, 0.2], seen=seen)
+    gains = track_gains(scene, scene.train_views)
+    assert gains.known.tolist() == [True, True, False, False, False]
+    assert gains.gains[2:].tolist() == [0.0] * 3
+
+
+def test_the_rule_asks_for_both_a_spread_and_a_reduction():
+    alike = grey_scene([0.2, 0.21, 0.19, 0.2])
+    assert not track_gains(alike, alike.train_views).differ
+    gains = track_gains(grey_scene([0.1, 0.4]), grey_scene([0.1, 0.4]).train_views)
+    assert gains.differ
+    weak = replace(gains, fit=replace(gains.fit, after=0.9 * gains.fit.before))
+    assert not weak.differ
+
+
+def test_of_many_observations_a_part_is_looked_at(monkeypatch):
+    scene = grey_scene([0.1, 0.2, 0.4])
+    module = "crossgrad_plugins.exposures.tracks.observations._MOST"
+    monkeypatch.setattr(module, 60)
+    found = observations_of(scene, scene.train_views)
+    assert found.count == 3 * 20
+    gains = track_gains(scene, scene.train_views)
+    assert gains.gains == pytest.approx([-1.0, 0.0, 1.0], abs=0.03)
+
+
+def test_a_scene_is_looked_at_once_and_not_kept():
+    scene = grey_scene([0.1, 0.4])
+    assert training_gains(scene) is training_gains(scene)
+    import weakref
+
+    gone = weakref.ref(scene)
+    del scene
+    assert gone() is None
+
+
+def test_auto_takes_a_gain_where_the_rule_says_so_and_says_why():
+    fitted_on = Auto().fitted_to(grey_scene([0.1, 0.2, 0.4]))
+    assert fitted_on.name == "gain"
+    off = Auto().fitted_to(grey_scene([0.2, 0.2, 0.2]))
+    assert off.name == "none"
+    assert "less than 0.2 stops or 15 %" in off.notes[0]
+    blind = Auto().fitted_to(grey_scene([0.2, 0.4], seen=[(), ()]))
+    assert blind.name == "none"
+    assert "no SfM tracks" in blind.notes[0]
+
+
+def test_no_exposure_names_the_option_where_it_would_help():
+    (remark,) = NoExposure().remarks(grey_scene([0.1, 0.2, 0.4]))
+    assert "--exposure gain" in remark
+    assert NoExposure().remarks(grey_scene([0.2, 0.2, 0.2])) == ()
+
+
+class Unseen:
+    def image(self):
+        raise AssertionError("decoded for nothing")
+
+    mask = image
+
+
+def test_photos_without_tracks_are_not_decoded():
+    scene = grey_scene([0.2, 0.4], seen=[(), ()])
+    scene = replace(scene, views=tuple(replace(view, photo=Unseen()) for view in scene.views))
+    assert NoExposure().remarks(scene) == ()
+    assert not training_gains(scene).known.any()
+
+
+def test_a_damaged_photo_is_left_to_whoever_needs_it():
+    scene = grey_scene([0.2, 0.4])
+    scene = replace(scene, views=tuple(replace(view, photo=Unseen()) for view in scene.views))
+    assert NoExposure().remarks(scene) == ()
