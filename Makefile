@@ -11,7 +11,7 @@ FUZZ_SEED ?= 0
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test slow matrix compat faults fuzz lint bench clean
+.PHONY: demo install test slow matrix exposures compat faults fuzz lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -31,6 +31,9 @@ matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.
 
 slow:  ## The tests that take minutes: statistics of many repetitions, gradients entry by entry
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m slow
+
+exposures:  ## Train every exposure x backbone x K for sixty steps, and photos of all extremes
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m exposures
 
 compat:  ## The tests on Python 3.12, 3.13 and the lowest versions of packages, one worker each
 	COMPAT_VENVS="$(abspath .venv-compat)" sh tests/compat.sh

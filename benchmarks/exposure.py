@@ -1,52 +1,51 @@
-"""PSNR of the held-out views of runs, as they are and with the exposure of each photo taken out.
+"""How the photos of scenes differ in exposure, by SfM tracks: the table of docs/exposure.md.
 
-    python benchmarks/exposure.py RUN [RUN ...]
+    python benchmarks/exposure.py SCENE [SCENE ...]
 
-Photos of one place often differ in exposure and white balance. Here every render is fitted to its
-photo by least squares, a gain and an offset per channel, before it is measured again: what is left
-is the error of structure and detail.
+All photos of a scene are looked at, held-out ones included, in their full size. Seconds are those
+of the process, without reading the scene and decoding its photos.
 """
 
 import argparse
+from math import log
 from pathlib import Path
-from statistics import mean
+from time import process_time
 
-import numpy as np
-from numpy.typing import NDArray
+from crossgrad_core.commands import configured, read_scene
+from crossgrad_core.plugin import exposure_value
+from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
 
-from crossgrad_core.run.export import renderer
-from crossgrad_core.run.opening import opened
-
-
-def psnr(image: NDArray[np.float64], photo: NDArray[np.float64]) -> float:
-    """PSNR in dB of two [H, W, 3] images in [0, 1]."""
-    return float(-10.0 * np.log10(np.mean((image - photo) ** 2)))
+HEADER = (
+    "| scene | photos | EXIF | std of gains, stops | range | deviation (natural logarithm) "
+    "| auto | seconds |\n|---|---|---|---|---|---|---|---|"
+)
 
 
-def fitted(image: NDArray[np.float64], photo: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The image with the gain and the offset of each channel that bring it closest to the photo."""
-    channels = []
-    for own, wanted in zip(image.reshape(-1, 3).T, photo.reshape(-1, 3).T, strict=True):
-        rows = np.stack([own, np.ones_like(own)], axis=1)
-        channels.append(rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0])
-    return np.stack(channels, axis=1).reshape(image.shape).clip(0.0, 1.0)
+def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
+    """The line of one scene; `told` photos have an EXIF header that tells their exposure."""
+    known = gains.gains[gains.known]
+    ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
+    before, after = (log(2.0) * each for each in (gains.fit.before, gains.fit.after))
+    auto = "gain" if gains.differ else "none"
+    return (
+        f"| {name} | {len(known)} of {len(gains.gains)} | {told} | {gains.spread:.2f} | {ends} "
+        f"| {before:.2f} -> {after:.2f} | {auto} | {seconds:.1f} |"
+    )
 
 
 def main() -> None:
-    """Prints a line for each run."""
+    """Prints a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="+")
-    print("| run | PSNR | exposure taken out |\n|---|---|---|")
-    for run in parser.parse_args().runs:
-        setup, state = opened(run, {}, -1)
-        draw = renderer(setup, state)
-        found = []
-        for view in setup.scene.test_views:
-            image = draw(view).detach().cpu().double().clamp(0.0, 1.0).numpy()
-            photo = view.photo.image().numpy() / 255.0
-            found.append((psnr(image, photo), psnr(fitted(image, photo), photo)))
-        plain, corrected = (mean(each) for each in zip(*found, strict=True))
-        print(f"| {run.name} | {plain:.2f} | {corrected:.2f} |", flush=True)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    print(HEADER)
+    for path in parser.parse_args().scenes:
+        scene, _ = read_scene(configured({"scene": path, "threads": 1}))
+        told = sum(exposure_value(view) is not None for view in scene.views)
+        for view in scene.views:
+            view.photo.image()
+        start = process_time()
+        gains = track_gains(scene, scene.views)
+        print(row(scene.name, told, gains, process_time() - start), flush=True)
 
 
 if __name__ == "__main__":

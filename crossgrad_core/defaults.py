@@ -14,7 +14,7 @@ EXPOSURE: Final = "none"
 RESOLUTION: Final = "full"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
-METRICS: Final = "psnr+ssim+ssim-skimage+psnr-cc+lpips"
+METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
 #: The reader that says what is missing in a folder that no reader accepts.

@@ -1,9 +1,11 @@
 """The metric slot: a figure of merit of each held-out view."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.contract.component import Component
@@ -20,12 +22,17 @@ class Compared:
         render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
         photo: [H, W, 3] uint8.
         mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+        drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None
+            where only the rounded one is there.
+        points: [S, 3] SfM points that the view observed, local frame; may be empty.
     """
 
     view: View
     render: Tensor
     photo: Tensor
     mask: Tensor | None
+    drawn: Tensor | None = None
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 class Metric(Component):

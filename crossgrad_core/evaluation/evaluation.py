@@ -7,7 +7,9 @@ metrics are means over images. Masked pixels do not count.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.contract.images import eight_bit
@@ -29,6 +31,7 @@ def evaluate(
     render_one: Callable[[View], Tensor],
     metrics: Sequence[Metric],
     on_view: Callable[[Evaluated], None] | None = None,
+    points: NDArray[np.float64] | None = None,
 ) -> EvaluationResult:
     """Renders and measures the views, one at a time.
 
@@ -37,11 +40,12 @@ def evaluate(
         render_one: [H, W, 3] float image of a view, on any device, need not be clamped.
         metrics: What is measured.
         on_view: Told each view with its render, for panels.
+        points: [P, 3] SfM points of the scene, local frame, for figures that need them.
     """
     measured = []
     with torch.no_grad():
         for view in views:
-            compared = compare(view, render_one(view))
+            compared = compare(view, render_one(view), points)
             found = _measured(compared, metrics)
             measured.append(found)
             if on_view is not None:
@@ -49,10 +53,11 @@ def evaluate(
     return summarised(measured, [metric.described() for metric in metrics])
 
 
-def compare(view: View, render: Tensor) -> Compared:
-    """The view's photo and its render [H, W, 3], rounded to 8 bits."""
+def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = None) -> Compared:
+    """The view's photo and its render [H, W, 3], rounded to 8 bits, and the points it observed."""
     photo, mask = view.photo.image(), view.photo.mask()
-    return Compared(view, eight_bit(render), photo, mask)
+    seen = np.zeros((0, 3)) if points is None else points[view.seen]
+    return Compared(view, eight_bit(render), photo, mask, render.detach().cpu(), seen)
 
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:

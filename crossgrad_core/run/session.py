@@ -93,6 +93,7 @@ class Session:
             renderer(setup, state),
             setup.metrics,
             on_view=None if writer is None else writer.write,
+            points=setup.scene.points,
         )
         state.clock.evaluate += perf_counter() - start
         self._result = (state.step, result)

@@ -16,6 +16,7 @@ WORDS = {
         "active",
         "analytic",
         "anchors",
+        "auto",
         "chain",
         "distance",
         "epoch",

@@ -8,6 +8,7 @@ import pytest
 
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
+from crossgrad_plugins.diagnostics.exposure import exposure_of
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement
 from crossgrad_plugins.diagnostics.table import table
@@ -29,6 +30,7 @@ def columns():
         *table(measurement, plan, distances_of(scene), 0),
         *camera_rows(scene),
         *grouping_rows(scene, measurement, 0),
+        *exposure_of(scene).rows,
     ]
     return sorted({name for row in found for name in row} - {"note", "quantity"})
 

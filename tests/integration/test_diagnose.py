@@ -15,7 +15,8 @@ from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_plugins.diagnostics.app import diagnose
 from crossgrad_plugins.diagnostics.command import Options
 
-FILES = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
+PROBED = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
+FILES = {*PROBED, "exposure.csv", "exposure.png"}
 QUICK = Options(per_group=4, probes=2, seconds=1.0)
 
 
@@ -60,7 +61,7 @@ def test_watching_changes_no_bit_of_the_training(scene, tmp_path, settings):
     assert same(plain.exp_avg, watched.exp_avg)
     assert same(plain.exp_avg_sq, watched.exp_avg_sq)
     assert plain.generators == watched.generators
-    assert {path.name for path in (tmp_path / "watched").iterdir()} >= FILES
+    assert {path.name for path in (tmp_path / "watched").iterdir()} >= PROBED
     assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
@@ -95,6 +96,7 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert "model: a vanilla run of" in printed
     assert "Sarle's bimodality" in printed
+    assert "no exposure needs a model" in printed
     rows = table(tmp_path / "out")
     assert len({row["step"] for row in rows}) == 2
     assert {row["metric"] for row in rows} == {"plain", "adam"}

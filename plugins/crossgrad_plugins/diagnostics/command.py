@@ -22,6 +22,7 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 from crossgrad_core.plugin import Grouping, Model, Scene
+from crossgrad_plugins.diagnostics.exposure import exposure_of
 from crossgrad_plugins.diagnostics.plan import (
     DEFAULT_GROUPING,
     OF_THE_RUN,
@@ -126,7 +127,7 @@ def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None)
 
 
 def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
-    report = watch.report(model.scene, which)
+    report = replace(watch.report(model.scene, which), exposure=exposure_of(model.scene))
     if options.signature is None:
         return report
     note = _write_signature(model, options.signature, options.seed)

@@ -12,12 +12,15 @@ from crossgrad_core.commands import (
     write_atomically,
     write_table,
 )
+from crossgrad_plugins.diagnostics.exposure import SceneExposure
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of, touched
 
 PROBES = "diagnostics.csv"
 CAMERAS = "cameras.csv"
 GROUPINGS = "groupings.csv"
 PICTURE = "diagnostics.png"
+EXPOSURE = "exposure.csv"
+EXPOSURE_PICTURE = "exposure.png"
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Report:
         groupings: Rows of `grouping_rows`, for the last probe.
         notes: What the reader should know.
         failure: Why training ended before its time; None where it did not.
+        exposure: How the photos differ in exposure; None where nobody looked.
     """
 
     scene: str
@@ -41,6 +45,7 @@ class Report:
     groupings: Sequence[Row]
     notes: Sequence[str] = ()
     failure: str | None = None
+    exposure: SceneExposure | None = None
 
     def write(self, folder: Path) -> None:
         """Writes the CSV files and the picture.
@@ -54,16 +59,25 @@ class Report:
         write_table(folder / CAMERAS, self.cameras)
         write_table(folder / GROUPINGS, self.groupings)
         write_atomically(folder / PICTURE, draw(self.title, self.probes, self.cameras))
+        if self.exposure is not None:
+            self._write_exposure(folder, self.exposure)
+
+    def _write_exposure(self, folder: Path, exposure: SceneExposure) -> None:
+        from crossgrad_plugins.diagnostics.exposure_figure import draw_exposure
+
+        write_table(folder / EXPOSURE, exposure.rows)
+        write_atomically(folder / EXPOSURE_PICTURE, draw_exposure(self.scene, exposure))
 
     def lines(self) -> list[str]:
         """The report for a terminal."""
         parts = (
             [f"scene: {self.scene}", *self.notes],
             _camera_lines(self.cameras),
+            [] if self.exposure is None else self.exposure.lines(),
             self._blocks(),
             _grouping_lines(self.groupings),
         )
-        return [line for part in parts for line in ("", *part)][1:]
+        return [line for part in parts if part for line in ("", *part)][1:]
 
     def _blocks(self) -> list[str]:
         last = max(int(row["step"]) for row in self.probes)

@@ -1,0 +1,74 @@
+"""How the photos of a scene differ in exposure, as rows and in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import nan
+from statistics import median
+
+from crossgrad_core.plugin import Scene
+from crossgrad_plugins.diagnostics.table import Row
+from crossgrad_plugins.exposures.exif import exposure_values
+from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
+
+
+@dataclass(frozen=True)
+class SceneExposure:
+    """What SfM tracks and EXIF headers say about the exposure of photos.
+
+    Attributes:
+        rows: A row for each photo, in the order of their names.
+        evidence: What the rule for `--exposure auto` goes by, over all photos.
+        differ: Whether it calls for a gain per photo.
+        spread: Standard deviation of the gains, stops.
+        before: Deviation of the observations, stops.
+        after: The same once the gains are taken out.
+    """
+
+    rows: Sequence[Row]
+    evidence: str
+    differ: bool
+    spread: float
+    before: float
+    after: float
+
+    def lines(self) -> list[str]:
+        """For a terminal."""
+        verdict = (
+            "the photos differ in exposure; --exposure gain (or auto) models that"
+            if self.differ
+            else "no exposure needs a model (--exposure none)"
+        )
+        return ["exposure", f"  {self.evidence}", f"  {verdict}"]
+
+
+def exposure_of(scene: Scene) -> SceneExposure:
+    """The exposure of all photos, held-out ones included.
+
+    Raises:
+        UserError: A photo cannot be decoded.
+    """
+    gains = track_gains(scene, scene.views)
+    fit = gains.fit
+    rows = _rows(scene, gains)
+    return SceneExposure(rows, gains.evidence, gains.differ, gains.spread, fit.before, fit.after)
+
+
+def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
+    told = exposure_values(scene)
+    known = zip(scene.views, gains.gains, gains.known, strict=True)
+    of_tracks = {view.name: float(gain) for view, gain, is_known in known if is_known}
+    # EXIF tells differences only; it is set beside the tracks where there are both.
+    both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
+    shift = median(both) if both else -sum(told.values()) / max(1, len(told))
+    trained = frozenset(scene.train)
+    return [
+        {
+            "photo": view.name,
+            "regime": view.regime,
+            "part": "train" if index in trained else "test",
+            "observations": int(gains.counts[index]),
+            "gain_stops": of_tracks.get(view.name, nan),
+            "exif_stops": told[view.name] + shift if view.name in told else nan,
+        }
+        for index, view in enumerate(scene.views)
+    ]

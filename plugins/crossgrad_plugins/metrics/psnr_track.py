@@ -1,0 +1,73 @@
+"""Peak signal-to-noise ratio with the exposure of the view taken from its SfM observations."""
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import Compared, Figure, Metric, psnr
+from crossgrad_plugins.exposures.srgb import encoded, with_gain
+from crossgrad_plugins.exposures.tracks.gains import LEAST
+from crossgrad_plugins.exposures.tracks.light import light_at
+
+#: Gains that are tried around the first guess, in stops, from coarse to fine.
+_STEPS = (0.1, 0.01)
+_TRIED = 15
+
+
+class TrackExposedPSNR(Metric):
+    """PSNR once the render's light is multiplied by one number, taken from SfM observations.
+
+    The number brings render and photo closest together where the photo shows the SfM points that it
+    observed: it looks at the photo where its pose came from, and nowhere else.
+    """
+
+    figure: ClassVar[Figure] = Figure(
+        name="psnr_track",
+        label="PSNR (track)",
+        form=".2f",
+        per_regime=True,
+        definition="dB; PSNR of the render with one gain in linear light, which brings it closest "
+        "to the photo at the SfM points that the view observed (3 x 3 means, least squares of sRGB "
+        "values)",
+        undefined=f"no held-out view has {LEAST} SfM observations that are neither too dark nor "
+        "cut off",
+    )
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        if not len(compared.points):
+            return None
+        drawn = compared.render / 255.0 if compared.drawn is None else compared.drawn
+        stops = _closest(drawn, compared)
+        if stops is None:
+            return None
+        exposed = with_gain(drawn.float(), torch.tensor(stops))
+        return psnr(exposed, compared.photo, compared.mask)
+
+
+def _closest(drawn: Tensor, compared: Compared) -> float | None:
+    """The gain in stops; None where too few observations are usable."""
+    camera = compared.view.camera
+    of_photo = light_at(compared.photo, compared.mask, camera, compared.points)
+    if np.count_nonzero(of_photo.usable) < LEAST:
+        return None
+    wanted = of_photo.brightness[of_photo.usable]
+    of_render = light_at(drawn, compared.mask, camera, compared.points)
+    light = np.maximum(of_render.brightness[of_photo.usable], 0.0)
+    if not light.any():
+        return 0.0
+    stops = float(np.log2(wanted.sum() / light.sum()))
+    for step in _STEPS:
+        tried = stops + step * np.arange(-_TRIED, _TRIED + 1)
+        stops = float(tried[np.argmin([_distance(light * 2.0**gain, wanted) for gain in tried])])
+    return stops
+
+
+def _distance(light: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
+    """Mean square of what two brightnesses in linear light differ by in sRGB values."""
+    one, other = (encoded(torch.from_numpy(each)) for each in (light, wanted))
+    return float((one - other).square().mean())

@@ -1,0 +1,46 @@
+"""The rule for exposure on real photos: the bundled scene, and others where they are there."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from crossgrad_core.commands import configured, read_scene
+from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_plugins.exposures.tracks.gains import track_gains
+
+#: Scene -> standard deviation of the gains in stops, share of the deviation that they take away,
+#: and whether photos differ (docs/exposure.md).
+KNOWN = {
+    "boruszyn_kap": (0.38, 0.41, True),
+    "brighton_beach": (0.46, 0.57, True),
+    "city_hybrid": (0.06, -0.02, False),
+    "ochota_kap_hybrid": (1.46, 0.61, True),
+    "ochota_kap_hybrid_gain": (0.10, 0.04, False),
+}
+#: A folder with scenes of these names.
+SCENES = Path(os.environ.get("CROSSGRAD_SCENES", "no-such-folder"))
+
+
+def gains_of(path, **reading):
+    scene, _ = read_scene(configured({"scene": path, "threads": 1, "reading": reading}))
+    return track_gains(scene, scene.views)
+
+
+def test_the_bundled_scene_differs_in_exposure_at_any_size():
+    for size in (100, 200):
+        gains = gains_of(bundled_scene(), max_size=size)
+        assert gains.differ
+        assert gains.spread == pytest.approx(0.39, abs=0.04)
+        assert gains.fit.reduction == pytest.approx(0.43, abs=0.06)
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_the_table_of_scenes(name):
+    if not (SCENES / name).is_dir():
+        pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
+    spread, reduction, differ = KNOWN[name]
+    gains = gains_of(SCENES / name)
+    assert gains.differ == differ
+    assert gains.spread == pytest.approx(spread, abs=0.02)
+    assert gains.fit.reduction == pytest.approx(reduction, abs=0.03)
