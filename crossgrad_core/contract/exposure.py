@@ -32,7 +32,7 @@ class PerPhoto:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What an exposure makes of itself for a scene.
+    """The exposure that a scene calls for, and why.
 
     Attributes:
         exposure: The exposure that the run takes.

@@ -17,6 +17,7 @@ WORDS = {
         "analytic",
         "anchors",
         "auto",
+        "channel",
         "chain",
         "distance",
         "epoch",

@@ -13,7 +13,7 @@ from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
 
 @dataclass(frozen=True)
 class SceneExposure:
-    """What SfM tracks and EXIF headers say about the exposure of photos.
+    """The exposure of all photos of a scene, by SfM tracks and EXIF headers.
 
     Attributes:
         rows: A row for each photo, in the order of their names.

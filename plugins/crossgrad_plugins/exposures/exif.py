@@ -1,4 +1,4 @@
-"""What the EXIF headers of a scene's photos say about their exposure."""
+"""Exposure values of a scene's photos, from their EXIF headers."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor

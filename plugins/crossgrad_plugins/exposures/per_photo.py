@@ -1,4 +1,4 @@
-"""What exposures with values per photo share: start, rates, and the values of unseen photos."""
+"""Base of exposures with values per photo: start, rates, and the values of unseen photos."""
 
 from abc import abstractmethod
 from collections.abc import Mapping

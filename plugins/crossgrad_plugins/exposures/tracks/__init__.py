@@ -1,1 +1,1 @@
-"""What SfM tracks tell about exposure: how bright photos are where they show the same points."""
+"""Exposure from SfM tracks: how bright photos are where they show the same points."""
