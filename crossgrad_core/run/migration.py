@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
-from crossgrad_core.scene.split import has_lists
 from crossgrad_core.system.version import VERSION
 
 #: The key that says which version wrote a configuration, and the version of this one.
@@ -61,6 +60,8 @@ def _reading(value: object, scene: object) -> object:
     """How 0.1 read a scene: what it called `auto` held out each n-th photo wherever no list did."""
     if not isinstance(value, dict) or value.get("split") != "auto" or not isinstance(scene, str):
         return value
+    from crossgrad_core.scene.split import has_lists  # Imports torch, which only this needs.
+
     return value if has_lists(Path(scene)) else {**value, "split": "every"}
 
 

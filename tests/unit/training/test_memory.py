@@ -69,7 +69,8 @@ def looked(monkeypatch, available=GIB, **settings):
     monkeypatch.setattr(
         step, "room_for_primitives", lambda d, demand: demands.append(demand) or room_for(d, demand)
     )
-    given = {"steps": 9, "densify_from": 1, "densify_until": 9, "densify_every": 2, "sh_from": 3}
+    times = {"densify_from": 1, "densify_until": 9, "densify_every": 2, "events": "steps"}
+    given = {"steps": 9, **times, "sh_from": 3}
     setup = assemble(RunConfig.model_validate({**given, **settings}), sample_scene(), "none")
     look = Look()
     setup = replace(setup, manager=make_manager({**setup.plugins, "look": look}))
