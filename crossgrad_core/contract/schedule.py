@@ -170,8 +170,8 @@ class Schedule:
 
     @property
     def grows(self) -> bool:
-        """Whether density control edits at all."""
-        return self.edits() > 0
+        """Whether density control edits at all, or has done so."""
+        return self.edits_before + self.edits() > 0
 
     @property
     def first_edit(self) -> int:

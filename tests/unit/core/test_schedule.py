@@ -232,6 +232,7 @@ def test_any_lengths_in_turn_keep_what_was_and_what_is_ahead(text, seed):
         assert later.total == length and later.pace.views(step) == schedule.pace.views(step)
         edits = schedule.edits_before + schedule.edits() - schedule.edits(step)
         assert later.edits_before == edits or later.counted(step) >= later.densify_until
+        assert later.grows or not edits
         assert later.edits(step) == sum(map(later.densifies, range(step + 1, length + 1)))
         if schedule.counted(step) >= schedule.densify_until:
             assert later.edits(step) == 0 and not later.collects(step + 1)

@@ -15,7 +15,7 @@ from crossgrad_core.training.start import first_state
 
 STEPS = 60
 #: Density control edits in steps 20 and 40.
-TIMES = {"densify_from": 10, "densify_every": 20, "densify_until": 59}
+TIMES = {"events": "steps", "densify_from": 10, "densify_every": 20, "densify_until": 59}
 #: What density control counts where it edits.
 EDITS = ("cloned", "split", "pruned", "grown", "added", "relocated")
 #: Every backbone and every densifier, at least once.
