@@ -23,7 +23,7 @@ from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce, finish
-from crossgrad_core.system.tables import write_table
+from crossgrad_core.system.tables import table_bytes, write_table
 from crossgrad_core.system.terminal import is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
@@ -107,6 +107,7 @@ __all__ = [
     "singular",
     "summary",
     "summary_of",
+    "table_bytes",
     "take_steps",
     "tell",
     "view_gradients",

@@ -17,9 +17,14 @@ def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> 
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
+    write_atomically(path, table_bytes(rows))
+
+
+def table_bytes(rows: Sequence[Mapping[str, str | int | float]]) -> bytes:
+    """What `write_table` writes."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     lines = ([_rounded(row.get(name)) for name in columns] for row in rows)
-    write_atomically(path, csv_bytes([columns, *lines]))
+    return csv_bytes([columns, *lines])
 
 
 def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:

@@ -33,6 +33,7 @@ PLACES = {
     "crossgrad_plugins.readers": READERS,
     # Checks packages, and writes one for each slot, readers and tests included.
     "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
+    "crossgrad_plugins.compare": COMMAND_ROOMS,
     "crossgrad_plugins.diagnostics": COMMAND_ROOMS,
     "crossgrad_plugins.sweep": COMMAND_ROOMS,
     "crossgrad_operators.stress": COMMAND_ROOMS,

@@ -16,6 +16,10 @@ from crossgrad_core.run.results.metrics_csv import Row, read_metrics
 from crossgrad_core.run.results.per_view import read_per_view
 from crossgrad_core.run.results.summary import FILE as SUMMARY
 from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.system.text_files import read_json
+
+#: What the scene of a run is known by; results/scene_file.py writes it.
+SCENE = "scene.json"
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,15 @@ class RunResults:
     def regimes(self) -> tuple[str, ...]:
         """The regimes of the held-out views by name; none before the run has ended."""
         return tuple((self.summary or {}).get("regimes") or ())
+
+    @cached_property
+    def scene_marks(self) -> Mapping[str, Any] | None:
+        """What the scene is known by: views with split, camera and photo; None of an older run."""
+        try:
+            marks = read_json(self.folder / SCENE)
+        except (FileNotFoundError, ValueError):
+            return None
+        return marks if isinstance(marks, dict) else None
 
     def figure(self, name: str, regime: str | None = None) -> float | None:
         """A figure of the last evaluation, overall or of one regime; None where there is none."""

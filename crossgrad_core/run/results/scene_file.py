@@ -7,11 +7,11 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.results.reading import SCENE as FILE
 from crossgrad_core.scene.differences import Weight, differences
 from crossgrad_core.scene.fingerprint import Fingerprint
 from crossgrad_core.system.files import write_atomically
 
-FILE = "scene.json"
 #: What to do about the heaviest difference; None stands for one that can be accepted.
 _WAYS_OUT = {
     None: "put it back as it was, or add --accept-scene to go on with it as it is",

@@ -1,0 +1,1 @@
+"""`crossgrad compare`: runs against each other, over seeds, scenes, regimes and budgets."""

@@ -1,0 +1,90 @@
+"""The command `crossgrad compare`."""
+
+import os.path
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.commands import Progress, table_bytes
+from crossgrad_plugins.compare.comparison import Comparison, Options, compared
+from crossgrad_plugins.compare.figures.curves import draw_curves
+from crossgrad_plugins.compare.figures.differences import draw_differences
+from crossgrad_plugins.compare.figures.frontier import draw_frontier
+from crossgrad_plugins.compare.figures.phases import draw_phases
+from crossgrad_plugins.compare.figures.primitives import draw_primitives
+from crossgrad_plugins.compare.figures.profile import draw_profile
+from crossgrad_plugins.compare.figures.regimes import draw_regimes
+from crossgrad_plugins.compare.figures.style import Drawn
+from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
+from crossgrad_plugins.compare.page import page_of
+from crossgrad_plugins.compare.pictures import with_pictures, worst_views
+from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.tables import tables_of
+from crossgrad_plugins.compare.terminal import lines_of
+
+#: Where a comparison goes by default, beside the runs.
+FOLDER: Final = "compare"
+#: What a comparison writes.
+_OWNED: Final = ("*.csv", f"{FIGURES}/*.pdf", f"{FIGURES}/*.png")
+
+
+def compare(
+    places: Sequence[Path], options: Options, out: Path | None, *, skip_broken: bool
+) -> None:
+    """Compares runs; writes page, figures and tables to a folder, and prints the verdicts.
+
+    Args:
+        places: Folders of runs, or folders with runs below.
+        options: How to compare.
+        out: Where the results go; by default `compare` beside the runs.
+        skip_broken: Leave out runs with damaged files.
+
+    Raises:
+        UserError: There is nothing to compare, it does not compare, or the folder is in use.
+    """
+    progress = Progress()
+    folder = _default_folder(places) if out is None else out
+    check_free(folder)
+    progress.tell("reading runs")
+    comparison = compared(read_runs(places, skip_broken=skip_broken), options)
+    progress.tell(f"drawing {len(comparison.runs)} runs of {len(comparison.arms)} arms")
+    views = worst_views(comparison)
+    pictured, unreadable = with_pictures(comparison, views)
+    figures = drawn_figures(comparison)
+    notes = (*comparison.notes, *unreadable)
+    page = page_of(comparison, figures, pictured, views, notes, version("crossgrad"))
+    files = {PAGE: page.encode()}
+    files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}
+    files |= {f"{FIGURES}/{figure.name}.png": figure.png for figure in figures}
+    files |= {
+        name: table_bytes(rows) for name, rows in tables_of(comparison, views).items() if rows
+    }
+    write_files(folder, files, _OWNED)
+    for line in lines_of(comparison, notes):
+        print(line)  # noqa: T201 - the result of the command
+    print(f"\npage, figures and tables in {folder}: open {folder / PAGE}")  # noqa: T201
+
+
+def drawn_figures(comparison: Comparison) -> list[Drawn]:
+    """All figures that can be drawn, in the order of the page."""
+    first, *rest = comparison.costs
+    figures = [
+        draw_curves(comparison, first),
+        draw_differences(comparison),
+        draw_frontier(comparison, first),
+        draw_regimes(comparison),
+        *(draw_curves(comparison, cost) for cost in rest),
+        draw_profile(comparison),
+        draw_primitives(comparison, first),
+        draw_phases(comparison),
+    ]
+    return [figure for figure in figures if figure is not None]
+
+
+def _default_folder(places: Sequence[Path]) -> Path:
+    """In the only place, where that is no run itself; else beside what was named."""
+    only = places[0]
+    if len(places) == 1 and not (only / "config.yaml").is_file():
+        return only / FOLDER
+    return Path(os.path.commonpath([place.absolute().parent for place in places])) / FOLDER

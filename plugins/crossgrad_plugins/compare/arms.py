@@ -1,0 +1,160 @@
+"""Arms: runs that differ in nothing but scene, seed and length, named by what tells them apart."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.settings import Settings
+
+#: What names an arm if it can, before anything else that differs.
+_FIRST: Final = (
+    *("backbone", "views_per_step", "sampler", "operator", "densifier"),
+    *("exposure", "loss", "resolution", "schedule", "preset", "backward"),
+)
+#: Settings that people know by another name.
+_SPOKEN: Final = {"views_per_step": "views"}
+_ABSENT: Final = "-"
+_DIGITS: Final = re.compile(r"(\d+)")
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One of the things that are compared.
+
+    Attributes:
+        name: Its name.
+        runs: Its runs that finished, of any length.
+        failed: Its runs that failed.
+        settings: Setting -> value, of those in which arms differ.
+    """
+
+    name: str
+    runs: tuple[Run, ...]
+    failed: tuple[Run, ...]
+    settings: Mapping[str, str]
+
+
+def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
+    """The arms, in the order of their names.
+
+    Labels of a sweep are taken where each run has one. Else runs belong together that agree in
+    every setting which varies within a scene: what depends on the scene alone, such as a degree
+    that its data cannot support, makes no arm.
+
+    Args:
+        runs: The runs that finished; at least one.
+        failed: Those that failed.
+    """
+    everything = [*runs, *failed]
+    keys = _varying(everything)
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    labelled = all(run.label for run in everything)
+    for run in everything:
+        values = _values(run.settings, keys)
+        groups.setdefault((str(run.label),) if labelled else values, []).append(run)
+    called = {key: key[0] for key in groups} if labelled else _names(groups, keys)
+    finished = set(runs)
+    arms = [
+        Arm(
+            name=called[key],
+            runs=tuple(run for run in members if run in finished),
+            failed=tuple(run for run in members if run not in finished),
+            settings=dict(zip(keys, _values(members[0].settings, keys), strict=True)),
+        )
+        for key, members in groups.items()
+    ]
+    return tuple(sorted(arms, key=lambda arm: _natural(arm.name)))
+
+
+def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
+    """The arms with names that the user gives.
+
+    Args:
+        arms: The arms.
+        names: `OLD:NEW` texts.
+
+    Raises:
+        UserError: A text names no arm, or two arms would have one name.
+    """
+    new = {arm.name: arm.name for arm in arms}
+    for text in names:
+        old = next((arm.name for arm in arms if text.startswith(f"{arm.name}:")), None)
+        if old is None or text == f"{old}:":
+            raise UserError(
+                "no arm has this name",
+                where="--name",
+                expected=f"OLD:NEW with one of {'; '.join(new)}",
+                found=text,
+                todo="copy the old name from the table that compare prints",
+            )
+        new[old] = text[len(old) + 1 :]
+    if len(set(new.values())) < len(new):
+        raise UserError(
+            "two arms would have one name",
+            where="--name",
+            found="; ".join(new.values()),
+            todo="give each arm a name of its own",
+        )
+    return tuple(Arm(new[arm.name], arm.runs, arm.failed, arm.settings) for arm in arms)
+
+
+def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
+    """Settings that have two values or more within a scene, the telling ones first.
+
+    An option that only some runs have does not count: it belongs to a component that the others
+    lack, which differs itself, or to another version.
+    """
+    seen: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        for key, value in run.settings.items():
+            seen.setdefault((key, run.scene), set()).add(value)
+    varying = {key for (key, _), values in seen.items() if len(values) > 1}
+    rest = sorted(varying - set(_FIRST), key=lambda key: (key.count("."), key))
+    return (*(key for key in _FIRST if key in varying), *rest)
+
+
+def _values(settings: Settings, keys: Sequence[str]) -> tuple[str, ...]:
+    return tuple(settings.get(key, _ABSENT) for key in keys)
+
+
+def _names(
+    groups: Mapping[tuple[str, ...], Sequence[Run]], keys: Sequence[str]
+) -> dict[tuple[str, ...], str]:
+    """The first settings that tell all groups apart; none that adds nothing to those before."""
+    if len(groups) == 1:
+        return {key: _of_one(runs[0]) for key, runs in groups.items()}
+    chosen: list[int] = []
+    for index in range(len(keys)):
+        if _told_apart(groups, [*chosen, index]) > _told_apart(groups, chosen):
+            chosen.append(index)
+    return {key: _name(keys, key, chosen) for key in groups}
+
+
+def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -> str:
+    """What is set of the chosen settings; an option of a component that is not there is not."""
+    known = [index for index in chosen if values[index] != _ABSENT]
+    return ", ".join(_part(keys[index], values[index]) for index in known or chosen)
+
+
+def _told_apart(groups: Iterable[tuple[str, ...]], chosen: Sequence[int]) -> int:
+    return len({tuple(key[index] for index in chosen) for key in groups})
+
+
+def _part(key: str, value: str) -> str:
+    return f"{_SPOKEN.get(key, key)}={value}"
+
+
+def _of_one(run: Run) -> str:
+    """What the only arm is called: the parts that make it."""
+    named = [run.settings.get(key, "") for key in ("backbone", "sampler", "operator")]
+    return ", ".join([*filter(None, named), f"views={run.settings.get('views_per_step', '?')}"])
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbers by their size."""
+    return [
+        (int(part), "") if part.isdigit() else (-1, part) for part in _DIGITS.split(name) if part
+    ]

@@ -1,0 +1,1 @@
+"""What must agree before runs are compared: scenes, metrics, machines."""

@@ -1,0 +1,81 @@
+"""Figures compare only where they have one definition."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.run import Run
+
+#: The definition that holds for every metric: how renders are compared at all.
+_RENDERS: Final = "renders"
+
+
+def quantities_of(
+    runs: Sequence[Run], name: str, margin: float | None
+) -> tuple[tuple[Quantity, ...], list[str]]:
+    """The figures that can be compared, the main one first, and notes on those that cannot.
+
+    Args:
+        runs: The runs.
+        name: Name of the main figure.
+        margin: Its margin; by default the usual one.
+
+    Raises:
+        UserError: No run has the main figure, or runs define it, or how renders are compared,
+            differently.
+    """
+    offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
+    measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
+    if name not in measured:
+        raise UserError(
+            "no run has this figure",
+            where="--metric",
+            expected=f"one of {', '.join(measured)}" if measured else "a figure of held-out views",
+            found=name,
+            todo="choose another one, or measure it: crossgrad eval RUN --metrics NAME",
+        )
+    for key in (_RENDERS, name):
+        _check_definition(runs, key)
+    notes, kept = [], [name]
+    for key in measured:
+        if key == name:
+            continue
+        if len(_definitions(runs, key)) > 1:
+            notes.append(f"{key} is not compared: runs define it differently")
+        elif lacking := [run.name for run in runs if key not in _overall(run)]:
+            notes.append(f"{key} is not compared: {lacking[0]} and others did not measure it"
+                         if len(lacking) > 1 else
+                         f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
+        else:
+            kept.append(key)
+    return tuple(Quantity.of(key, margin if key == name else None) for key in kept), notes
+
+
+def _check_definition(runs: Sequence[Run], key: str) -> None:
+    found = _definitions(runs, key)
+    if len(found) > 1:
+        (first, one), (second, other), *_ = ((text, run) for text, run in found.items())
+        raise UserError(
+            f"runs define {key} differently"
+            if key != _RENDERS
+            else "runs compare renders by different rules",
+            where=f"{one}, {other}",
+            expected="one definition in summary.json",
+            found=f"{first!r} against {second!r}",
+            todo="measure them alike with `crossgrad eval RUN`, or compare runs of one version",
+        )
+
+
+def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
+    """Definition -> the first run that has it; runs that do not state one agree with all."""
+    found: dict[str, str] = {}
+    for run in runs:
+        text = (run.summary.get("definitions") or {}).get(key)
+        if text is not None:
+            found.setdefault(str(text), run.name)
+    return found
+
+
+def _overall(run: Run) -> dict[str, Any]:
+    return dict(run.summary.get("overall") or {})

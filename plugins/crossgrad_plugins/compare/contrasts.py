@@ -1,0 +1,110 @@
+"""Differences between two arms, pair by pair, with their verdicts."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+from crossgrad_plugins.compare.cells import Problem
+from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
+from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+
+#: A run -> its value; None where it has none.
+Reading: TypeAlias = Callable[[Run], float | None]
+#: Scene and seed -> the run of an arm.
+Runs: TypeAlias = Mapping[Problem, Run]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two runs on one scene with one seed."""
+
+    scene: str
+    seed: int
+    first: float
+    second: float
+
+    @property
+    def difference(self) -> float:
+        """The first minus the second."""
+        return self.first - self.second
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One arm against another one.
+
+    Attributes:
+        first: Name of an arm.
+        second: Name of another one.
+        where: Where they are compared, such as `at the end` or a regime.
+        quantity: What is compared.
+        pairs: The pairs.
+        estimate: The first minus the second; None without a pair.
+        verdict: What can be said about it, beside the other contrasts of its table.
+        inside: Whether runs were read before their ends, where their schedules went on.
+    """
+
+    first: str
+    second: str
+    where: str
+    quantity: Quantity
+    pairs: tuple[Pair, ...]
+    estimate: Estimate | None
+    verdict: Verdict = Verdict.INCONCLUSIVE
+    inside: bool = False
+
+    @property
+    def ahead(self) -> int:
+        """Pairs in which the first arm is better."""
+        return sum(self.quantity.better(pair.first, pair.second) for pair in self.pairs)
+
+    @property
+    def favours(self) -> str:
+        """The arm that is better by the estimate."""
+        center = 0.0 if self.estimate is None else self.estimate.center
+        return self.first if self.quantity.better(center, 0.0) else self.second
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the 90 % interval lies within the margin, whatever else it says."""
+        if self.estimate is None:
+            return False
+        low, high = self.estimate.narrow
+        return -self.quantity.margin < low and high < self.quantity.margin
+
+
+def contrast(
+    names: tuple[str, str],
+    runs: tuple[Runs, Runs],
+    quantity: Quantity,
+    reading: Reading,
+    where: str,
+) -> Contrast:
+    """One arm against another one; pairs in which a run has no value are left out."""
+    first, second = runs
+    pairs = []
+    for scene, seed in sorted(first.keys() & second.keys()):
+        values = reading(first[scene, seed]), reading(second[scene, seed])
+        if values[0] is not None and values[1] is not None:
+            pairs.append(Pair(scene, seed, values[0], values[1]))
+    found = None
+    if pairs:
+        differences = [pair.difference for pair in pairs]
+        found = estimate(differences, [pair.scene for pair in pairs], quantity.margin)
+    return Contrast(*names, where, quantity, tuple(pairs), found)
+
+
+def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
+    """The contrasts of one table with their verdicts; those without a pair are left out."""
+    family = [each for each in contrasts if each.estimate is not None]
+    found = verdicts([each.estimate for each in family if each.estimate is not None])
+    return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, found, strict=True))
+
+
+def couples(ranking: Sequence[str], baseline: str | None) -> list[tuple[str, str]]:
+    """Which arms are compared: each with the baseline, or each with all that rank below it."""
+    if baseline is not None:
+        return [(name, baseline) for name in ranking if name != baseline]
+    return [(a, b) for index, a in enumerate(ranking) for b in ranking[index + 1 :]]

@@ -1,0 +1,139 @@
+"""Paired differences with their intervals, beside the margin."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from crossgrad_plugins.compare.comparison import END, OVERALL, Comparison
+from crossgrad_plugins.compare.contrasts import Contrast
+from crossgrad_plugins.compare.cost import COSTS
+from crossgrad_plugins.compare.figures.style import (
+    FAINT,
+    INK,
+    MARKERS,
+    PAGE,
+    Drawn,
+    drawn,
+    literal,
+    new_figure,
+    styled,
+)
+from crossgrad_plugins.compare.statistics.verdict import Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: More rows than these would not fit on a page.
+MOST_ROWS = 24
+_COLORS = {
+    Verdict.DIFFERENT: "#D55E00",
+    Verdict.EQUIVALENT: "#009E73",
+    Verdict.INCONCLUSIVE: "#666666",
+}
+_TITLES = {cost.name: f"equal {cost.title}" for cost in COSTS}
+
+
+def draw_differences(comparison: Comparison) -> Drawn | None:
+    """All contrasts of the main figure; None with a single arm."""
+    rows = [*comparison.ends, *comparison.equal, *_by_regime(comparison)][:MOST_ROWS]
+    if not rows:
+        return None
+    scenes = comparison.scenes
+    with styled():
+        figure = new_figure(PAGE, 0.75 + 0.24 * (len(rows) + len(_headings(rows))))
+        ax = figure.subplots()
+        _margin(ax, comparison.quantity.margin)
+        ticks = _draw(ax, rows, scenes)
+        ax.set_yticks([place for place, _ in ticks], [text for _, text in ticks])
+        ax.set_ylim(ticks[-1][0] + 0.6, -0.6)
+        ax.grid(visible=False, axis="y")
+        ax.tick_params(axis="y", length=0)
+        ax.spines["left"].set_visible(False)
+        ax.set_xlabel(f"difference in {comparison.quantity.with_unit}, first minus second arm")
+        _key(ax, rows, scenes)
+        return drawn(
+            figure,
+            "differences",
+            "Paired differences",
+            "Each small sign is a pair of runs on one scene with one seed. The bar is the 95 % "
+            "interval, its thick part the 90 % interval, the large sign the estimate; the grey "
+            f"band is the margin of {comparison.quantity.margin:g} "
+            f"{comparison.quantity.unit}.".replace(" .", "."),
+        )
+
+
+def where_text(contrast: Contrast) -> str:
+    """Where a contrast was taken, as a row is called."""
+    text = _TITLES.get(contrast.where, contrast.where)
+    return f"{text} *" if contrast.inside else text
+
+
+def _by_regime(comparison: Comparison) -> list[Contrast]:
+    return [each for each in comparison.regimes if each.where not in {END, OVERALL}]
+
+
+def _headings(rows: Sequence[Contrast]) -> list[tuple[str, str]]:
+    return list(dict.fromkeys((row.first, row.second) for row in rows))
+
+
+def _margin(ax: "Axes", margin: float) -> None:
+    ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
+    ax.axvline(0.0, color=FAINT, linewidth=0.8)
+
+
+def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[tuple[float, str]]:
+    """Draws the rows below headings; answers the labels of the axis with their places."""
+    ticks: list[tuple[float, str]] = []
+    place = 0.0
+    for first, second in _headings(rows):
+        ax.text(0.0, place + 0.25, literal(f"{first}  \u2212  {second}"), fontweight="bold",
+                transform=ax.get_yaxis_transform())  # fmt: skip
+        place += 1.0
+        for row in rows:
+            if (row.first, row.second) == (first, second):
+                _row(ax, row, place, scenes)
+                ticks.append((place, f"{literal(where_text(row))}"))
+                place += 1.0
+    return ticks
+
+
+def _row(ax: "Axes", row: Contrast, place: float, scenes: Sequence[str]) -> None:
+    color = _COLORS[row.verdict]
+    for scene in scenes:
+        own = [pair.difference for pair in row.pairs if pair.scene == scene]
+        marker = MARKERS[scenes.index(scene) % len(MARKERS)]
+        ax.plot(
+            own, [place + 0.2] * len(own), marker, color=FAINT, alpha=0.55, markersize=2.4,
+            markeredgewidth=0,
+        )  # fmt: skip
+    found = row.estimate
+    if found is None:
+        return
+    if found.pairs > 1:
+        ax.plot(found.wide, [place - 0.12] * 2, color=color, linewidth=1.1)
+        ax.plot(found.narrow, [place - 0.12] * 2, color=color, linewidth=2.8)
+    ax.plot([found.center], [place - 0.12], "o", color=color, markersize=5, markeredgecolor=INK,
+            markeredgewidth=0.5)  # fmt: skip
+
+
+def _key(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
+    """What colours and signs mean; the axis shows the estimates and the narrow intervals."""
+    from matplotlib.lines import Line2D
+
+    present = [verdict for verdict in Verdict if any(row.verdict == verdict for row in rows)]
+    handles = [Line2D([], [], color=_COLORS[v], linewidth=2.8, label=str(v)) for v in present]
+    handles += [
+        Line2D([], [], color=FAINT, linestyle="", marker=MARKERS[index % len(MARKERS)],
+               markersize=3, label=literal(scene))
+        for index, scene in enumerate(scenes)
+    ]  # fmt: skip
+    ax.figure.legend(handles=handles, loc="outside upper left", ncols=6, borderaxespad=0.0)
+    _limit(ax, rows)
+
+
+def _limit(ax: "Axes", rows: Sequence[Contrast]) -> None:
+    """A row of two pairs has an interval of many dB; it runs out of the figure."""
+    dots = [pair.difference for row in rows for pair in row.pairs]
+    margin = rows[0].quantity.margin
+    low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
+    room = 0.25 * (high - low)
+    ax.set_xlim(low - room, high + room)

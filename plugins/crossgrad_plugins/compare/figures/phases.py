@@ -1,0 +1,69 @@
+"""Where the seconds went."""
+
+import numpy as np
+
+from crossgrad_plugins.compare.comparison import Comparison
+from crossgrad_plugins.compare.figures.style import (
+    COLORS,
+    FAINT,
+    PAGE,
+    Drawn,
+    drawn,
+    literal,
+    new_figure,
+    styled,
+)
+
+_OTHER = "other"
+_HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
+
+
+def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
+    """Arm -> phase -> milliseconds of a step, in the mean over its runs that recorded them."""
+    found: dict[str, dict[str, float]] = {}
+    for arm, by in comparison.main.items():
+        runs = [run for run in by.values() if run.number("step")]
+        recorded = [run.summary.get("seconds", {}).get("phases") or {} for run in runs]
+        each = [
+            {name: 1000.0 * seconds / (run.number("step") or 1.0) for name, seconds in own.items()}
+            for run, own in zip(runs, recorded, strict=True)
+            if own
+        ]
+        if each:
+            names = list(dict.fromkeys(name for own in each for name in own))
+            found[arm] = {n: float(np.mean([own.get(n, 0.0) for own in each])) for n in names}
+    return found
+
+
+def draw_phases(comparison: Comparison) -> Drawn | None:
+    """Milliseconds of a step by phase, a bar for each arm; None where no run recorded them."""
+    found = phases_of(comparison)
+    if not found:
+        return None
+    names = list(dict.fromkeys(name for own in found.values() for name in own))
+    colors = {
+        name: FAINT if name == _OTHER else COLORS[index % len(COLORS)]
+        for index, name in enumerate(names)
+    }
+    with styled():
+        figure = new_figure(PAGE, 0.85 + 0.3 * len(found))
+        ax = figure.subplots()
+        for place, own in enumerate(found.values()):
+            left = 0.0
+            for index, name in enumerate(names):
+                wide = own.get(name, 0.0)
+                ax.barh(place, wide, left=left, height=0.62, color=colors[name], alpha=0.85,
+                        hatch=_HATCHES[index % len(_HATCHES)], edgecolor="white", linewidth=0.4,
+                        label=None if place else name.replace("_", " "))  # fmt: skip
+                left += wide
+        ax.set_yticks(range(len(found)), [literal(arm) for arm in found])
+        ax.invert_yaxis()
+        ax.grid(visible=False, axis="y")
+        ax.set_xlabel("milliseconds of a training step")
+        figure.legend(loc="outside upper left", ncols=5, borderaxespad=0.0)
+        return drawn(
+            figure,
+            "phases",
+            "Where the seconds went",
+            "Seconds of the clock by phase of a step, in the mean over runs.",
+        )

@@ -1,0 +1,180 @@
+"""How all figures look: sizes of print, colours for any colour vision, light and dark pages."""
+
+import io
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Okabe and Ito's colours without their yellow, which is hard to see on white.
+COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00")
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+DASHES: Final = ("-", (0, (5, 1.6)), (0, (1, 1)), (0, (4, 1.2, 1, 1.2)))
+INK, FAINT, GRID = "#1a1a1a", "#666666", "#e2e2e2"
+#: Inches: a page of a paper with margins, and a column.
+PAGE, COLUMN = 7.0, 3.4
+_RC: Final[Any] = {
+    "axes.edgecolor": FAINT,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.labelcolor": INK,
+    "axes.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 8.5,
+    "font.size": 8,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 3.5,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "crossgrad",
+    "text.color": INK,
+    "text.parse_math": False,
+    "xtick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.color": FAINT,
+    "ytick.labelcolor": INK,
+    "ytick.labelsize": 7.5,
+}
+_DPI: Final = 220
+_SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
+_ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure in all its forms.
+
+    Attributes:
+        name: Its name, for files and ids.
+        title: What it is called.
+        caption: What it shows, for the page.
+        svg: For the page: colours are variables of its style sheet.
+        pdf: For a paper.
+        png: For everything else.
+    """
+
+    name: str
+    title: str
+    caption: str
+    svg: str
+    pdf: bytes
+    png: bytes
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an arm looks in every figure."""
+
+    color: str
+    marker: str
+    dash: Any
+
+
+def looks(arms: Sequence[str]) -> dict[str, Look]:
+    """Arm -> how it looks; colour, marker and line differ at once, for print without colours."""
+    return {
+        arm: Look(
+            COLORS[index % len(COLORS)],
+            MARKERS[index % len(MARKERS)],
+            DASHES[(index + index // len(COLORS)) % len(DASHES)],
+        )
+        for index, arm in enumerate(arms)
+    }
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Figures inside have this style; signs that a font lacks are no warning."""
+    from matplotlib import rc_context
+
+    with rc_context(_RC), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """An empty figure of that size in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
+    """The figure in all its forms; its layout is worked out once, not for each of them."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+    png, pdf, svg = io.BytesIO(), io.BytesIO(), io.StringIO()
+    # Not by `savefig`, which works out the layout once more for every form.
+    for_png: Any = FigureCanvasAgg(figure)
+    for_png.print_png(png)
+    for_pdf: Any = FigureCanvasPdf(figure)
+    for_pdf.print_pdf(pdf, metadata={"CreationDate": None})
+    figure.patch.set_visible(False)
+    for ax in figure.axes:
+        ax.patch.set_visible(False)
+    for_svg: Any = FigureCanvasSVG(figure)
+    for_svg.print_svg(svg, metadata={"Date": None})
+    return Drawn(
+        name, title, caption, _for_page(svg.getvalue(), name), pdf.getvalue(), png.getvalue()
+    )
+
+
+def _for_page(svg: str, name: str) -> str:
+    """The SVG element alone, with ids of its own and colours that the page chooses."""
+    found = _SVG.search(svg)
+    text = _ID.sub(rf"\1{name}-", found[0] if found else svg)
+    for variable, color in variables().items():
+        text = text.replace(color, f"var(--{variable})").replace(
+            color.lower(), f"var(--{variable})"
+        )
+    return text
+
+
+def variables() -> dict[str, str]:
+    """Name of a variable of the page's style sheet -> the colour that stands for it in figures."""
+    series = {f"series-{number}": color for number, color in enumerate(COLORS)}
+    return {"ink": INK, "faint": FAINT, "grid": GRID, **series}
+
+
+def literal(text: str) -> str:
+    """Text for a legend, which hides what begins with an underscore."""
+    return f"'{text}'" if text.startswith("_") else text
+
+
+def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
+    """The arms above all panels, as they are called in `axes`."""
+    handles, labels = axes.get_legend_handles_labels()
+    known = dict(zip(labels, handles, strict=True))
+    shown = [literal(arm) for arm in arms if literal(arm) in known]
+    longest = max((len(label) for label in shown), default=1)
+    figure.legend(
+        [known[label] for label in shown],
+        shown,
+        loc="outside upper left",
+        ncols=max(1, min(columns, len(shown), 110 // (longest + 8))),
+        handlelength=2.6,
+        columnspacing=1.4,
+        borderaxespad=0.0,
+    )

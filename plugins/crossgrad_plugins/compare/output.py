@@ -1,0 +1,62 @@
+"""The folder of a comparison: only its own files are ever replaced."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.commands import UserError, check_folder, disk_errors, write_atomically
+
+#: The page; a folder that has it and the mark in it is a comparison.
+PAGE: Final = "index.html"
+#: Stands in the head of each page that compare wrote.
+MARK: Final = '<meta name="generator" content="crossgrad compare">'
+FIGURES: Final = "figures"
+_BEGINNING: Final = 2000
+
+
+def check_free(folder: Path) -> None:
+    """Refuses a folder with anything in it that is not an earlier comparison.
+
+    Raises:
+        UserError: What is in the way, and what to do.
+    """
+    check_folder(folder)
+    if not folder.is_dir() or is_comparison(folder) or not any(folder.iterdir()):
+        return
+    raise UserError(
+        "the folder holds something else than a comparison",
+        where=folder,
+        expected="a new folder, an empty one, or one that compare wrote",
+        found=", ".join(sorted(path.name for path in folder.iterdir())[:5]),
+        todo="choose another --out, or remove it",
+    )
+
+
+def is_comparison(folder: Path) -> bool:
+    """Whether compare wrote this folder."""
+    page = folder / PAGE
+    if not page.is_file():
+        return False
+    with page.open(encoding="utf-8", errors="replace") as file:
+        return MARK in file.read(_BEGINNING)
+
+
+def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) -> None:
+    """Writes the files, the page last, and removes those that an earlier comparison left.
+
+    Args:
+        folder: The folder, free or a comparison.
+        files: Path below the folder -> content.
+        owned: Patterns of what a comparison writes.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
+    """
+    with disk_errors(folder):
+        (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+        for pattern in owned:
+            for path in folder.glob(pattern):
+                if str(path.relative_to(folder)) not in files:
+                    path.unlink()
+    for name in sorted(files, key=lambda name: name == PAGE):
+        write_atomically(folder / name, files[name])

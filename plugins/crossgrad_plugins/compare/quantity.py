@@ -1,0 +1,67 @@
+"""The figure that is compared: its unit, which way is better, and the margin."""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+
+class _Kind(NamedTuple):
+    """What holds for all figures whose names begin alike; the margin counts as no difference."""
+
+    unit: str
+    decimals: int
+    margin: float
+
+
+_KINDS: Final = {
+    "psnr": _Kind("dB", 2, 0.1),
+    "ssim": _Kind("", 4, 0.005),
+    "lpips": _Kind("", 4, 0.005),
+}
+_OTHER: Final = _Kind("", 4, 0.005)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A figure of held-out views.
+
+    Attributes:
+        name: Its name in the results, such as `psnr`.
+        label: What people call it.
+        unit: Its unit; empty where it has none.
+        decimals: How many are shown.
+        margin: What counts as no difference.
+        falls: Whether less is better.
+    """
+
+    name: str
+    label: str
+    unit: str
+    decimals: int
+    margin: float
+    falls: bool = False
+
+    @classmethod
+    def of(cls, name: str, margin: float | None = None) -> "Quantity":
+        """The figure of that name, with its usual margin unless another one is given."""
+        start = next((start for start in _KINDS if name.startswith(start)), "")
+        kind = _KINDS.get(start, _OTHER)
+        label = " ".join([start.upper(), *name[len(start) :].strip("_").split("_")]).strip()
+        wanted = kind.margin if margin is None else margin
+        return cls(name, label, kind.unit, kind.decimals, wanted, falls=start == "lpips")
+
+    @property
+    def with_unit(self) -> str:
+        """Its label for an axis or a table."""
+        return f"{self.label} ({self.unit})" if self.unit else self.label
+
+    def better(self, first: float, second: float) -> bool:
+        """Whether the first of two values is the better one."""
+        return first < second if self.falls else first > second
+
+    def shown(self, value: float) -> str:
+        """A value without its unit."""
+        return f"{value:.{self.decimals}f}"
+
+    def difference(self, value: float) -> str:
+        """A difference with its sign and unit."""
+        return f"{value:+.{self.decimals}f} {self.unit}".rstrip()

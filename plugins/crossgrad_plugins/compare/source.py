@@ -1,0 +1,158 @@
+"""From folders to runs: what is broken, unfinished or of another kind is sorted out."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pydantic import BaseModel
+
+from crossgrad_core.commands import RunConfig, UserError, find_runs, read_results, read_rows
+from crossgrad_plugins.compare.run import Run
+
+if TYPE_CHECKING:
+    from crossgrad_core.commands import RunResults
+
+#: The table of a sweep, beside the folder of its runs.
+_PLAN: Final = "runs.csv"
+_ID, _LABEL = "id", "label"
+
+
+class _Summary(BaseModel):
+    """What a comparison takes for granted in summary.json, of any version."""
+
+    status: str
+    scene: str
+    step: int
+    overall: dict[str, float | None] | None
+    regimes: dict[str, dict[str, float | None]]
+    notes: list[str] = []
+    definitions: dict[str, str] = {}
+    environment: dict[str, Any] = {}
+    seconds: dict[str, Any] = {}
+
+
+@dataclass
+class Found:
+    """What lies in the folders.
+
+    Attributes:
+        runs: The runs that finished.
+        failed: The runs that failed: they never reach a quality.
+        left_out: Folder -> why it is not compared.
+    """
+
+    runs: list[Run] = field(default_factory=list)
+    failed: list[Run] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def read_runs(places: Sequence[Path], *, skip_broken: bool) -> Found:
+    """Reads every run at or below the places, each folder once.
+
+    Args:
+        places: Folders of runs, or folders with runs below.
+        skip_broken: Leave out a run with a damaged file, instead of refusing to go on.
+
+    Raises:
+        UserError: A place holds no run, or a file of a run is damaged.
+    """
+    found = Found()
+    folders = list(dict.fromkeys(folder for place in places for folder in _folders(place)))
+    names = _short_names(folders)
+    labels = {parent: _labels(parent) for parent in {folder.parent for folder in folders}}
+    for folder in folders:
+        label = labels[folder.parent].get(folder.name)
+        try:
+            _sort_in(found, names[folder], read_results(folder), label)
+        except UserError as error:
+            if not skip_broken:
+                raise _broken(error) from error
+            found.left_out[names[folder]] = f"{error.what}: {error.where}"
+    return found
+
+
+def _folders(place: Path) -> Iterator[Path]:
+    found = find_runs(place) if place.is_dir() else ()
+    if not found:
+        raise UserError(
+            "no run to compare",
+            where=place,
+            expected="the folder of a run, or one with runs below it",
+            found="no config.yaml" if place.is_dir() else "no such folder",
+            todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
+        )
+    yield from (folder.resolve() for folder in found)
+
+
+def _broken(error: UserError) -> UserError:
+    return UserError(
+        error.what,
+        where=error.where,
+        expected=error.expected,
+        found=error.found,
+        todo=f"{error.todo}; --skip-broken leaves this run out and compares the others",
+    )
+
+
+def _sort_in(found: Found, name: str, results: "RunResults", label: str | None) -> None:
+    if results.summary is None:
+        found.left_out[name] = "has not ended: no summary.json"
+        return
+    _check_summary(results)
+    run = Run(name, results, results.summary, _config(results), label)
+    if run.status == "failed":
+        found.failed.append(run)
+        found.left_out[name] = f"failed: {run.summary.get('error')}"
+    elif run.status != "finished":
+        found.left_out[name] = "was stopped before its end"
+    elif not results.rows:
+        found.left_out[name] = "was never evaluated: metrics.csv has no row"
+    else:
+        found.runs.append(run)
+
+
+def _check_summary(results: "RunResults") -> None:
+    try:
+        _Summary.model_validate(results.summary)
+    except ValueError as error:
+        raise UserError(
+            "unreadable summary.json",
+            where=results.folder / "summary.json",
+            found=str(error),
+            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+        ) from error
+
+
+def _config(results: "RunResults") -> dict[str, object]:
+    """The configuration with the names and the defaults of this version."""
+    try:
+        return RunConfig.model_validate(results.config).model_dump(mode="json")
+    except ValueError as error:
+        raise UserError(
+            "unreadable configuration of a run",
+            where=results.folder / "config.yaml",
+            found=str(error),
+            todo="restore the file, or read the run with the version that wrote it",
+        ) from error
+
+
+def _labels(folder: Path) -> dict[str, str]:
+    """Name of a run's folder -> what its sweep calls it; none where no sweep wrote the folder."""
+    plan = folder.parent / _PLAN
+    if not plan.is_file():
+        return {}
+    header, *lines = read_rows(plan, "the table of the sweep", "restore it, or remove it") or [[]]
+    if not {_ID, _LABEL} <= set(header):
+        return {}
+    at, called = header.index(_ID), header.index(_LABEL)
+    return {line[at]: line[called] for line in lines if len(line) == len(header)}
+
+
+def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
+    """The folders below the last one that they share."""
+    shared = 0
+    parts = [folder.parts for folder in folders]
+    while parts and all(len(p) > shared + 1 and p[shared] == parts[0][shared] for p in parts):
+        shared += 1
+    return {folder: "/".join(folder.parts[shared:]) for folder in folders}

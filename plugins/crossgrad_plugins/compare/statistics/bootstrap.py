@@ -1,0 +1,93 @@
+"""The interquartile mean of pairs from several scenes, by a bootstrap that is stratified by scene.
+
+A plain percentile bootstrap of few pairs is too narrow for two reasons. Resampling m values of a
+scene has (m - 1) / m of their variance, with three seeds two thirds of it: deviations within a
+scene are stretched by sqrt(m / (m - 1)) (Rao and Wu 1988). And its quantiles are those of a normal
+law where Student's would be right: the levels are moved accordingly, Hesterberg's expanded
+percentile interval (2015), with n - S degrees of freedom for n pairs of S scenes. Without both,
+12 pairs of 4 scenes found a difference between equal methods in 12 % of all trials, with them in
+5 % (tests/unit/compare/test_harness.py).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.compare.statistics.iqm import iqm
+from crossgrad_plugins.compare.statistics.student import quantile
+
+DRAWS: Final = 2000
+_SEED: Final = 20_150_101
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """The estimates of many resampled sets of pairs.
+
+    Attributes:
+        draws: [DRAWS] estimates, sorted.
+        freedom: Degrees of freedom of the variance within scenes.
+    """
+
+    draws: NDArray[np.float64]
+    freedom: int
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64], scenes: Sequence[str]) -> "Bootstrap":
+        """Resamples pairs within their scenes; scenes with a single pair are resampled together.
+
+        Args:
+            values: [n] differences, n >= 2.
+            scenes: The scene of each.
+        """
+        rng = np.random.default_rng(_SEED)
+        strata = _strata(scenes)
+        resampled = np.empty((DRAWS, len(values)))
+        for stratum in strata:
+            own, count = values[stratum], len(stratum)
+            drawn = own[rng.integers(0, count, (DRAWS, count))]
+            stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
+            resampled[:, stratum] = own.mean() + stretch * (drawn - own.mean())
+        return cls(np.sort(iqm(resampled)), max(1, len(values) - len(strata)))
+
+    def interval(self, level: float) -> tuple[float, float]:
+        """The two-sided interval of a level such as 0.95."""
+        from scipy.special import ndtr
+
+        tail = float(ndtr(-quantile(0.5 + level / 2.0, self.freedom)))
+        low, high = np.quantile(self.draws, [tail, 1.0 - tail])
+        return float(low), float(high)
+
+    def lower_tail(self, border: float) -> float:
+        """p-value of an estimate that is at most `border`."""
+        return self._tail(_share(self.draws, border))
+
+    def upper_tail(self, border: float) -> float:
+        """p-value of an estimate that is at least `border`."""
+        return self._tail(1.0 - _share(self.draws, border))
+
+    def _tail(self, share: float) -> float:
+        """What a share of the draws stands for, given that the intervals are expanded."""
+        from scipy.special import ndtri, stdtr
+
+        share = min(max(share, 0.5 / DRAWS), 1.0 - 0.5 / DRAWS)
+        return float(stdtr(self.freedom, ndtri(share)))
+
+
+def _share(draws: NDArray[np.float64], border: float) -> float:
+    """Share of sorted draws below a border; those on it count half."""
+    below = int(np.searchsorted(draws, border))
+    up_to = int(np.searchsorted(draws, border, side="right"))
+    return (below + up_to) / (2 * len(draws))
+
+
+def _strata(scenes: Sequence[str]) -> list[NDArray[np.intp]]:
+    names = np.asarray(scenes)
+    strata = [np.flatnonzero(names == name) for name in dict.fromkeys(scenes)]
+    single = [each for each in strata if len(each) == 1]
+    several = [each for each in strata if len(each) > 1]
+    return [*several, np.concatenate(single)] if single else several

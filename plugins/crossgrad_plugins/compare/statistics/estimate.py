@@ -1,0 +1,97 @@
+"""What pairs of runs say about a difference: an estimate, intervals and p-values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.compare.statistics import student
+from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
+from crossgrad_plugins.compare.statistics.iqm import iqm
+
+#: From so many pairs on the interval comes from the bootstrap.
+BOOTSTRAP_FROM: Final = 10
+#: Levels of the interval that shows a difference and of the one that shows equivalence.
+WIDE, NARROW = 0.95, 0.90
+MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
+_UNKNOWN = (-inf, inf)
+
+Interval: TypeAlias = tuple[float, float]
+_Found: TypeAlias = tuple[float, Interval, Interval, float, float]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A difference with its uncertainty.
+
+    Attributes:
+        pairs: Number of pairs.
+        scenes: Number of scenes that they come from.
+        center: The estimate: the mean below 10 pairs, the interquartile mean from there on.
+        method: Which of the two, and where the interval comes from.
+        wide: The 95 % interval; it shows a difference where it excludes zero.
+        narrow: The 90 % interval; it shows equivalence where it lies within the margin.
+        deviation: Standard deviation of the pairs' differences; NaN for a single pair.
+        p_different: Two-sided p-value of no difference.
+        p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
+        needed: Pairs after which the 90 % interval is as narrow as the margin; None where that
+            cannot be told.
+    """
+
+    pairs: int
+    scenes: int
+    center: float
+    method: str
+    wide: Interval
+    narrow: Interval
+    deviation: float
+    p_different: float
+    p_equivalent: float
+    needed: int | None
+
+
+def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
+    """The estimate from differences of pairs.
+
+    Args:
+        differences: One per pair, all finite; at least one.
+        scenes: The scene of each pair.
+        margin: What counts as no difference in practice.
+    """
+    values = np.asarray(differences, dtype=np.float64)
+    deviation = float(values.std(ddof=1)) if len(values) > 1 else nan
+    enough = len(values) >= BOOTSTRAP_FROM
+    found = _by_bootstrap(values, scenes, margin) if enough else _by_student(values, margin)
+    center, wide, narrow, different, equivalent = found
+    return Estimate(
+        pairs=len(values),
+        scenes=len(set(scenes)),
+        center=center,
+        method=IQM if enough else MEAN,
+        wide=wide,
+        narrow=narrow,
+        deviation=deviation,
+        p_different=different,
+        p_equivalent=equivalent,
+        needed=student.pairs_needed(deviation, margin) if isfinite(deviation) else None,
+    )
+
+
+def _by_student(values: NDArray[np.float64], margin: float) -> _Found:
+    center = float(values.mean())
+    if len(values) == 1:
+        return center, _UNKNOWN, _UNKNOWN, nan, nan
+    law = student.Law.of(values)
+    equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
+    different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
+    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent
+
+
+def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: float) -> _Found:
+    law = Bootstrap.of(values, scenes)
+    equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
+    different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
+    return float(iqm(values)), law.interval(WIDE), law.interval(NARROW), different, equivalent

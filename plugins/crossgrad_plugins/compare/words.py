@@ -1,0 +1,196 @@
+"""What was found, in plain words: what won, by how much, how sure, at what cost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isinf, isnan
+
+from crossgrad_plugins.compare.comparison import Comparison
+from crossgrad_plugins.compare.contrasts import Contrast
+from crossgrad_plugins.compare.cost import COSTS
+from crossgrad_plugins.compare.statistics.verdict import Verdict
+
+_TITLES = {cost.name: cost.title for cost in COSTS}
+#: Of many arms, so many are named in one sentence.
+_MOST_NAMED = 6
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """A statement and what supports it."""
+
+    claim: str
+    support: str
+
+
+def headline(comparison: Comparison) -> tuple[Sentence, ...]:
+    """The first things to know."""
+    if not comparison.ends:
+        return (_alone(comparison),)
+    if len(comparison.ends) == 1:
+        only = comparison.ends[0]
+        found = [Sentence(claim(only), support(only))]
+    elif comparison.baseline is not None:
+        found = [Sentence(claim(each), support(each)) for each in comparison.ends]
+    else:
+        found = _of_the_best(comparison)
+    return (*found, *_equal_costs(comparison))
+
+
+def claim(contrast: Contrast) -> str:
+    """What is said about two arms."""
+    found = contrast.estimate
+    if found is None:
+        return f"{contrast.first} and {contrast.second} share no scene with the same seed"
+    better = contrast.favours
+    worse = contrast.second if better == contrast.first else contrast.first
+    size = _size(contrast)
+    if contrast.verdict is Verdict.DIFFERENT:
+        small = f", by less than the margin of {_margin(contrast)}" if contrast.is_small else ""
+        return f"{better} is better than {worse} by {size}{small}"
+    if contrast.verdict is Verdict.EQUIVALENT:
+        return f"{contrast.first} and {contrast.second} are equivalent within {_margin(contrast)}"
+    return f"Inconclusive: {better} is {size} ahead of {worse}, which may be noise"
+
+
+def support(contrast: Contrast) -> str:
+    """How sure that is."""
+    found = contrast.estimate
+    if found is None:
+        return ""
+    equivalent = contrast.verdict is Verdict.EQUIVALENT
+    interval = found.narrow if equivalent else found.wide
+    level = "90 %" if equivalent else "95 %"
+    parts = [f"{level} interval {interval_text(contrast, interval)}"] if found.pairs > 1 else []
+    parts.append(f"{contrast.ahead} of {_count(found.pairs, 'pair')} in favour of {contrast.first}")
+    parts.append(_count(found.scenes, "scene"))
+    if contrast.verdict is Verdict.INCONCLUSIVE:
+        parts.append(needed_text(contrast))
+    return ", ".join(parts)
+
+
+def needed_text(contrast: Contrast) -> str:
+    """How many pairs would settle it."""
+    found = contrast.estimate
+    if found is None or found.pairs == 1:
+        return "one pair says nothing about noise: run more seeds"
+    margin = _margin(contrast)
+    if found.needed is None:
+        return f"the noise is far above the margin of {margin}"
+    if found.needed <= found.pairs:
+        return f"the difference is too close to the margin of {margin} for {found.pairs} pairs"
+    return f"n \u2265 {found.needed} pairs needed to tell {margin} at this noise"
+
+
+def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
+    """An interval with its signs and unit."""
+    if isinf(interval[0]):
+        return "unknown"
+    digits, unit = contrast.quantity.decimals, contrast.quantity.unit
+    return f"{interval[0]:+.{digits}f} to {interval[1]:+.{digits}f} {unit}".rstrip()
+
+
+def noise_sentence(comparison: Comparison) -> str:
+    """The floor of noise by scene."""
+    quantity = comparison.quantity
+    lacking = [scene for scene in comparison.scenes if scene not in comparison.noise]
+    known = [
+        f"{scene} {spread:.{quantity.decimals + 1}f}"
+        for scene, (spread, _) in comparison.noise.items()
+    ]
+    unit = f" {quantity.unit}" if quantity.unit else ""
+    parts = [f"{', '.join(known)}{unit}"] if known else []
+    if lacking:
+        parts.append(f"unknown on {', '.join(lacking)}: one seed")
+    return "; ".join(parts)
+
+
+def _alone(comparison: Comparison) -> Sentence:
+    if len(comparison.arms) > 1:
+        return Sentence(
+            "The arms share no scene with the same seed: nothing is paired",
+            "run them on the same scenes with the same seeds",
+        )
+    quantity = comparison.quantity
+    by = comparison.standing[comparison.arms[0].name]
+    finals = ", ".join(
+        f"{scene} {quantity.shown(each.mean)} {quantity.unit}".rstrip()
+        + ("" if isnan(each.spread) else f" \u00b1 {each.spread:.{quantity.decimals}f}")
+        for scene, each in by.items()
+    )
+    return Sentence("One arm: there is nothing to compare it with", finals)
+
+
+def _of_the_best(comparison: Comparison) -> list[Sentence]:
+    """What the leading arm is to the others."""
+    leader = comparison.ranking[0]
+    own = [each for each in comparison.ends if leader in {each.first, each.second}]
+    groups = {v: [c for c in own if c.verdict is v] for v in Verdict}
+    found = [Sentence(f"{leader} ends best", _against(groups[Verdict.DIFFERENT], "better than"))]
+    for verdict, words in (
+        (Verdict.EQUIVALENT, "equivalent to"),
+        (Verdict.INCONCLUSIVE, "not told apart from"),
+    ):
+        if groups[verdict]:
+            found.append(
+                Sentence(f"It is {words} {_listed(groups[verdict])}", _why(groups[verdict]))
+            )
+    return found
+
+
+def _against(contrasts: Sequence[Contrast], words: str) -> str:
+    if not contrasts:
+        return "but it is surely better than no other arm"
+    shown = [
+        f"{each.second} by {_size(each)} ({interval_text(each, each.estimate.wide)})"
+        for each in contrasts[:_MOST_NAMED]
+        if each.estimate is not None
+    ]
+    more = len(contrasts) - len(shown)
+    return f"{words} {', '.join(shown)}{f' and {more} more' if more else ''}"
+
+
+def _listed(contrasts: Sequence[Contrast]) -> str:
+    names = [each.second for each in contrasts]
+    shown = ", ".join(names[:_MOST_NAMED])
+    return shown if len(names) <= _MOST_NAMED else f"{shown} and {len(names) - _MOST_NAMED} more"
+
+
+def _why(contrasts: Sequence[Contrast]) -> str:
+    first = contrasts[0]
+    if first.verdict is Verdict.EQUIVALENT:
+        return f"within {_margin(first)}"
+    needed = [c.estimate.needed for c in contrasts if c.estimate and c.estimate.needed]
+    pairs = max(c.estimate.pairs for c in contrasts if c.estimate)
+    if not needed or max(needed) <= pairs:
+        return f"differences too close to the margin of {_margin(first)} for {pairs} pairs"
+    return f"n \u2265 {max(needed)} pairs needed to tell {_margin(first)}, there are {pairs}"
+
+
+def _equal_costs(comparison: Comparison) -> list[Sentence]:
+    """What holds at equal costs, of the two arms of the first sentence."""
+    if not comparison.ends:
+        return []
+    couple = comparison.ends[0].first, comparison.ends[0].second
+    return [
+        Sentence(f"At equal {_TITLES[each.where]}: {_lowered(claim(each))}", support(each))
+        for each in comparison.equal
+        if (each.first, each.second) == couple
+    ]
+
+
+def _lowered(text: str) -> str:
+    return text.replace("Inconclusive", "inconclusive", 1)
+
+
+def _size(contrast: Contrast) -> str:
+    center = 0.0 if contrast.estimate is None else contrast.estimate.center
+    quantity = contrast.quantity
+    return f"{abs(center):.{quantity.decimals}f} {quantity.unit}".rstrip()
+
+
+def _margin(contrast: Contrast) -> str:
+    return f"{contrast.quantity.margin:g} {contrast.quantity.unit}".rstrip()
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

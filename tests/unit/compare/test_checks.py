@@ -1,0 +1,140 @@
+"""What does not compare is refused, with the reason and the way out."""
+
+from pathlib import Path
+
+import pytest
+from support.run_folders import RunFolder
+
+from crossgrad_core.errors import UserError
+from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.cost import ClockChoice
+from crossgrad_plugins.compare.source import read_runs
+
+LOADED = {"load": {"mean": 5.0, "max": 9.0}}
+
+
+def comparison(folder: Path, *runs: RunFolder, **options):
+    for number, run in enumerate(runs):
+        run.write(folder / f"run-{number}")
+    return compared(read_runs([folder], skip_broken=False), Options(**options))
+
+
+def costs(found):
+    return [cost.name for cost in found.costs]
+
+
+@pytest.mark.parametrize(
+    ("other", "what", "found"),
+    [
+        ({"held_out": ("a/1.jpg", "a/2.jpg", "b/1.jpg", "c/9.jpg")}, "held-out views", "c/9.jpg"),
+        ({"photos": "photos: 800 x 600 px (16) from images/, not resized"}, "sizes", "800 x 600"),
+        (
+            {"photos": "photos: 400 x 300 px (16) from images/, 16 resized (box)"},
+            "resize filters",
+            "16 resized (box)",
+        ),
+        ({"definitions": {"psnr": "of means"}}, "define psnr differently", "of means"),
+        ({"definitions": {"renders": "not rounded"}}, "different rules", "not rounded"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_does_not_compare_is_refused(tmp_path, other, what, found):
+    with pytest.raises(UserError, match=what) as error:
+        comparison(tmp_path, RunFolder(), RunFolder(views_per_step=2, **other))
+    assert found in error.value.found
+    assert "run-0" in error.value.where
+    assert "run-1" in error.value.where
+    assert error.value.todo
+
+
+def test_two_scenes_of_one_name_are_refused(tmp_path):
+    first, second = RunFolder().write(tmp_path / "1"), RunFolder(seed=1).write(tmp_path / "2")
+    scene = (first / "scene.json").read_text().replace('"sha256": "city"', '"sha256": "other"')
+    (second / "scene.json").write_text(scene)
+    with pytest.raises(UserError, match="different photos"):
+        compared(read_runs([tmp_path], skip_broken=False), Options())
+
+
+def test_another_training_split_is_refused(tmp_path):
+    first, second = RunFolder().write(tmp_path / "1"), RunFolder(seed=1).write(tmp_path / "2")
+    scene = (first / "scene.json").read_text().replace('"trained": true', '"trained": false', 1)
+    (second / "scene.json").write_text(scene)
+    with pytest.raises(UserError, match="trained on different photos"):
+        compared(read_runs([tmp_path], skip_broken=False), Options())
+
+
+def test_figures_of_other_metrics_are_left_out_with_a_note(tmp_path):
+    found = comparison(tmp_path, RunFolder(), RunFolder(seed=1, definitions={"ssim": "other"}))
+    assert [quantity.name for quantity in found.quantities] == ["psnr"]
+    assert any("ssim is not compared" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"cpu": "Another Processor"},
+        {"cpu_cores": 64},
+        {"torch_threads": 2},
+        {"gpu": "A GPU"},
+        LOADED,
+        {"calibration": {"rate": 2.0}},
+    ],
+    ids=str,
+)
+def test_seconds_of_another_machine_are_not_drawn(tmp_path, environment):
+    usual = {"calibration": {"rate": 1.0}} if "calibration" in environment else {}
+    runs = RunFolder(environment=usual), RunFolder(seed=1, environment=environment)
+    found = comparison(tmp_path, *runs)
+    assert costs(found) == ["views", "steps"]
+    assert any("seconds are not compared" in note for note in found.notes)
+    with pytest.raises(UserError, match="seconds of these runs do not compare") as error:
+        compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.WALL))
+    assert "leave --clock out" in error.value.todo
+
+
+def test_a_busy_machine_leaves_cpu_seconds(tmp_path):
+    runs = [RunFolder(seed=n, cpu_seconds=50.0, environment=LOADED) for n in range(2)]
+    assert costs(comparison(tmp_path, *runs)) == ["cpu_seconds", "views", "steps"]
+    with pytest.raises(UserError, match="--clock cpu"):
+        compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.WALL))
+
+
+@pytest.mark.parametrize(
+    ("clock", "expected"),
+    [("auto", ["seconds", "cpu_seconds"]), ("wall", ["seconds"]), ("cpu", ["cpu_seconds"]),
+     ("none", [])],
+)  # fmt: skip
+def test_the_clock_can_be_chosen(tmp_path, clock, expected):
+    runs = [RunFolder(seed=n, cpu_seconds=50.0) for n in range(2)]
+    found = comparison(tmp_path, *runs, clock=ClockChoice(clock))
+    assert costs(found) == [*expected, "views", "steps"]
+
+
+def test_cpu_seconds_of_several_threads_do_not_compare(tmp_path):
+    many = {"torch_threads": 2}
+    runs = [RunFolder(seed=n, cpu_seconds=50.0, environment=many) for n in range(2)]
+    assert costs(comparison(tmp_path, *runs)) == ["seconds", "views", "steps"]
+
+
+def test_runs_without_cpu_seconds_have_no_such_axis_and_no_note(tmp_path):
+    found = comparison(tmp_path, RunFolder(), RunFolder(seed=1))
+    assert costs(found) == ["seconds", "views", "steps"]
+    assert found.notes == ()
+
+
+def test_regimes_that_differ_leave_the_overall_figures(tmp_path):
+    other = RunFolder(views_per_step=2, regimes={"street": 1.0, "air": -1.0})
+    found = comparison(tmp_path, RunFolder(), other)
+    assert [each.where for each in found.ends] == ["at the end"]
+    assert found.regimes == ()
+    assert any("regimes are not compared on city" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [({"metric": "lpips"}, "no run has this figure"), ({"baseline": "x"}, "no arm has this name")],
+)
+def test_names_that_are_not_there_are_refused(tmp_path, options, match):
+    with pytest.raises(UserError, match=match) as error:
+        comparison(tmp_path, RunFolder(), RunFolder(views_per_step=2), **options)
+    assert "psnr" in error.value.expected or "views=1" in error.value.expected

@@ -1,0 +1,76 @@
+"""The harness finds what is there and nothing else: arms of known difference, many times over.
+
+The noise is that of a pair's difference, except where it is said to be that of a run: then the
+difference of a pair has the square root of 2 times as much.
+"""
+
+import numpy as np
+import pytest
+
+from crossgrad_plugins.compare.statistics.estimate import estimate
+from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+
+TRIALS = 200
+NOISE, MARGIN = 0.1, 0.1
+NORMAL = "normal"
+HEAVY = "Student's t with 3 degrees of freedom"
+SKEWED = "exponential"
+
+
+def draws(law, rng, size):
+    """Draws with a mean of 0 and a standard deviation of 1."""
+    return {
+        NORMAL: lambda: rng.standard_normal(size),
+        HEAVY: lambda: rng.standard_t(3, size) / np.sqrt(3.0),
+        SKEWED: lambda: rng.exponential(size=size) - 1.0,
+    }[law]()
+
+
+def share(verdict, shift, *, scenes=1, pairs=12, law=NORMAL, noise=NOISE):
+    """Share of trials with this verdict on a method that is better by `shift`."""
+    rng = np.random.default_rng(1)
+    names = [f"scene {number}" for number in range(scenes) for _ in range(pairs // scenes)]
+    found = 0
+    for _ in range(TRIALS):
+        differences = shift + noise * draws(law, rng, pairs)
+        found += verdicts([estimate(differences, names, MARGIN)]) == [verdict]
+    return found / TRIALS
+
+
+def self_comparisons(**shape):
+    """Number of 200 comparisons of a method with itself that are said to be different."""
+    rng = np.random.default_rng(2)
+    scenes, pairs, law = shape.get("scenes", 1), shape["pairs"], shape.get("law", NORMAL)
+    names = [f"scene {number}" for number in range(scenes) for _ in range(pairs // scenes)]
+    found = 0
+    for _ in range(TRIALS):
+        first, second = NOISE * draws(law, rng, (2, pairs))
+        found += verdicts([estimate(first - second, names, MARGIN)]) == [Verdict.DIFFERENT]
+    return found
+
+
+@pytest.mark.parametrize("law", [NORMAL, HEAVY, SKEWED])
+@pytest.mark.parametrize(("scenes", "pairs"), [(1, 3), (4, 8), (1, 12), (4, 12)])
+def test_a_method_is_not_different_from_itself(scenes, pairs, law):
+    assert self_comparisons(scenes=scenes, pairs=pairs, law=law) <= 16
+
+
+@pytest.mark.parametrize("law", [NORMAL, HEAVY])
+@pytest.mark.parametrize("scenes", [1, 4])
+def test_a_difference_is_found(scenes, law):
+    noise = NOISE * np.sqrt(2.0)  # 0.1 dB of each run, which is harder than 0.1 dB of a pair.
+    assert share(Verdict.DIFFERENT, 0.3, scenes=scenes, law=law, noise=noise) >= 0.8
+
+
+@pytest.mark.parametrize("law", [NORMAL, HEAVY])
+@pytest.mark.parametrize("scenes", [1, 4])
+def test_equals_are_called_equivalent(scenes, law):
+    assert share(Verdict.EQUIVALENT, 0.0, scenes=scenes, law=law) >= 0.5
+
+
+def test_a_difference_of_the_margin_is_seldom_called_equivalent():
+    assert share(Verdict.EQUIVALENT, MARGIN, scenes=4) <= 0.1
+
+
+def test_three_seeds_of_one_scene_cannot_show_equivalence():
+    assert share(Verdict.EQUIVALENT, 0.0, pairs=3, noise=NOISE * np.sqrt(2.0)) <= 0.05

@@ -1,0 +1,153 @@
+"""The page, the figures and the tables, from folders to files."""
+
+import csv
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from support.run_folders import RunFolder
+
+from crossgrad_core.cli.main import main
+
+SCENE = '<b>&"x"$y_$'
+VIEW = "a/<script>alert(1)</script>.jpg"
+HELD_OUT = (VIEW, "a/2.jpg", "b/1.jpg", "b/2.jpg")
+VOID = {"meta", "link", "img", "br", "path", "use", "rect", "col"}
+
+
+class Reader(HTMLParser):
+    """Collects ids, sources and texts, and checks that elements are closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.ids += [value for name, value in attrs if name == "id"]
+        self.sources += [value for name, value in attrs if name in {"src", "href", "xlink:href"}]
+        assert tag != "script"
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.ids += [value for name, value in attrs if name == "id"]
+        self.sources += [value for name, value in attrs if name in {"src", "href", "xlink:href"}]
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def write_runs(folder: Path) -> None:
+    for views in (1, 2):
+        for seed in range(2):
+            RunFolder(
+                scene=SCENE,
+                seed=seed,
+                views_per_step=views,
+                final=20.0 + views + 0.05 * seed,
+                held_out=HELD_OUT,
+                pictures=HELD_OUT[:3],
+                cpu_seconds=55.0,
+                evaluations=5,
+            ).write(folder / f"{views}-{seed}")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    write_runs(folder)
+    assert run(str(folder)) == 0
+    return folder / "compare"
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", *arguments])
+    return int(ended.value.code or 0)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_page_needs_nothing_else(written):
+    text = (written / "index.html").read_text()
+    page = Reader(text)
+    local = {"data:,", *(f"figures/{path.name}" for path in (written / "figures").iterdir())}
+    for source in page.sources:
+        assert source.startswith(("#", "data:image/jpeg;base64,")) or source in local, source
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert len(set(page.ids)) == len(page.ids)
+    assert {source[1:] for source in page.sources if source.startswith("#")} <= set(page.ids)
+    assert len(text) < 3_000_000
+
+
+def test_names_are_shown_and_not_executed(written):
+    texts = "".join(Reader((written / "index.html").read_text()).texts)
+    assert SCENE in texts
+    assert VIEW in texts
+
+
+def test_the_first_screen_says_what_won(written):
+    texts = " ".join("".join(Reader((written / "index.html").read_text()).texts).split())
+    assert "views=2 is better than views=1 by 1.00 dB" in texts
+    assert "2 of 2 pairs in favour of views=2, 1 scene" in texts
+    assert "Noise floor" in texts
+
+
+def test_there_are_figures_for_a_paper(written):
+    names = {path.name for path in (written / "figures").iterdir()}
+    kinds = ["curves_seconds", "curves_cpu_seconds", "curves_views", "curves_steps", "differences"]
+    kinds += ["regimes", "profile", "primitives", "phases"]
+    assert names == {f"{kind}.{form}" for kind in kinds for form in ("pdf", "png")}
+    for path in (written / "figures").iterdir():
+        assert path.read_bytes().startswith(b"%PDF" if path.suffix == ".pdf" else b"\x89PNG")
+    # Text stays text, in fonts that journals take.
+    assert b"/Type3" not in (written / "figures" / "differences.pdf").read_bytes()
+
+
+def test_tables_hold_the_same_as_the_page(written):
+    [end] = [row for row in rows(written / "comparisons.csv") if row["where"] == "at the end"
+             and row["figure"] == "psnr"]  # fmt: skip
+    assert float(end["difference"]) == pytest.approx(1.0)
+    assert (end["pairs"], end["verdict"], end["method"]) == ("2", "different", "mean, Student's t")
+    assert {row["arm"] for row in rows(written / "runs.csv")} == {"views=1", "views=2"}
+    assert rows(written / "runs.csv")[0]["scene"] == SCENE
+    assert {row["views_per_step"] for row in rows(written / "arms.csv")} == {"1", "2"}
+    worst = rows(written / "views.csv")
+    assert [float(row["mean"]) for row in worst] == sorted(float(row["mean"]) for row in worst)
+    assert rows(written / "phases.csv")[0]["render"] == "25"
+
+
+def test_the_worst_views_are_shown_with_photo_render_and_error(written):
+    text = (written / "index.html").read_text()
+    # Of the four held-out views three have a picture: photo, and render and error of two arms.
+    assert text.count("data:image/jpeg;base64,") == 3 * 5
+
+
+def test_only_a_comparison_is_replaced_and_the_same_runs_give_the_same_bytes(written, tmp_path):
+    runs = [str(path) for path in sorted(written.parent.glob("?-?"))]
+    before = {path.name: path.read_bytes() for path in written.rglob("*.*")}
+    (written / "figures" / "frontier.pdf").write_bytes(b"of an earlier comparison")
+    (written / "mine.txt").write_text("mine")
+    assert run(*runs) == 0
+    after = {path.name: path.read_bytes() for path in written.rglob("*.*")}
+    assert after.pop("mine.txt") == b"mine"
+    assert after == before
+    (written / "mine.txt").unlink()
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "index.html").write_text("<html>somebody's</html>")
+    assert run(*runs, "--out", str(other)) == 2
+    assert (other / "index.html").read_text() == "<html>somebody's</html>"

@@ -1,0 +1,113 @@
+"""Interquartile means, intervals, Holm's correction, the three verdicts."""
+
+from math import inf, isnan, nan, sqrt
+
+import numpy as np
+import pytest
+from scipy.stats import bootstrap, trim_mean, ttest_1samp
+
+from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
+from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate
+from crossgrad_plugins.compare.statistics.holm import holm
+from crossgrad_plugins.compare.statistics.iqm import iqm
+from crossgrad_plugins.compare.statistics.student import pairs_needed
+from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("count", [4, 8, 12, 40])
+def test_the_iqm_is_scipys_where_quarters_are_whole(count):
+    values = RNG.standard_t(2, (3, count))
+    assert iqm(values) == pytest.approx(trim_mean(values, 0.25, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([5.0], 5.0), ([1.0, 2.0], 1.5), ([0.0, 3.0, 90.0], (0.25 * 0 + 3 + 0.25 * 90) / 1.5)],
+)
+def test_the_iqm_of_a_few(values, expected):
+    assert iqm(np.array(values)) == pytest.approx(expected)
+
+
+def test_below_ten_pairs_it_is_students_t():
+    values = RNG.normal(0.1, 0.2, 7)
+    found = estimate(values, ["a"] * 7, 0.1)
+    peer = ttest_1samp(values, 0.0)
+    assert found.method == MEAN
+    assert found.p_different == pytest.approx(peer.pvalue)
+    assert found.wide == pytest.approx(tuple(peer.confidence_interval(0.95)))
+    assert found.narrow == pytest.approx(tuple(peer.confidence_interval(0.90)))
+    greater = ttest_1samp(values, -0.1, alternative="greater").pvalue
+    less = ttest_1samp(values, 0.1, alternative="less").pvalue
+    assert found.p_equivalent == pytest.approx(max(greater, less))
+
+
+def test_from_ten_pairs_on_it_is_a_bootstrap_wider_than_the_plain_one():
+    values = RNG.normal(0.1, 0.2, 16)
+    found = estimate(values, ["a"] * 16, 0.1)
+    assert found.method == IQM
+    assert found.center == pytest.approx(trim_mean(values, 0.25))
+    plain = bootstrap((values,), lambda v, axis: trim_mean(v, 0.25, axis=axis), method="percentile",
+                      rng=np.random.default_rng(1)).confidence_interval  # fmt: skip
+    width = found.wide[1] - found.wide[0]
+    assert 1.05 < width / (plain.high - plain.low) < 1.4
+    assert found == estimate(values, ["a"] * 16, 0.1)
+
+
+def test_p_values_and_intervals_of_the_bootstrap_agree():
+    law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
+    low, high = law.interval(0.95)
+    assert law.lower_tail(low) == pytest.approx(0.025, abs=0.002)
+    assert law.upper_tail(high) == pytest.approx(0.025, abs=0.002)
+
+
+def test_differences_between_scenes_are_no_noise():
+    scenes = [name for name in "abcd" for _ in range(3)]
+    levels = np.repeat([0.1, 0.2, 0.3, 0.4], 3)
+    values = levels + 0.01 * RNG.standard_normal(12)
+    stratified, pooled = estimate(values, scenes, 0.1), estimate(values, ["a"] * 12, 0.1)
+    width = stratified.wide[1] - stratified.wide[0]
+    assert width < 0.3 * (pooled.wide[1] - pooled.wide[0])
+
+
+def test_scenes_with_one_pair_are_resampled_together():
+    values = RNG.normal(0.0, 1.0, 12)
+    scenes = [f"scene {number}" for number in range(12)]
+    assert estimate(values, scenes, 0.1).wide == estimate(values, ["a"] * 12, 0.1).wide
+
+
+def test_pairs_that_are_needed_are_those_of_the_table():
+    # 0.1 dB of noise per run: half-widths 0.095 at 8 pairs and 0.104 at 7.
+    assert pairs_needed(0.1 * sqrt(2.0), 0.1) == 8
+    assert pairs_needed(100.0, 0.1) is None
+
+
+def test_one_pair_is_inconclusive_and_equal_runs_are_equivalent():
+    single = estimate([3.0], ["a"], 0.1)
+    same = estimate([0.0, 0.0, 0.0], ["a"] * 3, 0.1)
+    other = estimate([0.5, 0.5], ["a"] * 2, 0.1)
+    assert single.wide == (-inf, inf)
+    assert isnan(single.p_different)
+    assert single.needed is None
+    assert verdicts([single, same, other]) == [
+        Verdict.INCONCLUSIVE,
+        Verdict.EQUIVALENT,
+        Verdict.DIFFERENT,
+    ]
+
+
+def test_holm_is_holms():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    adjusted = holm([0.02, nan, 0.01])
+    assert adjusted[0] == 0.02
+    assert isnan(adjusted[1])
+    assert adjusted[2] == 0.02
+
+
+def test_more_than_five_comparisons_are_corrected():
+    found = estimate([0.09, 0.11, 0.05, 0.15, 0.02], ["a"] * 5, 0.01)
+    assert 0.01 < found.p_different < 0.05
+    assert verdicts([found] * 5) == [Verdict.DIFFERENT] * 5
+    assert verdicts([found] * 6) == [Verdict.INCONCLUSIVE] * 6
