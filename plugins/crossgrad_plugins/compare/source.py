@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 #: The table of a sweep, beside the folder of its runs.
 _PLAN: Final = "runs.csv"
-_ID, _LABEL = "id", "label"
+_ID, _LABEL = "run", "configuration"
+_LENGTHS: Final = ("steps=", "max_views=", "seconds=")
+#: What a grid without arms calls its only one.
+_ONLY: Final = "run"
 
 
 class _Summary(BaseModel):
@@ -62,9 +65,10 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> Found:
     names = _short_names(folders)
     labels = {parent: _labels(parent) for parent in {folder.parent for folder in folders}}
     for folder in folders:
-        label = labels[folder.parent].get(folder.name)
         try:
-            _sort_in(found, names[folder], read_results(folder), label)
+            results = read_results(folder)
+            for label in labels[folder.parent].get(folder.name, (None,)):
+                _sort_in(found, names[folder], results, label)
         except UserError as error:
             if not skip_broken:
                 raise _broken(error) from error
@@ -137,8 +141,11 @@ def _config(results: "RunResults") -> dict[str, object]:
         ) from error
 
 
-def _labels(folder: Path) -> dict[str, str]:
-    """Name of a run's folder -> what its sweep calls it; none where no sweep wrote the folder."""
+def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Name of a run's folder -> what its sweep calls it; none where no sweep wrote the folder.
+
+    A run that two configurations come to stands for both.
+    """
     plan = folder.parent / _PLAN
     if not plan.is_file():
         return {}
@@ -146,7 +153,18 @@ def _labels(folder: Path) -> dict[str, str]:
     if not {_ID, _LABEL} <= set(header):
         return {}
     at, called = header.index(_ID), header.index(_LABEL)
-    return {line[at]: line[called] for line in lines if len(line) == len(header)}
+    found: dict[str, tuple[str, ...]] = {}
+    for line in lines:
+        if len(line) == len(header):
+            found[line[at]] = tuple(dict.fromkeys((*found.get(line[at], ()), _arm(line[called]))))
+    return found
+
+
+def _arm(label: str) -> str:
+    """A label without what makes no arm: the length, and the name of the only arm of a grid."""
+    parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
+    named = parts[1:] if parts[:1] == [_ONLY] else parts
+    return ", ".join(named or parts)
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:

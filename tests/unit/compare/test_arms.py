@@ -94,12 +94,23 @@ def test_an_option_that_an_older_version_lacks_makes_no_arm(tmp_path):
     assert len(names(tmp_path, RunFolder(settings=old), RunFolder(seed=1, settings=new))) == 1
 
 
-def test_labels_of_a_sweep_are_taken(tmp_path):
+def test_labels_of_a_sweep_are_taken_and_a_run_can_have_two(tmp_path):
     RunFolder(seed=0).write(tmp_path / "runs" / "aa")
     RunFolder(seed=0, steps=900).write(tmp_path / "runs" / "bb")
-    (tmp_path / "runs.csv").write_text("id,label,scene\naa,equal views,x\nbb,equal seconds,x\n")
+    plan = "run,scene,configuration,seed\naa,city,views,0\nbb,city,seconds,0\nbb,city,steps,0\n"
+    (tmp_path / "runs.csv").write_text(plan)
     found = read_runs([tmp_path], skip_broken=False)
-    assert [arm.name for arm in arms_of(found.runs)] == ["equal seconds", "equal views"]
+    assert [arm.name for arm in arms_of(found.runs)] == ["seconds", "steps", "views"]
+
+
+def test_lengths_in_a_label_make_no_arm(tmp_path):
+    for number in range(4):
+        RunFolder(steps=100 + 100 * number).write(tmp_path / "runs" / str(number))
+    labels = ('"run, steps=100"', '"run, steps=200"', '"two, views=2, seconds=9"', "run")
+    lines = [f"{number},{label}" for number, label in enumerate(labels)]
+    (tmp_path / "runs.csv").write_text("\n".join(["run,configuration", *lines]) + "\n")
+    found = read_runs([tmp_path], skip_broken=False)
+    assert [arm.name for arm in arms_of(found.runs)] == ["run", "two, views=2"]
 
 
 def test_arms_can_be_renamed(tmp_path):

@@ -132,8 +132,13 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
 
 def test_an_old_run_beside_a_new_one(tmp_path):
     shutil.copytree(OLD, tmp_path / "old")
-    RunFolder(scene="tiny", steps=20, held_out=("0000.png", "0008.png"), regimes={"far": 0.0},
-              photos="photos: 32 x 24 px (9) from images/, not resized").write(tmp_path / "new")  # fmt: skip
+    RunFolder(
+        scene="tiny",
+        steps=20,
+        held_out=("0000.png", "0008.png"),
+        regimes={"far": 0.0},
+        photos="photos: 32 x 24 px (9) from images/, not resized",
+    ).write(tmp_path / "new")
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     assert "ssim_skimage is not compared: new did not measure it" in found.notes
     assert len(found.arms) == 2
