@@ -1,4 +1,4 @@
-"""What a run spends: seconds of the clock or of the processor, views, steps."""
+"""Costs of a run: seconds of the clock or of the processor, views, steps."""
 
 from dataclasses import dataclass
 from enum import StrEnum

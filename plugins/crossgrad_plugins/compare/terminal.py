@@ -1,4 +1,4 @@
-"""What the command prints: the headline, a table of arms, the verdicts."""
+"""Output of the command on the terminal: the headline, a table of arms, the verdicts."""
 
 from collections.abc import Iterator, Sequence
 

@@ -1,4 +1,4 @@
-"""What was found, in plain words: what won, by how much, how sure, at what cost."""
+"""The results in plain words: the winner, by how much, how sure, at what cost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

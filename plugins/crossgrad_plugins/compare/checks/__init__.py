@@ -1,1 +1,1 @@
-"""What must agree before runs are compared: scenes, metrics, machines."""
+"""Checks before runs are compared: scenes, metrics, machines must agree."""

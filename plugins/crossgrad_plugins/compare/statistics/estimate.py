@@ -1,4 +1,4 @@
-"""What pairs of runs say about a difference: an estimate, intervals and p-values."""
+"""A difference estimated from pairs of runs, with intervals and p-values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
