@@ -49,7 +49,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What was found.
+    """The result of a comparison.
 
     Attributes:
         arms: The arms in the order of their names.

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 
 class _Kind(NamedTuple):
-    """What holds for all figures whose names begin alike; the margin counts as no difference."""
+    """A kind of figure, known by how its name begins; the margin counts as no difference."""
 
     unit: str
     decimals: int

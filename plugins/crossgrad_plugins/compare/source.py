@@ -22,7 +22,7 @@ _ONLY: Final = "run"
 
 
 class _Summary(BaseModel):
-    """What a comparison takes for granted in summary.json, of any version."""
+    """The part of summary.json that a comparison takes for granted, of any version."""
 
     status: str
     scene: str
@@ -37,7 +37,7 @@ class _Summary(BaseModel):
 
 @dataclass
 class Found:
-    """What lies in the folders.
+    """The runs in the folders.
 
     Attributes:
         runs: The runs that finished.

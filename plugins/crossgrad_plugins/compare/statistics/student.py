@@ -13,7 +13,7 @@ MOST_PAIRS: Final = 1000
 
 @dataclass(frozen=True)
 class Law:
-    """What is known about the mean of which a sample was drawn.
+    """Student's law of the mean of which a sample was drawn.
 
     Attributes:
         center: Mean of the sample.

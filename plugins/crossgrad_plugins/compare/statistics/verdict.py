@@ -13,7 +13,7 @@ UNCORRECTED: Final = 5
 
 
 class Verdict(StrEnum):
-    """What can be said about a difference."""
+    """The verdict on a difference."""
 
     DIFFERENT = "different"
     EQUIVALENT = "equivalent"
