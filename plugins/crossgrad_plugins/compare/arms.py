@@ -12,7 +12,8 @@ from crossgrad_plugins.compare.settings import Settings
 #: What names an arm if it can, before anything else that differs.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
-    *("exposure", "loss", "resolution", "schedule", "preset", "backward"),
+    *("rate_factor", "density_views", "schedule", "reference", "events"),
+    *("exposure", "loss", "resolution", "preset", "backward"),
 )
 #: Settings that people know by another name.
 _SPOKEN: Final = {"views_per_step": "views"}

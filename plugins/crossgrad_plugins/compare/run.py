@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Array: TypeAlias = NDArray[np.float64]
 
 #: The note of a run whose length followed the clock, as a run writes it.
-_PLANNED: Final = re.compile(r"steps planned for ([\d.]+) (?:CPU )?s(?:econds)?\b")
+_PLANNED: Final = re.compile(r"steps planned for ([\d.]+) s\b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,8 @@ class Run:
         """The unit and the amount of the budget that it was given."""
         for note in self.summary.get("notes") or ():
             if found := _PLANNED.search(str(note)):
-                return "s", float(found[1])
+                unit = "s CPU" if self.config.get("clock") == "cpu" else "s"
+                return unit, float(found[1])
         views = self.config.get("max_views")
         if views is not None:
             return "views", float(views)

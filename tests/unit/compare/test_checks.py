@@ -116,6 +116,19 @@ def test_cpu_seconds_of_several_threads_do_not_compare(tmp_path):
     assert costs(comparison(tmp_path, *runs)) == ["seconds", "views", "steps"]
 
 
+@pytest.mark.parametrize(("rate", "left"), [(1.2, ["cpu_seconds"]), (1.4, [])])
+def test_cpu_seconds_compare_between_runs_of_about_the_same_speed(tmp_path, rate, left):
+    runs = [
+        RunFolder(
+            seed=seed,
+            cpu_seconds=50.0,
+            environment={"calibration": {"rate": own, "cpu_rate": own}},
+        )
+        for seed, own in enumerate((1.0, rate))
+    ]
+    assert costs(comparison(tmp_path, *runs)) == [*left, "views", "steps"]
+
+
 def test_runs_without_cpu_seconds_have_no_such_axis_and_no_note(tmp_path):
     found = comparison(tmp_path, RunFolder(), RunFolder(seed=1))
     assert costs(found) == ["seconds", "views", "steps"]

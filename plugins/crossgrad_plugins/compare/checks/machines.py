@@ -10,8 +10,9 @@ from crossgrad_plugins.compare.run import Run
 #: What makes a machine, and beyond it a way to use it.
 _MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
 _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
-#: The calibration's rates may differ so much.
-_SAME_SPEED: Final = 0.1
+#: Rate of the calibration -> how much it may differ: on the clock, and in CPU time, of which other
+#: processes on the same core and cache take some even where they do not take the core.
+_SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
 #: Load above the number of cores from which on a machine is busy with other things.
 _BUSY: Final = 0.5
 
@@ -55,14 +56,19 @@ def _why_no_wall(runs: Sequence[Run]) -> str:
     """Why seconds of the clock do not compare; empty where they do."""
     return (
         _other_machine(runs, {**_MACHINE, **_SHARE})
-        or _other_speed(runs)
         or _busy(runs)
+        or _other_speed(runs, "rate")
         or _unrecorded(runs, SECONDS)
     )
 
 
 def _why_no_cpu(runs: Sequence[Run]) -> str:
-    return _unrecorded(runs, CPU_SECONDS) or _other_machine(runs, _MACHINE) or _threads(runs)
+    return (
+        _unrecorded(runs, CPU_SECONDS)
+        or _other_machine(runs, _MACHINE)
+        or _threads(runs)
+        or _other_speed(runs, "cpu_rate")
+    )
 
 
 def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
@@ -75,13 +81,14 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
     return ""
 
 
-def _other_speed(runs: Sequence[Run]) -> str:
+def _other_speed(runs: Sequence[Run], name: str) -> str:
     """Whether the machine itself ran at another speed, as its calibration tells."""
-    rates = [(rate, run) for run in runs if (rate := _rate(run)) is not None]
+    known = [(run.number("environment", "calibration", name), run) for run in runs]
+    rates = [(rate, run) for rate, run in known if rate is not None]
     if len(rates) < len(runs):
         return ""
     (low, slow), (high, fast) = min(rates, key=_first), max(rates, key=_first)
-    if high <= (1.0 + _SAME_SPEED) * low:
+    if high <= (1.0 + _SAME_SPEED[name]) * low:
         return ""
     return (
         f"the machine's calibration was {high / low - 1.0:.0%} faster at {fast.name} "
@@ -118,10 +125,6 @@ def _unrecorded(runs: Sequence[Run], cost: Cost) -> str:
     if not lacking:
         return ""
     return _NEVER_RECORDED if len(lacking) == len(runs) else f"{lacking[0]} did not record them"
-
-
-def _rate(run: Run) -> float | None:
-    return run.number("environment", "calibration", "rate")
 
 
 def _environment(run: Run) -> dict[str, Any]:

@@ -64,6 +64,7 @@ class Drawn:
         svg: For the page: colours are variables of its style sheet.
         pdf: For a paper.
         png: For everything else.
+        share: Its width as a share of a page's.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Drawn:
     svg: str
     pdf: bytes
     png: bytes
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,13 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
     for_svg: Any = FigureCanvasSVG(figure)
     for_svg.print_svg(svg, metadata={"Date": None})
     return Drawn(
-        name, title, caption, _for_page(svg.getvalue(), name), pdf.getvalue(), png.getvalue()
+        name,
+        title,
+        caption,
+        _for_page(svg.getvalue(), name),
+        pdf.getvalue(),
+        png.getvalue(),
+        figure.get_figwidth() / PAGE,
     )
 
 

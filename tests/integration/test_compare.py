@@ -1,0 +1,42 @@
+"""`crossgrad compare` reads what `crossgrad run` writes."""
+
+import csv
+
+import pytest
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.cli.main import main
+
+
+def ended(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as error:
+        main(list(arguments))
+    return int(error.value.code or 0)
+
+
+def test_runs_as_they_are_written(tmp_path, capsys):
+    scene = write_tiny_scene(tmp_path / "scene", views=9)
+    for views in ("1", "2"):
+        out = str(tmp_path / "runs" / views)
+        options = ["--views", views, "--sampler", "random", "--steps", "4", "--eval-every", "2"]
+        assert ended("run", str(scene), *options, "--threads", "1", "--out", out, "-q") == 0
+    capsys.readouterr()
+    assert ended("compare", str(tmp_path / "runs")) == 0
+    printed = capsys.readouterr().out
+    assert "views=2 - views=1" in printed
+    assert "one pair says nothing about noise" in printed
+
+    folder = tmp_path / "runs" / "compare"
+    with (folder / "runs.csv").open(newline="") as file:
+        rows = {row["arm"]: row for row in csv.DictReader(file)}
+    assert {arm: (row["steps"], row["views"]) for arm, row in rows.items()} == {
+        "views=1": ("4", "4"),
+        "views=2": ("4", "8"),
+    }
+    assert all(float(row["seconds"]) > 0 and float(row["psnr"]) > 0 for row in rows.values())
+    assert all(int(float(row["primitives"])) > 0 for row in rows.values())
+    assert all(row["length"] == "4 steps" for row in rows.values())
+    # Photo, and render and error of both arms, of each of the two held-out views.
+    assert (folder / "index.html").read_text().count("data:image/jpeg;base64,") == 2 * 5
+    assert (folder / "figures" / "phases.pdf").is_file()
+    assert "views.csv" in {path.name for path in folder.iterdir()}
