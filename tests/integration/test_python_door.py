@@ -20,6 +20,7 @@ from crossgrad_core.run.session import Session
 OPTIONS = {
     "sampler": "near-far", "operator": "pcgrad", "steps": 12, "eval_every": 6, "seed": 3,
     "operator.granularity": "global", "densify_from": 3, "densify_until": 11, "densify_every": 3,
+    "events": "steps",
 }  # fmt: skip
 #: Steps after which the run is evaluated; one that is stopped is evaluated there, too.
 EVALUATED = {"6", "12"}

@@ -17,7 +17,7 @@ from crossgrad_core.run.results.config_file import read_config
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 #: Density control within a few dozen steps; by default a run has to be longer.
-GROWTH = {"densify_from": 10, "densify_until": 50, "densify_every": 10}
+GROWTH = {"events": "steps", "densify_from": 10, "densify_until": 50, "densify_every": 10}
 QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
 
 

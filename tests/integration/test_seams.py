@@ -33,7 +33,8 @@ PLUGINS = {
     "metrics": {"brightness": "support.seam_plugins:BrightnessError"},
 }
 #: Two edits and a reset in a few steps.
-GROWTH = {"densify_from": 4, "densify_until": 22, "densify_every": 6, "reset_every": 13}
+WINDOW = {"densify_from": 4, "densify_until": 22, "densify_every": 6}
+GROWTH = {"events": "steps", "reset_every": 13, **WINDOW}
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,8 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
 }
 #: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
 STEPS: Final = 5
-_TIMES: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100, "reset_every": 4}
+_WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
+_TIMES: Final = {"events": "steps", "reset_every": 4, **_WINDOW}
 
 #: Row -> reasons; rows that work are not there.
 Refused: TypeAlias = Mapping[Row, Collection[str]]

@@ -284,6 +284,7 @@ def test_training_lowers_the_loss(options):
         backbone=ComponentChoice(name="scaffold", **options),
         operator=ComponentChoice(name="pcgrad"),
         sampler=ComponentChoice(name="random"),
+        events="steps",
         densify_from=10,
         densify_until=50,
         densify_every=10,

@@ -234,7 +234,7 @@ def test_regularisers_are_means_and_come_once_per_step():
     assert densifier.crossgrad_regularize(regularize_context(parameters([]))) is None
 
 
-EARLY = {"densify_from": 1, "densify_until": 9, "densify_every": 2}
+EARLY = {"events": "steps", "densify_from": 1, "densify_until": 9, "densify_every": 2}
 
 
 def setup_of(**options):
