@@ -12,7 +12,7 @@ from pathlib import Path
 from time import process_time
 
 from crossgrad_core.commands import configured, read_scene
-from crossgrad_core.plugin import exposure_value
+from crossgrad_plugins.exposures.photo_headers import exposure_value
 from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
 
 HEADER = (

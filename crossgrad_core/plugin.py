@@ -77,7 +77,6 @@ from crossgrad_core.run.results.lines import (
     progress_line,
 )
 from crossgrad_core.scene.bimodality import bimodality
-from crossgrad_core.scene.exif import exposure_value
 from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.terminal import shows_bar
 from crossgrad_core.system.text_files import read_rows
@@ -171,7 +170,6 @@ __all__ = [
     "diagonals",
     "eight_bit",
     "evaluation_line",
-    "exposure_value",
     "figures",
     "footprint_of",
     "hookimpl",

@@ -31,6 +31,8 @@ READERS = (*DOORS, f"{CORE}.scene")
 COMMAND_ROOMS = (*DOORS, f"{CORE}.commands")
 PLACES = {
     "crossgrad_plugins.readers": READERS,
+    # Reads the headers of photo files.
+    "crossgrad_plugins.exposures.photo_headers": READERS,
     # Checks packages, and writes one for each slot, readers and tests included.
     "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
     "crossgrad_plugins.compare": COMMAND_ROOMS,

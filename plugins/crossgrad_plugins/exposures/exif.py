@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from weakref import WeakKeyDictionary
 
-from crossgrad_core.plugin import Scene, exposure_value
+from crossgrad_core.plugin import Scene
+from crossgrad_plugins.exposures.photo_headers import exposure_value
 
 #: Headers that are read at once.
 _AT_ONCE = 4

@@ -5,8 +5,7 @@ from math import isfinite, log2
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crossgrad_core.contract.scene import View
-from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import UserError, View
 from crossgrad_core.scene.photos import FilePhoto
 from crossgrad_core.scene.pillow import opened
 
