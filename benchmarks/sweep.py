@@ -24,11 +24,18 @@ from crossgrad_plugins.sweep.records import read_records
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 
 
+def call(command: list[str]) -> None:
+    """Runs a command; where it fails, ends with what it said."""
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
+
+
 def swept(grid: Path, out: Path, workers: int, threads: int) -> float:
     """Seconds from the start of the first run of a sweep to the end of the last one."""
     command = [*CROSSGRAD, "sweep", str(grid), "--out", str(out)]
     command += ["--workers", str(workers), "--threads", str(threads)]
-    subprocess.run(command, check=True, capture_output=True)
+    call(command)
     times = [each.when for each in read_records(out / "workers")]
     return (max(times) - min(times)).total_seconds()
 
@@ -63,7 +70,7 @@ def measured(arguments: argparse.Namespace, folder: Path) -> None:
     for threads in (1, workers):  # Kernels are compiled before any clock runs.
         command = [*CROSSGRAD, "run", str(arguments.scene), "--steps", "20", "-q"]
         command += ["--threads", str(threads), "--out", str(folder / f"warm-{threads}")]
-        subprocess.run(command, check=True, capture_output=True)
+        call(command)
     one, many = by_hand(arguments, folder, 1), by_hand(arguments, folder, workers)
     print(f"{workers} runs at once, started by hand: {workers * one / many:.2f} x one", flush=True)
     together = swept(grid, folder / "together", workers, 1)

@@ -214,6 +214,7 @@ def machines(comparison: Comparison) -> list[str]:
                 ("device", "device: "),
                 ("gpu", "GPU: "),
                 ("crossgrad", "crossgrad "),
+                ("commit", "commit "),
             )
             if of.get(key) is not None
         )

@@ -59,7 +59,8 @@ def _runs(comparison: Comparison) -> list[Row]:
             row["primitives"] = _known(run.number("primitives"))
             row["peak_primitives"] = _known(run.peak_primitives)
             row["peak_memory_mib"] = _known(run.number("peak_memory_mib"))
-            row["crossgrad"] = str((run.summary.get("environment") or {}).get("crossgrad", ""))
+            made_with = run.summary.get("environment") or {}
+            row |= {name: str(made_with.get(name) or "") for name in ("crossgrad", "commit")}
             rows.append(row)
     return rows
 

@@ -59,6 +59,7 @@ def write_runs(folder: Path) -> None:
                 pictures=HELD_OUT[:3],
                 cpu_seconds=55.0,
                 evaluations=5,
+                environment={"commit": f"{seed}abcdef"},
             ).write(folder / f"{views}-{seed}")
 
 
@@ -124,6 +125,7 @@ def test_tables_hold_the_same_as_the_page(written):
     assert (end["pairs"], end["verdict"], end["method"]) == ("2", "different", "mean, Student's t")
     assert {row["arm"] for row in rows(written / "runs.csv")} == {"views=1", "views=2"}
     assert rows(written / "runs.csv")[0]["scene"] == SCENE
+    assert all(row["commit"] == f"{row['seed']}abcdef" for row in rows(written / "runs.csv"))
     assert {row["views_per_step"] for row in rows(written / "arms.csv")} == {"1", "2"}
     worst = rows(written / "views.csv")
     assert [float(row["mean"]) for row in worst] == sorted(float(row["mean"]) for row in worst)
