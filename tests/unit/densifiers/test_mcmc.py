@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.contexts import AfterStepContext, DensifyContext, RegularizeContext
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import EMPTY_STATE
@@ -279,7 +280,7 @@ def test_a_backbone_without_opacities_is_refused_with_the_reason(monkeypatch):
     build = assembling.build
 
     def with_other_backbone(slot, name, options):
-        return WithoutOpacities() if slot == "backbones" else build(slot, name, options)
+        return WithoutOpacities() if slot is Backbone else build(slot, name, options)
 
     monkeypatch.setattr(assembling, "build", with_other_backbone)
     with pytest.raises(IncompatibleSelectionError, match="cannot work together") as refused:
