@@ -211,7 +211,7 @@ def test_the_seam_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
 def test_a_metric_has_its_column_and_no_regime_is_made_of_its_name(scene, tmp_path):
     assert run(scene, tmp_path / "run", **ALTOGETHER) == 0
     columns = list(rows(tmp_path / "run")[0])
-    assert columns[4:10] == [
+    assert columns[5:11] == [
         "psnr", "psnr_cc", "psnr_far", "psnr_cc_far", "psnr_near", "psnr_cc_near",
     ]  # fmt: skip
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
