@@ -12,6 +12,7 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
+from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
@@ -296,7 +297,7 @@ def test_a_rasterizer_without_directions_is_refused(monkeypatch):
 
     def blind(slot, name, options):
         component = build(slot, name, options)
-        if slot != "rasterizers":
+        if slot is not Rasterizer:
             return component
         kind = type(component)
 
