@@ -79,7 +79,7 @@ def begins(out):
     return [each for each in read_records(out / "workers") if each.event == "begun"]
 
 
-def wait_for(happened, seconds=240.0):
+def wait_for(happened, seconds=500.0):
     end = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < end
