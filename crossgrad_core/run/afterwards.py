@@ -83,7 +83,8 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
     with _writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
-        result = measured(setup.scene.test_views, renderer(setup, state), setup.metrics)
+        draw, points = renderer(setup, state), setup.scene.points
+        result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
         if writes:
             write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
         return result, totals(setup, state)

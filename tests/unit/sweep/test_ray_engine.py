@@ -23,7 +23,8 @@ def test_a_node_that_is_killed_costs_only_time(tmp_path):
     said = json.loads(done.stdout.splitlines()[-1])
     assert said["killed"] and said["nodes"] >= 2
     assert said["states"] == ["finished"] * 6
-    assert said["begins"] >= 7
+    # Its run is begun again, unless it ended at that very moment.
+    assert 6 <= said["begins"] <= 8
 
 
 @pytest.mark.parametrize(
