@@ -106,6 +106,7 @@ def finished(out):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(3600 if "FAULTS" in os.environ else 600)
 def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
     out = tmp_path / "sweep"
