@@ -21,10 +21,11 @@ SHORTEST_INTERVAL = 100
 SHORTEST_ANCHOR_INTERVAL = 50
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
-#: Where edits are counted in views, a run has at least so many, however short it is: warm-up and
-#: interval, which are the least of a longer run, give way.
-FEWEST_EDITS = 6
-#: ... but not below this: what fewer views say of gradients makes nearly everything grow.
+#: Where edits are counted in views, an interval is a pass over the training photos as far as that
+#: leaves room for so many edits.
+USUAL_EDITS = 6
+#: A run that is to have edits however short it is has no shorter interval than this: what fewer
+#: views say of gradients makes nearly everything grow.
 LEAST_INTERVAL = 8
 
 
@@ -39,12 +40,15 @@ class Counting:
             run is long enough.
         reference: For which length the schedule counts, where that is not the run's own or the
             published one.
+        fewest_edits: So many edits of density control there are in any run, however short: warm-up
+            and interval, which are the least of a longer run, give way. Counted in views only.
     """
 
     unit: Unit = "steps"
     views: ViewPlan = ONE_VIEW
     photos: int = 1
     reference: int | None = None
+    fewest_edits: int = 0
 
 
 IN_STEPS = Counting()
@@ -105,7 +109,6 @@ class Schedule:
         pace = counting.views.paced(total)
         own = pace.views(total) if counting.unit == "views" else total
         length = own if mode == "scaled" else counting.reference or REFERENCE
-        published = mode == "absolute" and counting.reference is None
         schedule = cls(
             mode=mode,
             total=total,
@@ -121,8 +124,9 @@ class Schedule:
             coarse_until=min(length // 4, own // 2),
             counting=counting,
             pace=pace,
-            fewest_edits=FEWEST_EDITS if counting.unit == "views" and not published else 0,
         )
+        if counting.unit == "views" and not schedule._published:
+            schedule = replace(schedule, fewest_edits=counting.fewest_edits)
         return schedule.with_edits(until=schedule.densify_until)
 
     def with_edits(
@@ -130,8 +134,9 @@ class Schedule:
     ) -> "Schedule":
         """The schedule with another window of density control.
 
-        Where edits are counted in views, interval and start are fitted to it: an interval is at
-        least a pass over the training photos, and there are at least `FEWEST_EDITS`.
+        Where edits are counted in views, interval and start are fitted to it: an interval is a pass
+        over the training photos, as far as that leaves room for `USUAL_EDITS`, and there are at
+        least `fewest_edits`.
 
         Args:
             until: Edits end before this.
@@ -140,9 +145,17 @@ class Schedule:
         """
         start = max(self.length // 60, SHORTEST_WARM_UP) if start is None else start
         every = max(SHORTEST_INTERVAL, self.length // 300) if every is None else every
+        last, photos = until - 1, self.counting.photos
+        if self.counting.unit == "views" and not self._published:
+            every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.fewest_edits:
-            start, every = _fitted(start, until - 1, every, self.counting.photos)
+            start, every = _fitted(start, last, max(every, photos), photos, self.fewest_edits)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
+
+    @property
+    def _published(self) -> bool:
+        """Whether the numbers are the published ones, whatever the length."""
+        return self.mode == "absolute" and self.counting.reference is None
 
     def counted(self, step: int) -> int:
         """The count after a step: of the views drawn by then, or of the steps."""
@@ -267,22 +280,22 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
     )
 
 
-def _fitted(start: int, last: int, every: int, photos: int) -> tuple[int, int]:
-    """Start and interval with which `FEWEST_EDITS` come no later than `last`, if they can.
+def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple[int, int]:
+    """Start and interval with which so many edits come no later than `last`, if they can.
 
     Args:
         start: Wanted start.
         last: Count of the last edit, at most.
         every: Wanted interval.
         photos: The interval is at least so long where that leaves enough edits.
+        edits: How many there are to be.
     """
-    every = max(every, photos)
-    wanted = start + FEWEST_EDITS * every
+    wanted = start + edits * every
     if wanted > last:
         shrunk = every * max(0, last) // wanted
-        every = photos if shrunk < photos <= last // FEWEST_EDITS else shrunk
+        every = photos if shrunk < photos <= last // edits else shrunk
         every = max(every, LEAST_INTERVAL)
-        start = max(0, min(start, last - FEWEST_EDITS * every))
+        start = max(0, min(start, last - edits * every))
     return start, every
 
 

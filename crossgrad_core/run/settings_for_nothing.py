@@ -17,12 +17,13 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
+from crossgrad_core.training.schedules import unit_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
 
 _SLOTS = ("grouping", *ALWAYS)
-_TIMES = ("densify_from", "densify_until", "densify_every", "max_gaussians")
+_TIMES = ("densify_from", "densify_until", "densify_every", "fewest_edits", "max_gaussians")
 
 
 def refuse_labels_for_nothing(setup: Setup) -> None:
@@ -115,6 +116,8 @@ def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 def _of_the_schedule(config: RunConfig) -> Iterator[tuple[str, str]]:
     if config.reference is not None and config.schedule == "scaled":
         yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
+    if config.fewest_edits is not None and unit_of(config) == "steps":
+        yield "fewest_edits", "density control counts steps; --events views counts views"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -22,7 +22,8 @@ def counting_of(config: RunConfig, views: ViewPlan, photos: int) -> Counting:
         views: How many views its steps have.
         photos: Its training photos.
     """
-    return Counting(unit_of(config), views, photos, config.reference)
+    fewest = config.fewest_edits or 0
+    return Counting(unit_of(config), views, photos, config.reference, fewest)
 
 
 def unit_of(config: RunConfig) -> Unit:

@@ -84,7 +84,7 @@ def test_a_run_has_one_length(lengths):
 
 
 def test_one_view_and_two_edit_after_as_many_views():
-    one, two = (trained(views=k, max_views=144)[2] for k in (1, 2))
+    one, two = (trained(views=k, max_views=144, fewest_edits=6)[2] for k in (1, 2))
     assert len(one.edits) == len(two.edits) == 6
     assert [count + count % 2 for count in one.edits] == two.edits
     assert max(one.edits) < 72

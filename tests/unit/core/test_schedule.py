@@ -9,7 +9,6 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.schedule import (
-    FEWEST_EDITS,
     SHORTEST_INTERVAL,
     SHORTEST_WARM_UP,
     Counting,
@@ -98,8 +97,11 @@ def test_learning_rate_is_log_linear_and_clipped():
     assert LearningRate(0.0).at(0.3) == 0.0
 
 
+FEWEST_EDITS = 6
+
+
 def in_views(text="1", photos=24, reference=None):
-    return Counting("views", ViewPlan.parsed(text), photos, reference)
+    return Counting("views", ViewPlan.parsed(text), photos, reference, FEWEST_EDITS)
 
 
 def view_counts(schedule, happens=Schedule.densifies):
@@ -154,6 +156,17 @@ def test_any_run_has_six_edits_of_a_pass_each_where_it_is_long_enough(text, step
     if long:
         assert schedule.densify_from >= SHORTEST_WARM_UP
         assert schedule.densify_every >= SHORTEST_INTERVAL
+
+
+def test_floors_hold_in_views_where_no_edits_are_asked_for():
+    def default(steps, photos=24):
+        return Schedule.for_run(steps, counting=Counting("views", ViewPlan.parsed("2"), photos))
+
+    assert not default(500).grows
+    assert view_counts(default(900)) == [600, 700, 800]
+    assert default(900).lengthened(default(700), 100).fewest_edits == 0
+    assert default(15_000, photos=300).densify_every == 300
+    assert default(900, photos=300).densify_every == 100  # A pass would leave one edit.
 
 
 @pytest.mark.parametrize(
