@@ -36,7 +36,8 @@ def both(function, *inputs):
 
 def check(pairs):
     for compiled, exact in pairs:
-        scale = float(exact.abs().max()) + 1e-3
+        # Gradients of values are sums of terms up to 1 that may cancel: float32 knows 6e-8 of those.
+        scale = float(exact.abs().max()) + 1e-1
         assert float((compiled - exact).abs().max()) < 3e-6 * scale
 
 
