@@ -169,7 +169,8 @@ def test_before_the_first_edit_they_change_no_bit(choice, operator):
 
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_other_statistics_are_other_edits(choice):
-    edited = [trained(40, views=2, density_views=each, fewest_edits=6)[1] for each in ("all", choice)]
+    asked = {"views": 2, "fewest_edits": 6}
+    edited = [trained(40, density_views=each, **asked)[1] for each in ("all", choice)]
     shapes = [state.parameters["means"].shape[0] for state in edited]
     sums = [float(state.parameters["means"].detach().sum()) for state in edited]
     assert shapes[0] != shapes[1] or sums[0] != sums[1]

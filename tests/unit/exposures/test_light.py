@@ -36,7 +36,7 @@ def both(function, *inputs):
 
 def check(pairs):
     for compiled, exact in pairs:
-        # Gradients of values are sums of terms up to 1 that may cancel: float32 knows 6e-8 of those.
+        # Gradients are sums of terms that may cancel: float32 knows 6e-8 of these.
         scale = float(exact.abs().max()) + 1e-1
         assert float((compiled - exact).abs().max()) < 3e-6 * scale
 
