@@ -1,8 +1,10 @@
 """State of plugins: values that are handed in, returned, checkpointed and carried through edits."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from types import MappingProxyType
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -24,6 +26,12 @@ class PluginState:
     values: Mapping[str, Json] = field(default_factory=dict)
     tensors: Mapping[str, Tensor] = field(default_factory=dict)
     per_primitive: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "PluginState":
+        # By hand, because the read-only mappings of `EMPTY_STATE` cannot be copied deeply.
+        values = deepcopy(dict(self.values), memo)
+        tensors, rows = (deepcopy(dict(part), memo) for part in (self.tensors, self.per_primitive))
+        return PluginState(values, tensors, rows)
 
     def to(self, device: torch.device) -> "PluginState":
         """The state with its tensors on a device."""
@@ -53,4 +61,5 @@ def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     return new
 
 
-EMPTY_STATE = PluginState()
+#: The state of a plugin that has none yet; read-only, because all runs of a process share it.
+EMPTY_STATE = PluginState(MappingProxyType({}), MappingProxyType({}), MappingProxyType({}))

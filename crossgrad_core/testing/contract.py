@@ -67,7 +67,7 @@ def revived(state: PluginState) -> PluginState:
         ContractError: The values do not survive JSON.
     """
     try:
-        values = json.loads(json.dumps(state.values, allow_nan=False))
+        values = json.loads(json.dumps(dict(state.values), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ContractError(
             f"the state's values do not survive JSON ({error}): keep plain numbers, strings, "

@@ -1,9 +1,12 @@
 """Topology edits keep parameters, moments and statistics aligned."""
 
+from copy import deepcopy
+
+import pytest
 import torch
 
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import (
     Edit,
     Rows,
@@ -64,3 +67,11 @@ def test_per_primitive_state_follows_the_edit():
     moved = state.gathered(source, fresh)
     assert moved.per_primitive["count"].tolist() == [6.0, 0.0, 5.0]
     assert moved.values == {"a": 1}
+
+
+def test_the_state_that_all_runs_begin_with_cannot_be_changed():
+    for part in (EMPTY_STATE.values, EMPTY_STATE.tensors, EMPTY_STATE.per_primitive):
+        with pytest.raises(TypeError):
+            part["steps"] = 1
+    copy = deepcopy(EMPTY_STATE)
+    assert copy == EMPTY_STATE and copy.values is not EMPTY_STATE.values
