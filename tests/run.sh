@@ -29,5 +29,6 @@ case ",$extras," in *,lint,*)
     (cd "$here" && "$venv/bin/mypy")
     ;;
 esac
-"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --quiet \
+# A file's tests stay together: what they share is made once, and its kernels are compiled once.
+"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --dist loadfile --quiet \
     --rootdir "$here" --config-file "$here/pyproject.toml" "$here/tests" "$@"

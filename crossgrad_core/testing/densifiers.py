@@ -13,7 +13,7 @@ from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
 from crossgrad_core.errors import UserError
@@ -57,7 +57,7 @@ class DensifierRun:
     densifier: Densifier
     backbone: Backbone
     parameters: Parameters
-    state: PluginState = EMPTY_STATE
+    state: PluginState = field(default_factory=PluginState)
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     @classmethod

@@ -196,7 +196,7 @@ def state_survives_a_checkpoint(make: Make[Operator]) -> None:
     """After each step the state can be written, read and continued from, bit for bit."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
-        state, copy = EMPTY_STATE, EMPTY_STATE
+        state, copy = PluginState(), PluginState()
         for step in range(1, _STEPS + 1):
             case = operator_case(views, step)
             matrices, state = transformed(operator, case, state, step)

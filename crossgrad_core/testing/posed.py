@@ -12,7 +12,7 @@ from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.state import PluginState
 
 
 class _Blank:
@@ -78,7 +78,7 @@ class SamplerRun:
     steps: int = 30_000
     losses: Sequence[float] | None = None
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
-    state: PluginState = EMPTY_STATE
+    state: PluginState = field(default_factory=PluginState)
     step: int = 0
     last: StepRecord | None = None
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from crossgrad_core.contract.contexts import Draw, ScaleContext, StepRecord
 from crossgrad_core.contract.resolution import Resolution
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
@@ -28,7 +28,7 @@ class _Run:
     """Asks a resolution step by step, as a training run does."""
 
     resolution: Resolution
-    state: PluginState = EMPTY_STATE
+    state: PluginState = field(default_factory=PluginState)
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     last: StepRecord | None = None
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from time import perf_counter, process_time
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 #: What a budget counts: seconds of the clock on the wall, or of CPU time of the process.
 ClockKind = Literal["wall", "cpu"]
@@ -19,17 +19,7 @@ Phase = Literal[
 ]
 #: What a step spends time on: `photos` is choosing views and scales and having the photos at hand
 #: (decoding files is loading), `loss` has exposure, pixel weights and regularisation in it.
-PHASES: Final[tuple[Phase, ...]] = (
-    "photos",
-    "decode",
-    "render",
-    "loss",
-    "backward",
-    "aggregation",
-    "optimizer",
-    "density_control",
-    "other",
-)
+PHASES: Final[tuple[Phase, ...]] = get_args(Phase)
 
 
 @dataclass

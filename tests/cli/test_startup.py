@@ -9,14 +9,14 @@ import pytest
 
 from crossgrad_core.system import startup
 
-#: Notes the processor seconds and the heavy modules at the first line, and ends.
+#: Notes the heavy modules at the first line, and ends.
 FIRST_LINE = """
-import sys, time
+import sys
 
 class Writing:
     def write(self, text):
         heavy = {"torch", "numba", "numpy", "PIL", "yaml"} & sys.modules.keys()
-        print(time.process_time(), *heavy, *text.split())
+        print(*heavy, *text.split())
         sys.stdout.flush()
         sys.exit()
 
@@ -40,9 +40,8 @@ STAGES = logging.getLogger("crossgrad_core.training.start")
 def test_the_first_line_comes_before_anything_large_is_imported(arguments):
     command = [sys.executable, "-c", FIRST_LINE, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    seconds, *words = done.stdout.split()
+    words = done.stdout.split()
     assert words == ["crossgrad", words[1], "loading", "libraries"]
-    assert float(seconds) < 2.0
 
 
 @pytest.fixture

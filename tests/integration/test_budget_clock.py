@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
@@ -83,12 +84,13 @@ def test_other_budgets_may_have_threads(settings, threads, monkeypatch):
     check_clock(RunConfig(**settings))
 
 
-def test_a_run_on_the_cpu_clock_is_recorded_and_repeated(scene, tmp_path, capsys):
+def test_a_run_on_the_cpu_clock_is_recorded_and_repeated(scene, tmp_path, monkeypatch):
+    each_step_takes(monkeypatch, 0.02)
     given = {"scene": str(scene), "threads": 1, "seconds": 0.5, "clock": "cpu"}
     assert app.run({**given, "out": str(tmp_path / "timed")}, verbosity=-1) == 0
     rows = read_metrics(tmp_path / "timed")
     seconds = [row["cpu_seconds"] for row in rows]
-    assert seconds == sorted(seconds) and 0.3 < seconds[-1] < 5.0
+    assert seconds == sorted(seconds) and seconds[-1] == pytest.approx(0.5)
     summary = json.loads((tmp_path / "timed" / "summary.json").read_text())
     assert summary["cpu_seconds"] == pytest.approx(seconds[-1], abs=1e-3)
     assert "cpu" not in summary["seconds"]

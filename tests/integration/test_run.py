@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
@@ -134,11 +135,12 @@ def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scen
 def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_path, monkeypatch):
     # Whatever the probe of this machine says, the first plan is wrong.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps"))
+    each_step_takes(monkeypatch, 0.025)
     run(scene, tmp_path / "timed", steps=None, seconds=1.5, **GROWTH)
     stored = read_config(tmp_path / "timed")
     assert (stored["steps"], stored["seconds"]) == (40, None)
     last = load(latest(tmp_path / "timed")).step
-    assert stored["revisions"][-1][1] == last != 40
+    assert stored["revisions"][-1][1] == last == 60
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
     assert quality(tmp_path / "timed") == quality(tmp_path / "again")
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
@@ -147,6 +149,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
 def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkeypatch, capsys):
     # The plan is too short for density control (it would end in step 14), the run is not.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps"))
+    each_step_takes(monkeypatch, 0.05)
     times = {"events": "steps", "densify_from": 13, "densify_every": 1}
     settings = {**times, "steps": None, "seconds": 3.0}
     given = {"scene": str(scene), "out": str(tmp_path / "timed"), "threads": 1, **settings}
@@ -154,7 +157,7 @@ def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkey
     summary = json.loads((tmp_path / "timed" / "summary.json").read_text())
     told = [line for line in capsys.readouterr().err.splitlines() if "density control" in line]
     logged = (tmp_path / "timed" / "log.txt").read_text()
-    assert summary["step"] > 30
+    assert summary["step"] == 60
     assert not any("no density control" in note for note in summary["notes"])
     assert f"followed the clock: {summary['step']} steps instead of 28" in summary["notes"][-1]
     assert len(told) == 2 and told[0].startswith("- no density control")
