@@ -1,6 +1,6 @@
 """Whether two versions of crossgrad train to the same bits.
 
-    python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR]
+    python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR] [--for-new OPTIONS]
 
 OLD_PYTHON and NEW_PYTHON are the interpreters of two environments on this machine, each with one
 version installed. Every backbone with each of its densifiers, and every operator, sampler and
@@ -8,12 +8,14 @@ grouping at least once, trains the bundled scene for 60 steps with density contr
 is stopped at step 30 and resumed. Tensors, moments, plugin states, random streams, the PLY and
 metrics.csv without its clocks must be equal. Exit status 1 where anything differs.
 
-Where a difference is meant, the commit that makes it says why.
+Where a difference is meant, the commit that makes it says why. Where a default changed, `--for-new
+"--events steps"` gives the new version the options that keep what the old one does.
 """
 
 import argparse
 import csv
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -69,6 +71,7 @@ class Environment:
     """A version of crossgrad, driven through one process of its interpreter."""
 
     python: str
+    options: tuple[str, ...] = ()
     process: "subprocess.Popen[str]" = field(init=False)
 
     def __post_init__(self) -> None:
@@ -113,7 +116,7 @@ def cases(names: dict[str, list[str]]) -> Iterator[Case]:
 
 def trained(environment: Environment, case: Case, folder: Path) -> tuple[int, str]:
     """Trains a case into `folder`, stopped and resumed; the exit code and the last output."""
-    arguments = ("run", "--out", str(folder), *case.options, *USUAL)
+    arguments = ("run", "--out", str(folder), *case.options, *environment.options, *USUAL)
     code, said = environment.run(*arguments)
     if code != 0:
         return code, said
@@ -177,8 +180,12 @@ def main() -> None:
     parser.add_argument("new", help="interpreter with the new version")
     parser.add_argument("--only", default="", help="only cases whose name contains this text")
     parser.add_argument("--out", type=Path, help="where the runs go; default: a temporary folder")
+    parser.add_argument(
+        "--for-new", type=shlex.split, default=[], help="options that only the new version gets"
+    )
     arguments = parser.parse_args()
-    environments = [Environment(arguments.old), Environment(arguments.new)]
+    new = Environment(arguments.new, tuple(arguments.for_new))
+    environments = [Environment(arguments.old), new]
     names = environments[0].names("backbones", "densifiers", "operators", "samplers", "groupings")
     out = arguments.out or Path(tempfile.mkdtemp(prefix="same-bits-"))
     counts = {"equal": 0, "refused by both": 0, "different": 0}

@@ -13,22 +13,30 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+# Installing compiles no bytecode: most of it would never be imported, and it takes a minute.
 pip="$venv/bin/python -m pip --quiet --disable-pip-version-check"
-$pip install --constraint "$here/constraints.txt" build hatchling
+$pip install --no-compile --constraint "$here/constraints.txt" build hatchling
 "$venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$here" >"$work/build.log" 2>&1 ||
     { cat "$work/build.log"; exit 1; }
 wheel=$(ls "$work"/dist/crossgrad-*.whl)
-$pip install --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
+$pip install --no-compile --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
-$pip install --force-reinstall --no-deps "$wheel"
+$pip install --no-compile --force-reinstall --no-deps "$wheel"
 
 cd "$work"
+types=
 case ",$extras," in *,lint,*)
     "$venv/bin/ruff" check "$here"
     "$venv/bin/ruff" format --check "$here"
-    (cd "$here" && "$venv/bin/mypy")
+    # Beside the tests: it has one thread.
+    (cd "$here" && exec "$venv/bin/mypy") >"$work/types.log" 2>&1 &
+    types=$!
     ;;
 esac
-# A file's tests stay together: what they share is made once, and its kernels are compiled once.
-"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --dist loadfile --quiet \
-    --rootdir "$here" --config-file "$here/pyproject.toml" "$here/tests" "$@"
+# A file's tests stay together: what they share is made once. In the order of the files the
+# contracts compile the kernels that the matrix uses, not both at a time.
+"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --dist loadfile \
+    --no-loadscope-reorder --quiet --rootdir "$here" --config-file "$here/pyproject.toml" \
+    "$here/tests" "$@" && tests=0 || tests=$?
+[ -z "$types" ] || wait "$types" || { cat "$work/types.log"; exit 1; }
+exit "$tests"

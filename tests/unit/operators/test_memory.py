@@ -23,7 +23,7 @@ def repeat(ask, operator, rows, steps, state=EMPTY_STATE, **circumstances):
 
 def revived(state):
     """As a checkpoint gives it back."""
-    values = json.loads(json.dumps(state.values))
+    values = json.loads(json.dumps(dict(state.values)))
     tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}
     rows = {name: tensor.clone() for name, tensor in state.per_primitive.items()}
     return PluginState(values, tensors, rows)
