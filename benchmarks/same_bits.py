@@ -1,6 +1,7 @@
 """Whether two versions of crossgrad train to the same bits.
 
-    python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR] [--for-new OPTIONS]
+    python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR]
+        [--for-new OPTIONS]
 
 OLD_PYTHON and NEW_PYTHON are the interpreters of two environments on this machine, each with one
 version installed. Every backbone with each of its densifiers, and every operator, sampler and
