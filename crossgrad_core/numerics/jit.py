@@ -4,9 +4,6 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, cast
 
 from numba import njit
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
-from typing_extensions import override
 
 from crossgrad_core.numerics.kernel_cache import cache_for
 
@@ -18,28 +15,6 @@ _COMPILE = cast("Callable[..., Any]", njit)
 #: Fused multiply-add may be formed and the sign of zero is free; apart from that arithmetic is IEEE
 #: in the order written, so NaN and infinity stay visible.
 _FLAGS = {"contract", "nsz"}
-
-
-class _UnoptimisedCode(JITCodeLibrary):
-    """Code that stays as it was generated."""
-
-    @override
-    def _optimize_final_module(self) -> None:
-        pass
-
-
-class _PartCompiler(Compiler):
-    """For functions that only strict kernels call: each caller optimises them with its own code.
-
-    Optimising them on their own as well took half of the time of compiling a solver.
-    """
-
-    @override
-    def compile_extra(self, function: Callable[..., Any]) -> Any:
-        codegen = self.state.targetctx.codegen()
-        self.state.library = _UnoptimisedCode(codegen, function.__qualname__)
-        self.state.library.enable_object_caching()
-        return super().compile_extra(function)
 
 
 def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
@@ -63,13 +38,12 @@ def strict_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def strict_device(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function that strict kernels call; becomes part of the caller."""
-    return inlined(function, pipeline_class=_PartCompiler)
+    return inlined(function)
 
 
 def strict_part(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of its own that only strict kernels call."""
-    part = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return compiled(function, pipeline_class=_PartCompiler, **part)
+    return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def strict_parallel_kernel(function: Callable[P, R]) -> Callable[P, R]:

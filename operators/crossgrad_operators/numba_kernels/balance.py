@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_operators.numba_kernels.linear import (
     eigen,
     smallest_pivot,
@@ -37,7 +37,7 @@ CLOSE = 0.25
 ENDLESS = 3e7
 
 
-@strict_part
+@strict_kernel
 def _compact(
     gramian: Floats, present: Flags, norms: Floats, cosines: Floats, places: Indices
 ) -> int:
@@ -57,7 +57,7 @@ def _compact(
     return count
 
 
-@strict_part
+@strict_kernel
 def _shortest_solution(norms: Floats, cosines: Floats, rank: int) -> Floats:
     """The shortest v with least |G v - (|g_k|)| for G of the given rank below full."""
     n = norms.size
@@ -82,7 +82,7 @@ def _shortest_solution(norms: Floats, cosines: Floats, rank: int) -> Floats:
     return v
 
 
-@strict_part
+@strict_kernel
 def _equal_projections(norms: Floats, cosines: Floats, v: Floats) -> float:
     """Solves G v = (|g_k|); the shortest least-squares solution where G is singular.
 
@@ -171,7 +171,7 @@ def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) ->
     return float(np.sqrt(max(square, 0.0)))
 
 
-@strict_part
+@strict_kernel
 def bargain(cosines: Floats, beta: Floats) -> bool:
     """Solves C beta = 1 / beta for beta > 0 by damped Newton; False where there is no such beta.
 
@@ -203,7 +203,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
     return False
 
 
-@strict_part
+@strict_kernel
 def geometric_mean(values: Floats) -> float:
     """The n-th root of a product, with the exponents apart so that it neither fades nor loses."""
     mantissa, exponent = 1.0, 0

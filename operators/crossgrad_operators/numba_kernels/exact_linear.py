@@ -11,7 +11,7 @@ from crossgrad_core.numerics.double_double import (
     multiply,
     square_root,
 )
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Off-diagonal elements up to this share of the diagonal ones count as zero.
@@ -22,7 +22,7 @@ VANISHING = 1e-140
 SWEEPS = 40
 
 
-@strict_part
+@strict_kernel
 def exact_cosines(gramian: Floats, remainder: Floats, places: Indices) -> tuple[Floats, Floats]:
     """Norms [2, n] and cosines [2, n, n], high and low, of the views at `places` [n]."""
     n = places.size
@@ -77,7 +77,7 @@ def _turn(
     return one, one_low, other, other_low
 
 
-@strict_part
+@strict_kernel
 def _rotation(matrix: Floats, p: int, q: int, rotation: Floats) -> None:
     """Cosine and sine [2, 2] of the rotation that clears the element (p, q), and both diagonals."""
     x, x_low = matrix[0, p, q], matrix[1, p, q]
@@ -107,7 +107,7 @@ def _rotation(matrix: Floats, p: int, q: int, rotation: Floats) -> None:
     matrix[:, q, p] = 0.0
 
 
-@strict_part
+@strict_kernel
 def _rotate(matrix: Floats, vectors: Floats, p: int, q: int, rotation: Floats) -> None:
     """One Jacobi rotation of the rest of a matrix and of its eigenvectors."""
     for k in range(matrix.shape[1]):
@@ -126,7 +126,7 @@ def _rotate(matrix: Floats, vectors: Floats, p: int, q: int, rotation: Floats) -
         vectors[0, k, q], vectors[1, k, q] = b, b_low
 
 
-@strict_part
+@strict_kernel
 def exact_eigen(matrix: Floats, vectors: Floats) -> None:
     """Eigenvalues of a positive semi-definite matrix [2, n, n], left on its diagonal.
 
@@ -156,7 +156,7 @@ def exact_eigen(matrix: Floats, vectors: Floats) -> None:
             return
 
 
-@strict_part
+@strict_kernel
 def graded(cosines: Floats, norms: Floats, out: Floats) -> None:
     """D C D [2, n, n] with D the norms [2, n] over the longest one."""
     n = norms.shape[1]

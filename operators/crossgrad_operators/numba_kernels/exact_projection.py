@@ -3,12 +3,12 @@
 import numpy as np
 
 from crossgrad_core.numerics.double_double import add, divide, multiply, square_root
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_operators.numba_kernels.exact_linear import exact_cosines, exact_form, inner
 from crossgrad_operators.numba_kernels.normal import CANCELLED, OPPOSITE, Flags, Floats, Indices
 
 
-@strict_part
+@strict_kernel
 def _partners(order: Indices, places: Indices) -> Indices:
     """[n, n - 1] partners of the views at `places`, as positions there, in their order [K, K]."""
     n = places.size
@@ -25,7 +25,7 @@ def _partners(order: Indices, places: Indices) -> Indices:
     return partners
 
 
-@strict_part
+@strict_kernel
 def _remaining(v: Floats, cosines: Floats) -> tuple[float, float]:
     """The length of a projected vector; it becomes zero where only rounding noise is left."""
     square, square_low = exact_form(cosines, v)
@@ -48,7 +48,7 @@ def _shift(v: Floats, j: int, x: float, x_low: float) -> None:
     v[0, j], v[1, j] = add(v[0, j], v[1, j], x, x_low)
 
 
-@strict_part
+@strict_kernel
 def _as_row(v: Floats, norms: Floats, places: Indices, i: int, row: Floats) -> None:
     """Coefficients of unit vectors, in units of |g_i|, as coefficients of the gradients."""
     for k in range(places.size):
@@ -57,7 +57,7 @@ def _as_row(v: Floats, norms: Floats, places: Indices, i: int, row: Floats) -> N
             row[places[k]] = multiply(v[0, k], v[1, k], ratio, ratio_low)[0]
 
 
-@strict_part
+@strict_kernel
 def _project(
     cosines: Floats, i: int, partners: Indices, gates: Flags, rule: tuple[float, float], v: Floats
 ) -> None:
@@ -110,7 +110,7 @@ def exact_projected(
     return result
 
 
-@strict_part
+@strict_kernel
 def _raised(
     phi: float, phi_low: float, t: float, size: float, size_low: float
 ) -> tuple[float, float]:
@@ -129,7 +129,7 @@ def _raised(
     return multiply(x, x_low, size, size_low)
 
 
-@strict_part
+@strict_kernel
 def _vaccinate(
     cosines: Floats, i: int, partners: Indices, targets: Floats, beta: float, v: Floats
 ) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_part
+from crossgrad_core.numerics.jit import strict_kernel
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Smallest pivot of a Cholesky factor of cosines. Smaller ones are rounding noise of a singular
@@ -13,7 +13,7 @@ PIVOT = 1e-15
 SWEEPS = 30
 
 
-@strict_part
+@strict_kernel
 def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Floats) -> None:
     """Solves M_SS x = r_S for positive semi-definite M of unit diagonal by Cholesky.
 
@@ -49,7 +49,7 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
         out[chosen[i]] = x[i]
 
 
-@strict_part
+@strict_kernel
 def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
     """Solves (1 + M) x = r for positive semi-definite M by Cholesky.
 
@@ -83,7 +83,7 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
         out[i] = total / lower[i, i]
 
 
-@strict_part
+@strict_kernel
 def smallest_pivot(cosines: Floats, count: int) -> float:
     """The last pivot of Cholesky's factor with the largest pivot first; at least 0.
 
@@ -110,7 +110,7 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
     return pivot
 
 
-@strict_part
+@strict_kernel
 def eigen(matrix: Floats, vectors: Floats) -> Floats:
     """Eigenvalues [n] of a positive semi-definite matrix (destroyed), vectors [n, n] as columns.
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -22,7 +22,7 @@ EPSILON = 2.220446049250313e-16
 CAUTION = 4.0
 
 
-@strict_part
+@strict_kernel
 def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
     """Fills norms [K] and cosines [K, K] of one Gramian; zero for views that are not present."""
     views = present.size
@@ -38,7 +38,7 @@ def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) 
             cosines[j, i] = c
 
 
-@strict_part
+@strict_kernel
 def form(a: Floats, cosines: Floats, b: Floats) -> float:
     """a^T C b."""
     total = 0.0

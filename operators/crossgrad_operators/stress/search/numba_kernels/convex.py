@@ -82,7 +82,7 @@ def _projection(cosines: Floats, b: Floats, present: Flags, z: Floats) -> float:
     return trust
 
 
-@strict_part
+@strict_kernel
 def on_cone(norms_of: Floats, cosines_of: Floats, present: Flags, apart: bool) -> Solved:
     """Each gradient projected (UPGrad), or all at once (DualProj), over K."""
     blocks, views = present.shape
@@ -240,7 +240,7 @@ def _pair_cosine(cosines: Floats) -> float:
     return least
 
 
-@strict_part
+@strict_kernel
 def on_simplex(norms_of: Floats, cosines_of: Floats, present: Flags, c: float) -> Solved:
     """CAGrad: g_0 + v, v the best of length c |g_0|; of two that are opposite v = -c g_0."""
     blocks, views = present.shape
