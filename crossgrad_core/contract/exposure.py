@@ -87,6 +87,13 @@ class Exposure(Component):
         """
         return values
 
+    def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        """The values [P, ...] of a parameter, all changed alike, so that `start` would be `end`.
+
+        By default by a sum. Photos keep what they differ by, whatever level a file has them at.
+        """
+        return values + (end - start)
+
     def unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:

@@ -83,7 +83,8 @@ def _with_known(setup: Setup, starts: Mapping[str, Tensor]) -> Mapping[str, Tens
     merged = {}
     for name, start in starts.items():
         values = torch.stack([known[names[row]][name] for row in rows])
-        merged[name] = start + (values - start[rows]).mean(dim=0)
+        level, known_level = start[rows].mean(dim=0), values.mean(dim=0)
+        merged[name] = setup.exposure.moved(name, start, level, known_level)
         merged[name][rows] = values
     return setup.exposure.projected(merged)
 

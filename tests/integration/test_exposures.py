@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -143,18 +142,31 @@ def test_values_of_another_run_are_where_this_one_starts(varied, tmp_path):
     assert str(values) in config.read_text()
 
 
-def test_photos_that_the_file_lacks_keep_their_distance(varied, tmp_path):
+@pytest.mark.parametrize("model", ["gain", "affine"])
+def test_photos_that_the_file_lacks_keep_their_distance(varied, tmp_path, model):
+    """The file has three photos, each three stops brighter than in the run before."""
+    kind = "matrix" if model == "affine" else "stops"
+
+    def levels(values):
+        numbers = (np.array(values[name][kind]) for name in sorted(values))
+        return [2.4 * np.log2(each[1, 1]) if model == "affine" else each for each in numbers]
+
+    def brighter(value):
+        if model == "gain":
+            return value + 3.0
+        return (np.array(value) @ np.diag([2.0**1.25] * 3 + [1.0])).tolist()
+
+    exposure = {"name": model, "rate": 0.0}
     values = tmp_path / "exposure.json"
-    assert run(varied, tmp_path / "first", steps=1, exposure={"name": "gain", "rate": 0.0}) == 0
+    assert run(varied, tmp_path / "first", steps=1, exposure=exposure) == 0
     known = photos(tmp_path / "first")[1]
-    some = {name: {"stops": known[name]["stops"] + 3.0} for name in sorted(known)[:3]}
-    values.write_text(json.dumps({"format": 1, "exposure": "gain", "photos": some}))
-    kept = {"exposure": {"name": "gain", "rate": 0.0}, "exposure_from": str(values)}
+    some = {name: {kind: brighter(known[name][kind])} for name in sorted(known)[:3]}
+    values.write_text(json.dumps({"format": 1, "exposure": model, "photos": some}))
+    kept = {"exposure": exposure, "exposure_from": str(values)}
     assert run(varied, tmp_path / "second", steps=1, **kept) == 0
-    for one, other in pairwise(sorted(known)):
-        before = known[other]["stops"] - known[one]["stops"]
-        after = photos(tmp_path / "second")[1]
-        assert after[other]["stops"] - after[one]["stops"] == pytest.approx(before, abs=1e-5)
+    after = photos(tmp_path / "second")[1]
+    assert after.keys() == known.keys()
+    assert np.diff(levels(after)) == pytest.approx(np.diff(levels(known)), abs=1e-5)
 
 
 WRONG = {

@@ -11,6 +11,9 @@ from crossgrad_plugins.exposures.light import mapped
 from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET
 
+#: Maps that (nearly) lose a colour cannot be undone; only files and very large rates bring them.
+_LARGEST_INVERSE = 1e3
+
 
 class Affine(ExposurePerPhoto):
     """Each photo has A x + b for the render's sRGB value x; the mean of all maps is the identity.
@@ -34,6 +37,17 @@ class Affine(ExposurePerPhoto):
         ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
         diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
         return torch.cat([scale * diagonal, (scale - 1.0) * OFFSET * ones], dim=-1)
+
+    @override
+    def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        # A sum would change what photos differ by, and make negatives of dark ones. So each map
+        # comes after `end` and the inverse of `start`.
+        inverse, failed = torch.linalg.inv_ex(start[:, :3])
+        if failed or not inverse.abs().max() < _LARGEST_INVERSE:
+            return super().moved(name, values, start, end)
+        linear = values[..., :3] @ inverse
+        constant = values[..., 3:] + linear @ (end[:, 3:] - start[:, 3:])
+        return torch.cat([linear @ end[:, :3], constant], dim=-1)
 
     @override
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:

@@ -66,7 +66,8 @@ class ExposurePerPhoto(Exposure):
 
     def _centred(self, values: Tensor) -> Tensor:
         """The values [P, V] in float64 with their mean where it belongs, in float32."""
-        return (values - values.mean(dim=0) + self.neutral().to(values)).float()
+        neutral = self.neutral().to(values)
+        return self.moved(self.parameter, values, values.mean(dim=0), neutral).float()
 
     @override
     def unseen(
