@@ -62,8 +62,11 @@ class Exposure(Component):
         """
         return Fitted(self)
 
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
-        """What the user should know about this exposure and the scene; asked of new runs only."""
+    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+        """What the user should know about this exposure and the scene; asked of new runs only.
+
+        `known` are the values [P, ...] at the start by name, if the user has a file; else empty.
+        """
         return ()
 
     def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
@@ -88,9 +91,9 @@ class Exposure(Component):
         return values
 
     def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        """The values [P, ...] of a parameter, all changed alike, so that `start` would be `end`.
+        """The values [P, ...] of a parameter, all moved by what makes `end` of `start`.
 
-        By default by a sum. Photos keep what they differ by, whatever level a file has them at.
+        By default by a sum. What photos differ by stays, at whatever level a file has them.
         """
         return values + (end - start)
 

@@ -45,7 +45,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
-from crossgrad_core.training.photo_parameters import check_known
+from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
@@ -165,8 +165,8 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
     """The setup with what its exposure says about the scene, and the seconds that it took."""
     start = perf_counter()
-    notes = (*setup.notes, *setup.exposure.remarks(setup.scene))
-    return replace(setup, notes=notes), perf_counter() - start
+    remarks = setup.exposure.remarks(setup.scene, known_starts(setup))
+    return replace(setup, notes=(*setup.notes, *remarks)), perf_counter() - start
 
 
 def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]:
@@ -178,7 +178,7 @@ def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]
     check_clock(config)
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
-    check_known(setup)
+    known_starts(setup)
     return setup, load_seconds + _held_out_decoded(setup)
 
 

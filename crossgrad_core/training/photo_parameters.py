@@ -42,7 +42,7 @@ def started(setup: Setup) -> PluginState | None:
     for name, start in starts.items():
         _check(setup, f"starts parameter {name} with", start)
     tensors = {}
-    for name, each in _with_known(setup, starts).items():
+    for name, each in (known_starts(setup) or starts).items():
         start = each.detach().to(setup.device).clone()
         tensors[f"{_VALUE}.{name}"] = start
         tensors[f"{_FIRST}.{name}"] = torch.zeros_like(start)
@@ -51,24 +51,18 @@ def started(setup: Setup) -> PluginState | None:
     return PluginState({"photos": [view.name for view in setup.train_views]}, tensors)
 
 
-def check_known(setup: Setup) -> None:
-    """Refuses a file of values that are of no training photo, or do not fit.
-
-    Raises:
-        UserError: It is such a file.
-    """
-    if setup.config.exposure_from is not None and setup.per_photo:
-        _with_known(setup, {name: each.first() for name, each in setup.per_photo.items()})
-
-
-def _with_known(setup: Setup, starts: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """The starts with the values of photos that the user has a file of.
+def known_starts(setup: Setup) -> Mapping[str, Tensor]:
+    """The starts with the values of photos that the user has a file of; empty without one.
 
     Photos that are not in it keep what they differ by from those that are, on average.
+
+    Raises:
+        UserError: Its values are of no training photo, or do not fit.
     """
     path = setup.config.exposure_from
     if path is None:
-        return starts
+        return {}
+    starts = {name: each.first() for name, each in setup.per_photo.items()}
     known = read_values(path, starts)
     names = [view.name for view in setup.train_views]
     rows = [row for row, name in enumerate(names) if name in known]
@@ -83,8 +77,7 @@ def _with_known(setup: Setup, starts: Mapping[str, Tensor]) -> Mapping[str, Tens
     merged = {}
     for name, start in starts.items():
         values = torch.stack([known[names[row]][name] for row in rows])
-        level, known_level = start[rows].mean(dim=0), values.mean(dim=0)
-        merged[name] = setup.exposure.moved(name, start, level, known_level)
+        merged[name] = setup.exposure.moved(name, start, start[rows].mean(0), values.mean(0))
         merged[name][rows] = values
     return setup.exposure.projected(merged)
 

@@ -9,10 +9,12 @@ from typing_extensions import override
 
 from crossgrad_plugins.exposures.light import mapped
 from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
-from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET
+from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET, STRETCH
 
 #: Maps that (nearly) lose a colour cannot be undone; only files and very large rates bring them.
 _LARGEST_INVERSE = 1e3
+#: What makes black of white is taken for so small a scale: 48 stops.
+_DARKEST = 2.0**-20
 
 
 class Affine(ExposurePerPhoto):
@@ -37,6 +39,11 @@ class Affine(ExposurePerPhoto):
         ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
         diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
         return torch.cat([scale * diagonal, (scale - 1.0) * OFFSET * ones], dim=-1)
+
+    @override
+    def in_stops(self, values: Tensor) -> Tensor:
+        white = values.sum(dim=-1) + OFFSET
+        return EXPONENT * (white / STRETCH).clamp(min=_DARKEST).log2()
 
     @override
     def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:

@@ -25,6 +25,10 @@ class ChannelGain(ExposurePerPhoto):
         return stops[..., None].expand(*stops.shape, 3)
 
     @override
+    def in_stops(self, values: Tensor) -> Tensor:
+        return values
+
+    @override
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:
         return values + stops[:, None]
 

@@ -29,6 +29,10 @@ class Gain(ExposurePerPhoto):
         return stops
 
     @override
+    def in_stops(self, values: Tensor) -> Tensor:
+        return values
+
+    @override
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:
         return values + stops
 

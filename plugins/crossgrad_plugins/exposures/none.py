@@ -19,7 +19,7 @@ class NoExposure(Exposure):
         return image
 
     @override
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
+    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
         """Names the option that helps where SfM tracks say that photos differ in exposure."""
         views = scene.train_views
         if not any(len(view.seen) for view in views):

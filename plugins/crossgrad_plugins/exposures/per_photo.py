@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, LearningRate, PerPhoto, Scene, Selection, View
 from crossgrad_plugins.exposures.exif import exposure_values
-from crossgrad_plugins.exposures.starts import Start, starts_of
+from crossgrad_plugins.exposures.starts import Start, far_ones, starts_of
 
 
 class ExposurePerPhoto(Exposure):
@@ -41,6 +41,10 @@ class ExposurePerPhoto(Exposure):
         """Values [..., V] that stand for gains of so many stops [...]."""
 
     @abstractmethod
+    def in_stops(self, values: Tensor) -> Tensor:
+        """Stops [...] or [..., 3] by which values [..., V] brighten what is white."""
+
+    @abstractmethod
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:
         """Values [P, V] of photos that differ from those of `values` by stops [P]."""
 
@@ -57,8 +61,12 @@ class ExposurePerPhoto(Exposure):
         return {self.parameter: PerPhoto(start, LearningRate(self.rate, self.rate * self.decay))}
 
     @override
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
-        return starts_of(scene, self.start).remarks
+    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+        if not known:
+            return starts_of(scene, self.start).remarks
+        names = [view.name for view in scene.train_views]
+        stops = self.in_stops(known[self.parameter]).abs().reshape(len(names), -1)
+        return tuple(far_ones(names, stops.amax(dim=1).tolist()))
 
     @override
     def projected(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:

@@ -62,7 +62,7 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     remarks += _told_by("EXIF", [name for name in of_exif if name not in of_tracks])
     if start != "none":
         remarks += _told_by("the mean of their regime, for want of usable tracks and EXIF", rest)
-    remarks += _far(names, stops)
+    remarks += far_ones(names, stops)
     return Starts(stops, tuple(remarks))
 
 
@@ -94,7 +94,8 @@ def _told_by(source: str, names: Sequence[str]) -> Iterable[str]:
         yield f"exposure: {len(names)} photos start from {source} ({_some(names)})"
 
 
-def _far(names: Sequence[str], stops: NDArray[np.float64]) -> Iterable[str]:
+def far_ones(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
+    """What there is to say of photos, each with its stops from the mean."""
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (

@@ -103,3 +103,24 @@ def test_values_move_from_one_level_to_another(model):
     found = model.moved(model.parameter, values, start, end)
     expected = model.of_stops(torch.tensor([1.0, 5.0, 9.0]).double())
     assert torch.allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=NAMES)
+@pytest.mark.parametrize("stops", [0.0, 3.5, 10.0])
+def test_photos_that_a_file_puts_far_from_the_mean_are_named(model, stops):
+    levels = torch.tensor([stops, *[0.0] * 30, -stops]).double()
+    known = model.projected({model.parameter: model.of_stops(levels)})
+    remarks = model.remarks(scene_of(len(levels)), known)
+    if stops < 4:
+        assert remarks == ()
+    else:
+        assert len(remarks) == 1
+        assert "2 photos are more than 4 stops from the mean (0.png, 31.png)" in remarks[0]
+
+
+def test_one_channel_far_off_is_enough_and_black_is_far():
+    for model, value in ((ChannelGain(), [0.0, -7, 7]), (Affine(), torch.zeros(3, 4).tolist())):
+        known = torch.stack([model.neutral()] * 3)
+        known[1] = torch.tensor(value)
+        (remark,) = model.remarks(scene_of(3), {model.parameter: known})
+        assert "1 photos" in remark and "1.png" in remark
