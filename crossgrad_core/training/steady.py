@@ -48,12 +48,10 @@ def faded(config: RunConfig, rate: LearningRate, step: int, total: int) -> float
 
     Rates that decay by themselves do so as published.
     """
-    share = final_decay_of(config)
-    if share == 0.0 or rate.decays:
+    step, start = min(step, total), (1.0 - final_decay_of(config)) * total
+    if rate.decays or step <= start:
         return 1.0
-    start = (1.0 - share) * total
-    over = min(max((step - start) / (total - start), 0.0), 1.0)
-    return float(config.final_rate**over)
+    return float(config.final_rate ** ((step - start) / (total - start)))
 
 
 def notes_on(config: RunConfig) -> tuple[str, ...]:
@@ -79,10 +77,11 @@ def follow(setup: Setup, state: TrainState) -> None:
     if share == 0.0:
         return
     total = setup.schedule.total
-    if state.step <= (1.0 - share) * total:
+    before = int((1.0 - share) * total)
+    if state.step <= before:
         restart(state)  # The run has become longer.
         return
-    every = max(1, round(share * total / SAMPLES))
+    every = -(-(total - before) // SAMPLES)
     if (total - state.step) % every == 0:
         _add(setup, state)
 

@@ -65,6 +65,10 @@ def same(one, two):
         (0.2, 1000, 0.01),
         (1.0, 500, 0.1),
         (1.0, 1, 0.01**0.001),
+        (1e-17, 999, 1.0),
+        (1e-17, 1000, 1.0),
+        (1e-9, 999, 1.0),
+        (1e-9, 1000, 0.01),
     ],
 )
 def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left):
@@ -180,7 +184,15 @@ def fake(total, share, states=None):
 
 @pytest.mark.parametrize(
     ("total", "share", "count"),
-    [(400, 0.1, 40), (400, 0.25, 100), (1000, 1.0, 100), (30_000, 0.1, 100), (30_000, 0.5, 100)],
+    [
+        (400, 0.1, 40),
+        (400, 0.25, 100),
+        (1000, 1.0, 100),
+        (1001, 0.1, 51),
+        (1490, 0.1, 75),
+        (30_000, 0.1, 100),
+        (30_000, 0.5, 100),
+    ],
 )
 def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, share, count):
     setup, state = fake(total, share)
@@ -193,6 +205,18 @@ def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, shar
     assert len(taken) == state.states[STATE].values["count"] == count
     assert taken[-1] == total and taken[0] > (1 - share) * total
     assert len(set(np.diff(taken))) == 1
+
+
+def test_no_length_and_share_has_more_than_a_hundred():
+    for total in (99, 100, 1000, 1490, 2001):
+        for share in np.linspace(0.01, 1.0, 12):
+            window = sum(step > (1.0 - share) * total for step in range(1, total + 1))
+            setup, state = fake(total, float(share))
+            state.commit = lambda _: taken.append(state.step)  # noqa: B023 - called in this turn
+            taken = []
+            for state.step in range(1, total + 1):
+                follow(setup, state)
+            assert min(window, 50) <= len(taken) <= 100
 
 
 def test_sums_of_many_states_lose_nothing():
