@@ -27,7 +27,7 @@ from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.defaults import CHAIN, EXPORTER, READER
+from crossgrad_core.defaults import CHAIN, EXPORTER, METRICS, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
@@ -258,7 +258,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         exposure=fitted.exposure,
         resolution=_built(Resolution, config.resolution),
         exporter=_built(Exporter, config.exporter),
-        metrics=_metrics(config, scene),
+        metrics=_metrics(config, scene, notes),
         names=names,
         views_per_step=max(views.counts),
         device=device.type,
@@ -281,22 +281,29 @@ def _built(slot: type[C], choice: ComponentChoice) -> C:
     return build(slot, choice.name, choice.options)
 
 
-def _metrics(config: RunConfig, scene: Scene) -> dict[str, Metric]:
-    """The metrics by name.
+def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:
+    """The metrics by name; of those by default only what gives each column a name of its own.
 
     Raises:
         UserError: Two columns of metrics.csv would have one name.
     """
-    metrics = {each.name: _built(Metric, each) for each in config.metrics}
+    metrics: dict[str, Metric] = {}
     regimes = sorted({view.regime for view in scene.test_views})
-    columns = columns_for(regimes, [metric.figure for metric in metrics.values()])
-    if twice := sorted({name for name in columns if columns.count(name) > 1}):
-        raise UserError(
-            f"two columns of metrics.csv would be called {listed(twice)}",
-            where=f"metrics {listed(metrics)}; regimes {listed(regimes)}",
-            expected="figures whose names are no other's, nor those of another one in a regime",
-            todo="leave one of the metrics out, or rename the folder of photos",
-        )
+    for name, choice in {each.name: each for each in config.metrics}.items():
+        metric = _built(Metric, choice)
+        columns = columns_for(regimes, [each.figure for each in (*metrics.values(), metric)])
+        twice = sorted({each for each in columns if columns.count(each) > 1})
+        if not twice:
+            metrics[name] = metric
+        elif name in METRICS.split("+"):
+            notes.append(f"metric {name} is left out: metrics.csv has a column {listed(twice)}")
+        else:
+            raise UserError(
+                f"two columns of metrics.csv would be called {listed(twice)}",
+                where=f"metrics {listed((*metrics, name))}; regimes {listed(regimes)}",
+                expected="figures whose names are no other's, nor those of another one in a regime",
+                todo=f"leave metric {name} out, or rename the folder of photos",
+            )
     return metrics
 
 
