@@ -1,14 +1,15 @@
 """Which views density control gets the statistics of."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from crossgrad_core.contract.contexts import Draw, ViewRecord
 from crossgrad_core.training.regrouping import groups_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import is_observed, observe_view
+from crossgrad_core.training.views import observe_view
 
-#: Name of the stream of random numbers that further views are drawn from.
+#: Name of the stream that all random numbers of further views come from.
 STREAM = "density"
 
 
@@ -20,11 +21,15 @@ def observed_views(
     Raises:
         NonFiniteError: The loss of the further view is not finite.
     """
-    views = len(records)
-    own = (record for slot, record in enumerate(records) if is_observed(setup, state, slot, views))
-    if setup.config.density_views != "extra" or not setup.schedule.collects(state.step):
-        return tuple(own)
+    if setup.config.density_views == "one":
+        # Each place of a draw in turn, as samplers may always put the same group first.
+        return (records[state.step % len(records)],)
+    wanted = setup.schedule.grows and setup.schedule.collects(state.step)
+    if setup.config.density_views != "extra" or not wanted:
+        return tuple(records)
+    # Whatever is drawn for the further view, its background and what plugins draw included.
+    state = replace(state, rngs=dict.fromkeys(state.rngs, state.rngs[STREAM]))
     index = int(state.rngs[STREAM].integers(len(setup.train_views)))
     groups = groups_of(setup, state)
     draw = Draw((index,), None if groups is None else (groups[index],))
-    return (*own, observe_view(setup, state, draw, records[0].scale))
+    return (*records, observe_view(setup, state, draw, records[0].scale))

@@ -151,15 +151,6 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
     return _Drawn(record, gaussians, loss, leaves)
 
 
-def is_observed(setup: Setup, state: TrainState, slot: int, views: int) -> bool:
-    """Whether density control gets the statistics of a view of the step.
-
-    Of one view where the run says so: each place of a draw in turn, as samplers may always put the
-    same group first.
-    """
-    return setup.config.density_views != "one" or slot == state.step % views
-
-
 def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:
     """Renders the one view of `draw` for its statistics: nobody takes its gradients.
 

@@ -2,6 +2,7 @@
 
 from math import prod, sqrt
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +17,7 @@ from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.coefficients import BETAS, EPS, Rule
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
+from crossgrad_core.training.rngs import STREAMS
 from crossgrad_core.training.start import first_state
 
 
@@ -142,7 +144,8 @@ def test_statistics_of_one_view_are_those_of_each_place_in_turn():
 @pytest.mark.parametrize("views", [1, 2])
 def test_an_extra_view_is_rendered_while_density_control_lasts(views):
     seen = Observed()
-    setup, state = trained(40, seen, views=views, density_views="extra")
+    asked = {"views": views, "fewest_edits": 6}
+    setup, state = trained(40, seen, density_views="extra", **asked)
     last = 20  # of 40: density control ends in the middle
     assert [setup.schedule.collects(step) for step in (last - 1, last + 1)] == [True, False]
     extra = sum(map(setup.schedule.collects, range(1, 41)))
@@ -152,19 +155,38 @@ def test_an_extra_view_is_rendered_while_density_control_lasts(views):
     assert len({got[views] for got in seen.got[:extra]}) > 4
 
 
+@pytest.mark.parametrize("views", [1, 2])
+def test_no_further_view_is_rendered_where_no_edit_will_come(views):
+    setup, state = trained(12, views=views, density_views="extra")
+    assert setup.schedule.collects(12) and not setup.schedule.grows
+    assert state.counters.views == 12 * views
+
+
+class Weighing:
+    """Weighs pixels by random numbers."""
+
+    @hookimpl
+    def crossgrad_pixel_weights(self, context):
+        shape = (context.camera.height, context.camera.width)
+        return torch.from_numpy(context.rng.random(shape, dtype=np.float32))
+
+
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_before_the_first_edit_they_change_no_bit(choice, operator):
-    settings = {"views": 2, "steps": 400, "operator": {"name": operator}}
+    settings = {"views": 2, "steps": 400, "operator": {"name": operator}, "fewest_edits": 6}
     (setup, state), (_, other) = (
-        trained(8, density_views=each, **settings) for each in ("all", choice)
+        trained(8, Weighing(), density_views=each, background="random", **settings)
+        for each in ("all", choice)
     )
-    assert setup.schedule.first_edit > 8
+    assert setup.schedule.first_edit > 8 and setup.weighs
+    assert other.counters.views == 16 + 8 * (choice == "extra")
     assert all(torch.equal(t, other.parameters[n]) for n, t in state.parameters.items())
     for n, moment in state.adam.exp_avg_sq.items():
         assert torch.equal(moment, other.adam.exp_avg_sq[n])
-    rngs = (each.rngs["sampler"].bit_generator.state for each in (state, other))
-    assert next(rngs) == next(rngs)
+    for name in set(STREAMS) - {"density"}:
+        rngs = (each.rngs[name].bit_generator.state for each in (state, other))
+        assert next(rngs) == next(rngs)
 
 
 @pytest.mark.parametrize("choice", ["one", "extra"])
