@@ -335,6 +335,7 @@ class DensifyContext(StepContext):
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
+        share: Number of these over that of all views of the step; 1 but for `--density-views`.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
         render: Renders a training view of the densifier's choice: on the training clock, and
@@ -348,6 +349,7 @@ class DensifyContext(StepContext):
     means_lr: float
     room: int
     render: RenderOnRequest = field(default_factory=NoRenders, kw_only=True)
+    share: float = field(default=1.0, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

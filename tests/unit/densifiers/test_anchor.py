@@ -311,6 +311,22 @@ def test_transparent_anchors_go_once_they_were_seen_often():
     assert len(new_state.per_primitive["views"]) == count
 
 
+@pytest.mark.parametrize("share", [0.5, 1.5])
+def test_a_share_of_the_views_is_judged_as_all_of_them_are(share):
+    parameters = model()
+    whole = state_of(parameters)
+    part = PluginState(per_primitive={n: share * sums for n, sums in whole.per_primitive.items()})
+    expected, kept = AnchorControl().densify(context(parameters), whole)
+    found, left = AnchorControl().densify(replace(context(parameters), share=share), part)
+    assert dict(found.counts) == dict(expected.counts) and min(expected.counts.values()) > 0
+    assert torch.equal(found.source, expected.source)
+    # As many views as all of them would be are judged too early, or too late.
+    other, _ = AnchorControl().densify(context(parameters), part)
+    assert dict(other.counts) != dict(expected.counts)
+    for name, sums in kept.per_primitive.items():
+        assert torch.equal(left.per_primitive[name], share * sums)
+
+
 def test_an_anchor_that_never_draws_is_removed():
     parameters = model()
     count = len(parameters["anchors"])

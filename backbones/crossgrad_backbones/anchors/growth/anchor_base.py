@@ -81,7 +81,7 @@ class AnchorDensifier(Densifier):
     def _edited(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         sums = state.per_primitive
         parameters = {name: tensor.detach() for name, tensor in context.parameters.items()}
-        enough = self.success_threshold * context.schedule.densify_every
+        enough = self.success_threshold * context.schedule.densify_every * context.share
         judged = sums[VIEWS] > enough
         transparent = sums[OPACITY] < self.prune_opacity * sums[VIEWS]
         urge = Urge(screen_statistics.mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
