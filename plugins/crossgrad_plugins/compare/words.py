@@ -12,6 +12,7 @@ from crossgrad_plugins.compare.statistics.verdict import Verdict
 _TITLES = {cost.name: cost.title for cost in COSTS}
 #: Of many arms, so many are named in one sentence.
 _MOST_NAMED = 6
+_NONE_BEATEN = "but it is surely better than no other arm"
 
 
 @dataclass(frozen=True)
@@ -121,11 +122,19 @@ def _alone(comparison: Comparison) -> Sentence:
 
 
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
-    """What the leading arm is to the others."""
+    """What the leading arm is to the others.
+
+    It leads by its mean over runs, from which the estimate of pairs can differ.
+    """
     leader = comparison.ranking[0]
     own = [each for each in comparison.ends if leader in {each.first, each.second}]
     groups = {v: [c for c in own if c.verdict is v] for v in Verdict}
-    found = [Sentence(f"{leader} ends best", _against(groups[Verdict.DIFFERENT], "better than"))]
+    ahead = [c for c in groups[Verdict.DIFFERENT] if c.favours == leader]
+    behind = [c for c in groups[Verdict.DIFFERENT] if c.favours != leader]
+    support = f"better than {_against(ahead)}" if ahead else _NONE_BEATEN
+    found = [Sentence(f"{leader} {'has the best mean' if behind else 'ends best'}", support)]
+    if behind:
+        found.append(Sentence(f"It is worse than {_against(behind)}", "pair by pair"))
     for verdict, words in (
         (Verdict.EQUIVALENT, "equivalent to"),
         (Verdict.INCONCLUSIVE, "not told apart from"),
@@ -137,16 +146,14 @@ def _of_the_best(comparison: Comparison) -> list[Sentence]:
     return found
 
 
-def _against(contrasts: Sequence[Contrast], words: str) -> str:
-    if not contrasts:
-        return "but it is surely better than no other arm"
+def _against(contrasts: Sequence[Contrast]) -> str:
     shown = [
         f"{each.second} by {_size(each)} ({interval_text(each, each.estimate.wide)})"
         for each in contrasts[:_MOST_NAMED]
         if each.estimate is not None
     ]
     more = len(contrasts) - len(shown)
-    return f"{words} {', '.join(shown)}{f' and {more} more' if more else ''}"
+    return f"{', '.join(shown)}{f' and {more} more' if more else ''}"
 
 
 def _listed(contrasts: Sequence[Contrast]) -> str:

@@ -1,5 +1,6 @@
 """Interquartile means, intervals, Holm's correction, the three verdicts."""
 
+from itertools import pairwise
 from math import inf, isnan, nan, sqrt
 
 import numpy as np
@@ -60,6 +61,39 @@ def test_p_values_and_intervals_of_the_bootstrap_agree():
     low, high = law.interval(0.95)
     assert law.lower_tail(low) == pytest.approx(0.025, abs=0.002)
     assert law.upper_tail(high) == pytest.approx(0.025, abs=0.002)
+
+
+@pytest.mark.parametrize("shift", [5.0, -5.0])
+def test_what_is_far_above_the_noise_is_different_beside_any_number_of_others(shift):
+    scenes = [name for name in "abcd" for _ in range(3)]
+    found = estimate(shift + 0.05 * RNG.standard_normal(12), scenes, 0.1)
+    assert found.method == IQM
+    assert 0.0 < found.p_different < 1e-9
+    assert verdicts([found] * 100) == [Verdict.DIFFERENT] * 100
+
+
+def test_p_values_fall_steadily_beyond_all_draws():
+    law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
+    borders = np.linspace(1.0, 9.0, 33)
+    above = [law.upper_tail(border) for border in borders]
+    below = [law.lower_tail(-border) for border in borders]
+    for values in (above, below):
+        assert values == sorted(values, reverse=True)
+        assert values[-1] < 0.1 * values[0]
+        assert all(b > 0.2 * a for a, b in pairwise(values))
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0.0, "equivalent"), (0.5, "different")])
+def test_many_pairs_without_noise_are_judged_as_a_few_are(value, expected):
+    family = [estimate([value] * pairs, ["a"] * pairs, 0.1) for pairs in (3, 12)]
+    assert {str(verdict) for verdict in verdicts(family * 10)} == {expected}
+
+
+def test_the_interval_holds_its_estimate_though_one_run_diverged():
+    values = 0.05 * np.random.default_rng(3).standard_normal((40, 12))
+    values[:, 0] -= 15.0
+    found = [estimate(each, ["a"] * 12, 0.1) for each in values]
+    assert all(each.wide[0] < each.center < each.wide[1] for each in found)
 
 
 def test_differences_between_scenes_are_no_noise():

@@ -1,0 +1,25 @@
+"""The first sentences say what the tables say."""
+
+from support.run_folders import RunFolder
+
+from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.words import headline
+
+
+def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_path):
+    # One run of two views diverged: less in the mean, more in eleven pairs of twelve.
+    for number in range(12):
+        scene, seed = f"scene {number % 4}", number // 4
+        noise = 0.01 * seed
+        finals = {1: 21.0, 2: 21.3 + noise - (9.0 if number == 5 else 0.0), 4: 19.0 + noise}
+        for views, final in finals.items():
+            run = RunFolder(scene, seed, final, views_per_step=views, evaluations=2)
+            run.write(tmp_path / f"{views}-{number}")
+    found = compared(read_runs([tmp_path], skip_broken=False), Options())
+    assert found.ranking == ("views=1", "views=2", "views=4")
+    first, second, *_ = headline(found)
+    assert first.claim == "views=1 has the best mean"
+    assert first.support.startswith("better than views=4 by 1.99 dB (+1.9")
+    assert second.claim.startswith("It is worse than views=2 by 0.31 dB (-0.3")
+    assert not any("ends best" in each.claim for each in (first, second))
