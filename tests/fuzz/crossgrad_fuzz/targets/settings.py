@@ -9,7 +9,7 @@ from crossgrad_core.registry import validation
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import settings
 from crossgrad_core.run.opening import parsed
-from crossgrad_core.run.settings import merged
+from crossgrad_core.run.settings import layered, merged
 from crossgrad_core.system import yaml_values
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml, write_yaml
 from crossgrad_fuzz.case import Case
@@ -54,9 +54,12 @@ def _seeds() -> Sequence[Case]:
 def _parse(folder: Path) -> None:
     path = folder / _SETS
     text = path.read_bytes().decode("latin-1") if path.is_file() else ""
-    found = merged(folder / _FILE, {}, [line for line in text.split("\n") if line])
+    given = {"out": Path("runs")}
+    found = merged(folder / _FILE, given, [line for line in text.split("\n") if line])
     config = parsed(found)
     _checked(config)
+    # As the arms of a sweep are laid over its base.
+    assert parsed(layered([found, found])) == config
 
 
 def _written(config: RunConfig) -> str:
