@@ -140,6 +140,9 @@ class RunConfig(BaseModel):
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (), description="(step, steps in all from there on) of a run that followed the clock"
     )
+    planned_seconds: float | None = Field(
+        None, gt=0, description="the seconds that a run with a time budget was given"
+    )
     seed: Annotated[int, Flag("N", TRAINING)] = Field(
         0, ge=0, description="Seed of every random number. Default: 0."
     )

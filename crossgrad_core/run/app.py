@@ -205,7 +205,7 @@ def with_defaults(config: RunConfig) -> RunConfig:
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note = steps_for(setup, seconds)
-    update = {"steps": steps, "seconds": None, "revisions": ()}
+    update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
     config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))

@@ -27,7 +27,9 @@ ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
 #: Settings that name one component (or a chain of operators) and hold its options.
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
 #: Settings that say how long a run is.
-LENGTHS: Final = (("steps",), ("max_views",), ("seconds",), ("revisions",))
+LENGTHS: Final = tuple(
+    (name,) for name in ("steps", "max_views", "seconds", "revisions", "planned_seconds")
+)
 #: Settings that hold settings.
 GROUPS_OF_SETTINGS: Final = ("reading",)
 _FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")

@@ -55,11 +55,12 @@ def test_options_win_over_the_file_and_assignments_over_both(config):
 )
 def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     path = tmp_path / "config.yaml"
-    path.write_text("steps: 40\nrevisions: [[10, 60]]\nseed: 1\n")
+    path.write_text("steps: 40\nrevisions: [[10, 60]]\nplanned_seconds: 3.0\nseed: 1\n")
     # A file with revisions and without `events` was written when schedules counted steps.
     expected = {"seconds": 5.0, "seed": 1, "events": "steps"}
     assert merged(path, options, assignments) == expected
-    assert merged(path, {"seed": 2}, [])["revisions"] == [[10, 60]]
+    kept = merged(path, {"seed": 2}, [])
+    assert (kept["revisions"], kept["planned_seconds"]) == ([[10, 60]], 3.0)
 
 
 def test_unset_options_leave_the_file_alone(config):

@@ -3,9 +3,12 @@
 import csv
 
 import pytest
+from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli.main import main
+from crossgrad_core.run import app
+from crossgrad_plugins.compare.source import read_runs
 
 
 def ended(*arguments: str) -> int:
@@ -40,3 +43,14 @@ def test_runs_as_they_are_written(tmp_path, capsys):
     assert (folder / "index.html").read_text().count("data:image/jpeg;base64,") == 2 * 5
     assert (folder / "figures" / "phases.pdf").is_file()
     assert "views.csv" in {path.name for path in folder.iterdir()}
+
+
+def test_a_run_within_seconds_keeps_its_length_when_it_is_resumed(tmp_path, monkeypatch):
+    scene = write_tiny_scene(tmp_path / "scene", views=9)
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (12, "twelve steps"))
+    each_step_takes(monkeypatch, 0.125)
+    given = {"scene": str(scene), "out": str(tmp_path / "run"), "threads": 1, "seconds": 1.5}
+    assert app.run({**given, "stop_after": 6}, verbosity=-1) == 0
+    assert app.run({}, resume=tmp_path / "run", verbosity=-1) == 0
+    [run] = read_runs([tmp_path / "run"], skip_broken=False).runs
+    assert run.length == ("s", 1.5)

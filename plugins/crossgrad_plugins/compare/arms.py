@@ -7,7 +7,7 @@ from typing import Final
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.settings import Settings
+from crossgrad_plugins.compare.settings import ABSENT, Settings
 
 #: What names an arm if it can, before anything else that differs.
 _FIRST: Final = (
@@ -17,7 +17,6 @@ _FIRST: Final = (
 )
 #: Settings that people know by another name.
 _SPOKEN: Final = {"views_per_step": "views"}
-_ABSENT: Final = "-"
 _DIGITS: Final = re.compile(r"(\d+)")
 
 
@@ -41,9 +40,10 @@ class Arm:
 def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
     """The arms, in the order of their names.
 
-    Labels of a sweep are taken where each run has one. Else runs belong together that agree in
-    every setting which varies within a scene: what depends on the scene alone, such as a degree
-    that its data cannot support, makes no arm.
+    Runs belong together that agree in every setting which varies within a scene: what depends on
+    the scene alone, such as a degree that its data cannot support, makes no arm. Where each run
+    has a label of a sweep, those of one label belong together, unless it stands for several
+    configurations on one scene, as labels of two sweeps do: then their settings tell them apart.
 
     Args:
         runs: The runs that finished; at least one.
@@ -51,23 +51,52 @@ def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
     """
     everything = [*runs, *failed]
     keys = _varying(everything)
-    groups: dict[tuple[str, ...], list[Run]] = {}
-    labelled = all(run.label for run in everything)
-    for run in everything:
-        values = _values(run.settings, keys)
-        groups.setdefault((str(run.label),) if labelled else values, []).append(run)
-    called = {key: key[0] for key in groups} if labelled else _names(groups, keys)
     finished = set(runs)
     arms = [
         Arm(
-            name=called[key],
+            name=name,
             runs=tuple(run for run in members if run in finished),
             failed=tuple(run for run in members if run not in finished),
             settings=dict(zip(keys, _values(members[0].settings, keys), strict=True)),
         )
-        for key, members in groups.items()
+        for name, members in _grouped(everything)
     ]
     return tuple(sorted(arms, key=lambda arm: _natural(arm.name)))
+
+
+def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
+    """The runs of each arm with its name; no two of these are the same."""
+    if all(run.label for run in runs):
+        found = _by_labels(runs)
+        if len({name for name, _ in found}) == len(found):
+            return found
+    # A run with two labels is there twice.
+    return _by_settings(list({run.name: run for run in runs}.values()))
+
+
+def _by_labels(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
+    labelled: dict[str, list[Run]] = {}
+    for run in runs:
+        labelled.setdefault(str(run.label), []).append(run)
+    found = []
+    for label, own in labelled.items():
+        parts = _by_settings(own)
+        if len(parts) == 1:
+            found.append((label, own))
+        elif len(labelled) == 1:
+            found += parts
+        else:
+            found += [(f"{label}, {name}", members) for name, members in parts]
+    return found
+
+
+def _by_settings(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
+    keys = _varying(runs)
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(_values(run.settings, keys), []).append(run)
+    names = _names(groups, keys)
+    return [(names[values], members) for values, members in groups.items()]
 
 
 def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
@@ -118,7 +147,7 @@ def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
 
 
 def _values(settings: Settings, keys: Sequence[str]) -> tuple[str, ...]:
-    return tuple(settings.get(key, _ABSENT) for key in keys)
+    return tuple(settings.get(key, ABSENT) for key in keys)
 
 
 def _names(
@@ -136,7 +165,7 @@ def _names(
 
 def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -> str:
     """What is set of the chosen settings; an option of a component that is not there is not."""
-    known = [index for index in chosen if values[index] != _ABSENT]
+    known = [index for index in chosen if values[index] != ABSENT]
     return ", ".join(_part(keys[index], values[index]) for index in known or chosen)
 
 
@@ -145,7 +174,7 @@ def _told_apart(groups: Iterable[tuple[str, ...]], chosen: Sequence[int]) -> int
 
 
 def _part(key: str, value: str) -> str:
-    return f"{_SPOKEN.get(key, key)}={value}"
+    return f"{_SPOKEN.get(key, key)}={'none' if value == ABSENT else value}"
 
 
 def _of_one(run: Run) -> str:

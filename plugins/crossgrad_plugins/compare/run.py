@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = NDArray[np.float64]
 
-#: The note of a run whose length followed the clock, as a run writes it.
+#: The note of a run whose length followed the clock, as runs write it until they are resumed.
 _PLANNED: Final = re.compile(r"steps planned for ([\d.]+) s\b")
 
 
@@ -63,19 +63,24 @@ class Run:
     @cached_property
     def length(self) -> tuple[str, float]:
         """The unit and the amount of the budget that it was given."""
-        for note in self.summary.get("notes") or ():
-            if found := _PLANNED.search(str(note)):
-                unit = "s CPU" if self.config.get("clock") == "cpu" else "s"
-                return unit, float(found[1])
+        if seconds := self.config.get("planned_seconds") or self._noted_seconds():
+            return ("s CPU" if self.config.get("clock") == "cpu" else "s"), float(seconds)
         views = self.config.get("max_views")
         if views is not None:
             return "views", float(views)
         return "steps", float(self.config.get("steps") or self.summary.get("step") or 0)
 
+    def _noted_seconds(self) -> str | None:
+        """Its seconds as an older run, which has them in no setting, notes them."""
+        for note in self.summary.get("notes") or ():
+            if found := _PLANNED.search(str(note)):
+                return found[1]
+        return None
+
     @property
     def length_text(self) -> str:
         """Its budget as text, such as `70 s`."""
-        return f"{self.length[1]:,g} {self.length[0]}"
+        return text_of(self.length)
 
     def final(self, name: str, regime: str | None = None) -> float | None:
         """A figure at its end, overall or of a regime; None where there is none or it is NaN."""
@@ -108,3 +113,8 @@ class Run:
         counts = [row.get("primitives") for row in self.results.rows]
         seen = [float(count) for count in counts if count is not None]
         return self.number("peak_primitives") or max(seen, default=self.number("primitives"))
+
+
+def text_of(length: tuple[str, float]) -> str:
+    """A length as text, such as `70 s`."""
+    return f"{length[1]:,g} {length[0]}"

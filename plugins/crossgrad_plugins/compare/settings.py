@@ -6,11 +6,13 @@ from typing import Any, Final, TypeAlias
 #: A value of a setting as text, such as `0.4`, `scaffold` or `pcgrad+soft`.
 Settings: TypeAlias = dict[str, str]
 
+#: The value of a setting that is not set.
+ABSENT: Final = "-"
 #: Where a run lies, how long it is, and what only watches it.
 _NO_ARM: Final = frozenset(
     {
         *("crossgrad", "scene", "seed", "out"),
-        *("steps", "max_views", "seconds", "revisions", "stop_after", "clock"),
+        *("steps", "max_views", "seconds", "revisions", "planned_seconds", "stop_after", "clock"),
         *("eval_every", "save_every", "threads", "max_dropped"),
         *("observers", "metrics", "exporter"),
         *("reading.cache_mib", "reading.masks"),
@@ -19,15 +21,15 @@ _NO_ARM: Final = frozenset(
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
-    """Setting -> value, of those that can make an arm; one that is not set is left out.
+    """Setting -> value, of those that can make an arm.
 
-    A component is `backbone` and its options `backbone.sh_degree`; a chain of operators is
-    `operator` with the names joined by `+`, and its options `operator.1.c`.
+    A setting that is null is not set: its value is `-`. A component is `backbone` and its options
+    `backbone.sh_degree`; a chain of operators is `operator` with the names joined by `+`, and its
+    options `operator.1.c`.
     """
-    flat = {name: value for name, value in _flat("", config) if value is not None}
     return {
         name: _text(value)
-        for name, value in flat.items()
+        for name, value in _flat("", config)
         if not _NO_ARM & {name, name.partition(".")[0]}
     }
 
@@ -47,6 +49,8 @@ def _flat(name: str, value: object) -> Iterator[tuple[str, object]]:
 
 
 def _text(value: object) -> str:
+    if value is None:
+        return ABSENT
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

@@ -1,6 +1,6 @@
 """From folders to runs: what is broken, unfinished or of another kind is sorted out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -129,9 +129,15 @@ def _check_summary(results: "RunResults") -> None:
 
 
 def _config(results: "RunResults") -> dict[str, object]:
-    """The configuration with the names and the defaults of this version."""
+    """The configuration with the names and the defaults of this version.
+
+    What a run had to say about a setting that is newer than its version is not known: such a one
+    is there with its default, or not at all where that is none.
+    """
     try:
-        return RunConfig.model_validate(results.config).model_dump(mode="json")
+        config = RunConfig.model_validate(results.config)
+        stated = config.model_dump(mode="json", exclude_unset=True)
+        return _without_nulls(config.model_dump(mode="json"), stated)
     except ValueError as error:
         raise UserError(
             "unreadable configuration of a run",
@@ -139,6 +145,15 @@ def _config(results: "RunResults") -> dict[str, object]:
             found=str(error),
             todo="restore the file, or read the run with the version that wrote it",
         ) from error
+
+
+def _without_nulls(settings: Mapping[str, Any], besides: Mapping[str, Any]) -> dict[str, object]:
+    """The settings without those that are null, besides some, and likewise in inner ones."""
+    return {
+        name: _without_nulls(value, besides.get(name) or {}) if isinstance(value, dict) else value
+        for name, value in settings.items()
+        if value is not None or name in besides
+    }
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:

@@ -7,7 +7,10 @@ from hashlib import sha256
 from typing import Any, Final
 
 #: Settings that change neither what is trained nor what is reported.
-_OF_NO_CONSEQUENCE: Final = ("scene", "out", "threads", "stop_after", "save_every", "revisions")
+_OF_NO_CONSEQUENCE: Final = (
+    *("scene", "out", "threads", "stop_after", "save_every"),
+    *("revisions", "planned_seconds"),
+)
 _DIGITS: Final = 12
 
 

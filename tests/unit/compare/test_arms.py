@@ -29,6 +29,7 @@ def test_seeds_scenes_and_lengths_make_no_arm(tmp_path):
         RunFolder(seed=0),
         RunFolder(seed=1, steps=300),
         RunFolder(scene="park", planned=70.0, steps=431),
+        RunFolder(scene="park", seed=1, settings={"planned_seconds": 80.0}, steps=523),
         RunFolder(seed=2, settings={"eval_every": 10, "threads": 2, "save_every": 9}),
     ]
     [only] = arms(tmp_path, *runs)
@@ -94,6 +95,91 @@ def test_an_option_that_an_older_version_lacks_makes_no_arm(tmp_path):
     assert len(names(tmp_path, RunFolder(settings=old), RunFolder(seed=1, settings=new))) == 1
 
 
+def test_what_is_set_in_one_arm_and_not_in_another_one_tells_them_apart(tmp_path):
+    few, mip = {"max_gaussians": 5000}, {"backbone": {"name": "mip"}}
+    runs = [RunFolder(seed=n, settings=own) for own in ({}, few, mip) for n in range(3)]
+    found = arms(tmp_path, *runs)
+    assert [arm.name for arm in found] == [
+        "backbone=mip",
+        "backbone=vanilla",
+        "backbone=vanilla, max_gaussians=5000",
+    ]
+    assert [len(arm.runs) for arm in found] == [3, 3, 3]
+    assert found[1].settings["max_gaussians"] == "-"
+    assert names(tmp_path / "two", *(RunFolder(settings=own) for own in ({}, few))) == [
+        "max_gaussians=5000",
+        "max_gaussians=none",
+    ]
+
+
+def test_an_option_of_a_component_that_is_not_set_in_one_arm_tells_it_apart(tmp_path):
+    runs = [RunFolder(settings={"loss": {"name": "dssim", "clip": c}}) for c in (None, 0.5)]
+    assert names(tmp_path, *runs) == ["loss.clip=0.5", "loss.clip=none"]
+
+
+def test_a_setting_that_an_older_version_lacks_is_as_one_that_is_not_set(tmp_path):
+    few = {"max_gaussians": 5000}
+    runs = RunFolder(), RunFolder(seed=1), RunFolder(settings=few), RunFolder(seed=1, settings=few)
+    for number, run in enumerate(runs):
+        run.write(tmp_path / str(number))
+    config = tmp_path / "0" / "config.yaml"
+    config.write_text(config.read_text().replace("max_gaussians: null\n", ""))
+    found = read_runs([tmp_path], skip_broken=False)
+    assert [len(arm.runs) for arm in arms_of(found.runs)] == [2, 2]
+    # Nor does what only newer versions write down: decisions that were made without a word.
+    config.write_text(config.read_text().replace("final_decay: null\n", ""))
+    for number in range(1, 4):
+        newer = tmp_path / str(number) / "config.yaml"
+        newer.write_text(newer.read_text().replace("final_decay: null", "final_decay: 0.0"))
+    found = read_runs([tmp_path], skip_broken=False)
+    assert [len(arm.runs) for arm in arms_of(found.runs)] == [2, 2]
+
+
+def sweep(folder: Path, runs: dict[str, RunFolder]):
+    """Runs by their labels, in a folder as a sweep leaves it."""
+    lines = []
+    for number, (label, run) in enumerate(runs.items()):
+        run.write(folder / "runs" / str(number))
+        lines.append(f'{number},"{label}"')
+    (folder / "runs.csv").write_text("\n".join(["run,configuration", *lines]) + "\n")
+
+
+def swept(folder: Path):
+    found = read_runs([folder], skip_broken=False)
+    return {arm.name: len(arm.runs) for arm in arms_of(found.runs, found.failed)}
+
+
+def test_one_label_of_two_sweeps_is_told_apart_by_settings(tmp_path):
+    sweep(tmp_path / "a", {"run": RunFolder()})
+    sweep(tmp_path / "b", {"run": RunFolder(settings={"backbone": {"name": "mip"}})})
+    assert swept(tmp_path) == {"backbone=mip": 1, "backbone=vanilla": 1}
+
+
+def test_a_label_that_stands_for_one_configuration_on_each_scene_is_taken(tmp_path):
+    for folder, factor in (("a", 1.0), ("b", 2.0)):
+        runs = {
+            "one": RunFolder(),
+            "two": RunFolder(views_per_step=2, settings={"rate_factor": factor}),
+        }
+        sweep(tmp_path / folder, runs)
+    tuned = RunFolder(scene="park", settings={"rate_factor": 0.5})
+    sweep(tmp_path / "c", {"one": tuned})
+    assert swept(tmp_path) == {"one": 3, "two, rate_factor=1": 1, "two, rate_factor=2": 1}
+
+
+def test_no_two_arms_have_one_name(tmp_path):
+    sweep(tmp_path / "a", {"x": RunFolder(), "x, views=2": RunFolder(steps=9, views_per_step=4)})
+    sweep(tmp_path / "b", {"x": RunFolder(views_per_step=2)})
+    assert swept(tmp_path) == {"views=1": 1, "views=2": 1, "views=4": 1}
+
+
+def test_a_run_with_two_labels_beside_one_without_does_not_repeat_itself(tmp_path):
+    RunFolder().write(tmp_path / "runs" / "aa")
+    (tmp_path / "runs.csv").write_text("run,configuration\naa,one\naa,two\n")
+    RunFolder(views_per_step=2).write(tmp_path / "other")
+    assert swept(tmp_path) == {"views=1": 1, "views=2": 1}
+
+
 def test_labels_of_a_sweep_are_taken_and_a_run_can_have_two(tmp_path):
     RunFolder(seed=0).write(tmp_path / "runs" / "aa")
     RunFolder(seed=0, steps=900).write(tmp_path / "runs" / "bb")
@@ -137,6 +223,7 @@ def test_settings_are_flat_texts():
         "backbone.on": "yes",
         "operator": "a+b",
         "operator.1.c": "0.5",
+        "grouping": "-",
         "reading.max_size": "400",
         "background": "black",
     }

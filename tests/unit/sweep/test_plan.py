@@ -8,6 +8,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.grid import read_grid
+from crossgrad_plugins.sweep.job import run_id
 from crossgrad_plugins.sweep.plan import planned
 
 
@@ -22,6 +23,12 @@ def plan(folder, assignments=(), **grid):
     path = folder / "grid.yaml"
     path.write_text(yaml.safe_dump(grid))
     return planned(read_grid(path), path, assignments)
+
+
+def test_what_a_run_notes_about_its_length_is_not_in_its_id():
+    plain = {"seed": 1, "steps": 9}
+    noted = {**plain, "revisions": [[1, 9]], "planned_seconds": 5.0}
+    assert run_id(noted, "scene") == run_id(plain, "scene")
 
 
 def ids(folder, scene, **base):
