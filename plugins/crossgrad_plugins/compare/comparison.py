@@ -137,7 +137,7 @@ def compared(found: Found, options: Options) -> Comparison:
         quantities=quantities,
         costs=costs,
         notes=(*about_clocks, *about_figures, *notes, *_without(main, quantities[0])),
-        left_out={**found.left_out, **_repeated(cells)},
+        left_out={**found.left_out, **_not_main(cells)},
         cells=cells,
         main=main,
         standing=work.standing,
@@ -178,12 +178,12 @@ class _Work:
 
     def ends(self) -> tuple[Contrast, ...]:
         """Each couple at the ends of its runs."""
-        return pairwise.judged(self._at_end(c, self.quantities[0], None) for c in self.couples)
+        return pairwise.judged(self._at_end(c, self.quantities[0], None, END) for c in self.couples)
 
     def others(self) -> tuple[Contrast, ...]:
         """The telling couples by the other figures."""
         return pairwise.judged(
-            self._at_end(c, quantity, None)
+            self._at_end(c, quantity, None, END)
             for quantity in self.quantities[1:]
             for c in self.telling
         )
@@ -205,7 +205,7 @@ class _Work:
         if len(names) < 2:  # noqa: PLR2004 - a single one would repeat `overall`
             return ()
         return pairwise.judged(
-            self._at_end(couple, self.quantities[0], regime, unlike)
+            self._at_end(couple, self.quantities[0], regime, regime or OVERALL, unlike)
             for couple in self.telling
             for regime in (None, *sorted(names))
         )
@@ -218,12 +218,12 @@ class _Work:
         couple: tuple[str, str],
         quantity: Quantity,
         regime: str | None,
+        where: str,
         without: Sequence[str] = (),
     ) -> Contrast:
         def reading(run: Run) -> float | None:
             return None if run.scene in without else run.final(quantity.name, regime)
 
-        where = END if regime is None and not without else regime or OVERALL
         return pairwise.contrast(couple, self._pair(couple), quantity, reading, where)
 
     def _at_cost(self, couple: tuple[str, str], cost: Cost) -> Contrast:
@@ -269,8 +269,8 @@ def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
     ]
 
 
-def _repeated(cells: Cells) -> dict[str, str]:
-    return {name: f"repeats {kept}" for name, kept in cells.repetitions.items()}
+def _not_main(cells: Cells) -> dict[str, str]:
+    return {name: f"repeats {kept}" for name, kept in cells.repetitions.items()} | cells.unlike
 
 
 def _reached(

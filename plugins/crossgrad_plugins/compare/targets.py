@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
+from typing import Literal
 
 import numpy as np
 
@@ -51,7 +52,11 @@ class Reached:
 def targets_of(
     runs: Mapping[str, Runs], quantity: Quantity, given: float | None
 ) -> dict[str, float]:
-    """Scene -> the quality to reach: a given one, or where the weakest arm ends in its median."""
+    """Scene -> the quality to reach: a given one, or where the weakest arm ends in its median.
+
+    Of the two runs in the middle the worse one counts: where it ends, half of the runs and one
+    more have been, so that the median of what they spent is finite.
+    """
     finals: dict[str, dict[str, list[float]]] = {}
     for arm, by in runs.items():
         for (scene, _), run in by.items():
@@ -59,10 +64,11 @@ def targets_of(
             if value is not None:
                 finals.setdefault(scene, {}).setdefault(arm, []).append(value)
     worst = max if quantity.falls else min
+    middle: Literal["higher", "lower"] = "higher" if quantity.falls else "lower"
     return {
         scene: given
         if given is not None
-        else worst(float(np.median(values)) for values in by.values())
+        else worst(float(np.quantile(values, 0.5, method=middle)) for values in by.values())
         for scene, by in sorted(finals.items())
     }
 

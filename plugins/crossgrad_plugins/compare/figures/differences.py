@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from crossgrad_plugins.compare.comparison import END, OVERALL, Comparison
+from crossgrad_plugins.compare.comparison import OVERALL, Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
 from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.style import (
@@ -68,7 +68,7 @@ def where_text(contrast: Contrast) -> str:
 
 
 def _by_regime(comparison: Comparison) -> list[Contrast]:
-    return [each for each in comparison.regimes if each.where not in {END, OVERALL}]
+    return [each for each in comparison.regimes if each.where != OVERALL]
 
 
 def _headings(rows: Sequence[Contrast]) -> list[tuple[str, str]]:
