@@ -8,6 +8,7 @@ from typing import Final
 
 from crossgrad_core.commands import Progress, table_bytes
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
+from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import draw_curves
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.frontier import draw_frontier
@@ -20,13 +21,21 @@ from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_fi
 from crossgrad_plugins.compare.page import page_of
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.source import read_runs
-from crossgrad_plugins.compare.tables import tables_of
+from crossgrad_plugins.compare.tables import TABLES, tables_of
 from crossgrad_plugins.compare.terminal import lines_of
 
 #: Where a comparison goes by default, beside the runs.
 FOLDER: Final = "compare"
-#: What a comparison writes.
-_OWNED: Final = ("*.csv", f"{FIGURES}/*.pdf", f"{FIGURES}/*.png")
+#: All figures that there can be.
+DRAWINGS: Final = (
+    *(f"curves_{cost.name}" for cost in COSTS),
+    *("differences", "frontier", "phases", "primitives", "profile", "regimes"),
+)
+#: What a comparison writes, besides its page.
+OWNED: Final = (
+    *TABLES,
+    *(f"{FIGURES}/{name}.{form}" for name in DRAWINGS for form in ("pdf", "png")),
+)
 
 
 def compare(
@@ -60,7 +69,7 @@ def compare(
     files |= {
         name: table_bytes(rows) for name, rows in tables_of(comparison, views).items() if rows
     }
-    write_files(folder, files, _OWNED)
+    write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):
         print(line)  # noqa: T201 - the result of the command
     print(f"\npage, figures and tables in {folder}: open {folder / PAGE}")  # noqa: T201

@@ -47,16 +47,15 @@ def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) 
     Args:
         folder: The folder, free or a comparison.
         files: Path below the folder -> content.
-        owned: Patterns of what a comparison writes.
+        owned: All files that a comparison may have, likewise.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
     with disk_errors(folder):
         (folder / FIGURES).mkdir(parents=True, exist_ok=True)
-        for pattern in owned:
-            for path in folder.glob(pattern):
-                if str(path.relative_to(folder)) not in files:
-                    path.unlink()
+        for name in owned:
+            if name not in files:
+                (folder / name).unlink(missing_ok=True)
     for name in sorted(files, key=lambda name: name == PAGE):
         write_atomically(folder / name, files[name])

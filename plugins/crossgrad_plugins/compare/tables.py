@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import nan
+from typing import Final
 
 import numpy as np
 
@@ -13,12 +14,17 @@ from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.pictures import WorstView
 
 Row = dict[str, str | int | float]
+#: Files of all tables.
+TABLES: Final = (
+    *("runs.csv", "arms.csv", "comparisons.csv", "pairs.csv", "time_to_quality.csv"),
+    *("curves.csv", "lengths.csv", "noise.csv", "phases.csv", "views.csv"),
+)
 
 
 def tables_of(
     comparison: Comparison, views: Mapping[str, Sequence[WorstView]]
 ) -> dict[str, list[Row]]:
-    """File name -> rows."""
+    """File name -> rows, for each of `TABLES`."""
     everything = (
         *comparison.ends, *comparison.equal, *comparison.regimes, *comparison.others,
     )  # fmt: skip

@@ -9,6 +9,10 @@ import pytest
 from support.run_folders import RunFolder
 
 from crossgrad_core.cli.main import main
+from crossgrad_plugins.compare import app
+from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.tables import TABLES, tables_of
 
 SCENE = '<b>&"x"$y_$'
 VIEW = "a/<script>alert(1)</script>.jpg"
@@ -118,6 +122,15 @@ def test_there_are_figures_for_a_paper(written):
     assert b"/Type3" not in (written / "figures" / "differences.pdf").read_bytes()
 
 
+def test_all_that_is_written_is_known_to_the_next_comparison(written):
+    files = {path.relative_to(written).as_posix() for path in written.rglob("*.*")}
+    assert files <= {"index.html", *app.OWNED}
+    modules = {path.stem for path in Path(app.__file__).parent.glob("figures/*.py")}
+    assert modules - {"__init__", "style", "curves"} <= set(app.DRAWINGS)
+    found = compared(read_runs([written.parent], skip_broken=False), Options())
+    assert set(tables_of(found, {})) == set(TABLES)
+
+
 def test_tables_hold_the_same_as_the_page(written):
     [end] = [row for row in rows(written / "comparisons.csv") if row["where"] == "at the end"
              and row["figure"] == "psnr"]  # fmt: skip
@@ -142,12 +155,15 @@ def test_only_a_comparison_is_replaced_and_the_same_runs_give_the_same_bytes(wri
     runs = [str(path) for path in sorted(written.parent.glob("?-?"))]
     before = {path.name: path.read_bytes() for path in written.rglob("*.*")}
     (written / "figures" / "frontier.pdf").write_bytes(b"of an earlier comparison")
-    (written / "mine.txt").write_text("mine")
+    mine = [written / name for name in ("mine.txt", "my.csv", "figures/my.png", "figures/my.pdf")]
+    for path in mine:
+        path.write_text("mine")
     assert run(*runs) == 0
     after = {path.name: path.read_bytes() for path in written.rglob("*.*")}
-    assert after.pop("mine.txt") == b"mine"
+    assert {after.pop(path.name) for path in mine} == {b"mine"}
     assert after == before
-    (written / "mine.txt").unlink()
+    for path in mine:
+        path.unlink()
     other = tmp_path / "other"
     other.mkdir()
     (other / "index.html").write_text("<html>somebody's</html>")
