@@ -117,6 +117,18 @@ def test_pairs_that_are_needed_are_those_of_the_table():
     assert pairs_needed(100.0, 0.1) is None
 
 
+def test_pairs_are_asked_for_by_the_noise_of_the_interval():
+    scenes = [name for name in "abcd" for _ in range(3)]
+    noise = 0.1 * np.tile([-1.0, 0.0, 1.0], 4)
+    levels = np.repeat([-2.0, -1.0, 1.0, 2.0], 3)
+    found = estimate(levels + noise, scenes, 0.1)
+    assert found.method == IQM
+    assert found.needed == pairs_needed(0.1, 0.1) == estimate(noise, scenes, 0.1).needed
+    # Student's interval is about all scenes at once.
+    few = estimate((levels + noise)[:9], scenes[:9], 0.1)
+    assert few.needed == pairs_needed(few.deviation, 0.1)
+
+
 def test_one_pair_is_inconclusive_and_equal_runs_are_equivalent():
     single = estimate([3.0], ["a"], 0.1)
     same = estimate([0.0, 0.0, 0.0], ["a"] * 3, 0.1)

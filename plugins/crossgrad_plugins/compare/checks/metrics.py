@@ -33,7 +33,7 @@ def quantities_of(
             where="--metric",
             expected=f"one of {', '.join(measured)}" if measured else "a figure of held-out views",
             found=name,
-            todo="choose another one, or measure it: crossgrad eval RUN --metrics NAME",
+            todo="choose another one, or repeat the runs with it: crossgrad run --metrics NAME",
         )
     for key in (_RENDERS, name):
         _check_definition(runs, key)
@@ -63,7 +63,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
             where=f"{one}, {other}",
             expected="one definition in summary.json",
             found=f"{first!r} against {second!r}",
-            todo="measure them alike with `crossgrad eval RUN`, or compare runs of one version",
+            todo="compare runs of one version, or repeat those of the other one",
         )
 
 

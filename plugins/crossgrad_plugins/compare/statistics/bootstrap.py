@@ -35,10 +35,12 @@ class Bootstrap:
     Attributes:
         draws: [DRAWS] estimates, sorted.
         freedom: Degrees of freedom of the variance within scenes.
+        noise: Standard deviation of a pair within its scene.
     """
 
     draws: NDArray[np.float64]
     freedom: int
+    noise: float
 
     @classmethod
     def of(cls, values: NDArray[np.float64], scenes: Sequence[str]) -> "Bootstrap":
@@ -49,16 +51,18 @@ class Bootstrap:
             scenes: The scene of each.
         """
         rng = np.random.default_rng(_SEED)
-        strata = _strata(scenes)
+        strata, squares = _strata(scenes), 0.0
         stretched, resampled = np.empty(len(values)), np.empty((DRAWS, len(values)))
         for stratum in strata:
             own, count = values[stratum], len(stratum)
             stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
             stretched[stratum] = own.mean() + stretch * (own - own.mean())
+            squares += float(np.sum((own - own.mean()) ** 2))
             drawn = rng.integers(0, count, (DRAWS, count))
             resampled[:, stratum] = stretched[stratum][drawn]
         draws = iqm(resampled) + (iqm(values) - iqm(stretched))
-        return cls(np.sort(draws), max(1, len(values) - len(strata)))
+        freedom = max(1, len(values) - len(strata))
+        return cls(np.sort(draws), freedom, sqrt(squares / freedom))
 
     def interval(self, level: float) -> tuple[float, float]:
         """The two-sided interval of a level such as 0.95."""

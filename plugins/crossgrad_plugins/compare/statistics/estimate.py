@@ -20,7 +20,7 @@ MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 
 Interval: TypeAlias = tuple[float, float]
-_Found: TypeAlias = tuple[float, Interval, Interval, float, float]
+_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Estimate:
         p_different: Two-sided p-value of no difference.
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
         needed: Pairs after which the 90 % interval is as narrow as the margin; None where that
-            cannot be told.
+            cannot be told. The bootstrap's interval knows no differences between scenes.
     """
 
     pairs: int
@@ -62,10 +62,9 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
         margin: What counts as no difference in practice.
     """
     values = np.asarray(differences, dtype=np.float64)
-    deviation = float(values.std(ddof=1)) if len(values) > 1 else nan
     enough = len(values) >= BOOTSTRAP_FROM
     found = _by_bootstrap(values, scenes, margin) if enough else _by_student(values, margin)
-    center, wide, narrow, different, equivalent = found
+    center, wide, narrow, different, equivalent, noise = found
     return Estimate(
         pairs=len(values),
         scenes=len(set(scenes)),
@@ -73,25 +72,30 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
         method=IQM if enough else MEAN,
         wide=wide,
         narrow=narrow,
-        deviation=deviation,
+        deviation=_deviation(values),
         p_different=different,
         p_equivalent=equivalent,
-        needed=student.pairs_needed(deviation, margin) if isfinite(deviation) else None,
+        needed=student.pairs_needed(noise, margin) if isfinite(noise) else None,
     )
 
 
+def _deviation(values: NDArray[np.float64]) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else nan
+
+
 def _by_student(values: NDArray[np.float64], margin: float) -> _Found:
-    center = float(values.mean())
+    center, noise = float(values.mean()), _deviation(values)
     if len(values) == 1:
-        return center, _UNKNOWN, _UNKNOWN, nan, nan
+        return center, _UNKNOWN, _UNKNOWN, nan, nan, noise
     law = student.Law.of(values)
     equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent
+    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, noise
 
 
 def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: float) -> _Found:
     law = Bootstrap.of(values, scenes)
     equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    return float(iqm(values)), law.interval(WIDE), law.interval(NARROW), different, equivalent
+    wide, narrow = law.interval(WIDE), law.interval(NARROW)
+    return float(iqm(values)), wide, narrow, different, equivalent, law.noise
