@@ -122,9 +122,13 @@ class Sweep:
         """Writes a grid with the best parameters of each arm and scene, for other seeds.
 
         Raises:
-            UserError: They are not known yet, or the file cannot be written.
+            UserError: They are not known yet, the file is there already, or cannot be written.
         """
         check_file(path)
+        if path.exists():
+            raise UserError(
+                "the file is there already", where=path, todo="choose another name, or remove it"
+            )
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         content, notes = best_grid(self.plan.grid, self.plan.cells, found, path.parent)
         write_mapping(path, content)

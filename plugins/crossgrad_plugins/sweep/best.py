@@ -1,18 +1,21 @@
 """Of each arm and scene the best parameters: tuned on some seeds, to be measured on others."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import Any, TypeAlias
 
-from crossgrad_core.commands import UserError
+from crossgrad_core.commands import UserError, listed
 from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, choices, scene_name
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.standing import Standing, figure
 
 #: Seeds that the new grid has.
 SEEDS = 3
+#: Configuration and scene -> seed -> the metric, None where the run failed or has none; a run that
+#: is left to do is not there.
+Ends: TypeAlias = Mapping[tuple[str, str], Mapping[int, float | None]]
 
 
 def best_grid(
@@ -29,12 +32,13 @@ def best_grid(
         folder: Where the new grid is going to be.
 
     Returns:
-        The content of its file, and notes on parameters that are best at the end of their values.
+        The content of its file, and notes: on parameters of which a run failed, which are no
+        candidates, and on those that are best at the end of their values.
 
     Raises:
-        UserError: Of some arm and scene nothing is finished, or nothing varies.
+        UserError: Of some arm and scene a run is left to do, all values failed, or nothing varies.
     """
-    found = _means(grid, cells, standings)
+    ends = _ends(grid, cells, standings)
     first = max(grid.seeds) + 1
     notes: list[str] = []
     arms: list[dict[str, Any]] = []
@@ -42,12 +46,12 @@ def best_grid(
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         best = {}
         for scene in map(scene_name, grid.scenes):
-            chosen = _best(own, scene, found, grid)
+            chosen, without = _best(own, scene, ends, grid)
             best[scene] = chosen.parameters
-            notes += _at_the_end(chosen, scene, own)
+            notes += [*without, *_at_the_end(chosen, scene, own)]
         arms += _twice(arm, best)
     content = {
-        "name": f"{grid.name or 'grid'}-best",
+        **({} if grid.name is None else {"name": f"{grid.name}-best"}),
         "description": grid.description,
         "base": grid.base,
         "scenes": [each and os.path.relpath(each, folder.resolve()) for each in grid.scenes],
@@ -66,32 +70,70 @@ def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, A
     yield {"name": f"{arm.name}, best", **own, "by_scene": by_scene}
 
 
-def _means(
-    grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]
-) -> dict[tuple[str, str], float]:
-    """Configuration and scene -> mean of the metric over seeds."""
-    values = {each.job.id: figure(each, grid.metric.name) for each in standings}
-    known: dict[tuple[str, str], list[float]] = {}
+def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> Ends:
+    """What the runs that are at their ends came to."""
+    known = {each.job.id: each for each in standings}
+    found: dict[tuple[str, str], dict[int, float | None]] = {}
     for job in cells:
-        if (value := values[job.id]) is not None:
-            known.setdefault((job.label, job.scene), []).append(value)
-    return {key: mean(each) for key, each in known.items()}
+        own = found.setdefault((job.label, job.scene), {})
+        if known[job.id].state in {"finished", "failed"}:
+            own[job.seed] = figure(known[job.id], grid.metric.name)
+    return found
 
 
-def _best(
-    own: list[Choice], scene: str, found: Mapping[tuple[str, str], float], grid: Grid
-) -> Choice:
+def _best(own: Sequence[Choice], scene: str, ends: Ends, grid: Grid) -> tuple[Choice, list[str]]:
+    """The best of an arm's choices on a scene, and notes on those that were none.
+
+    All of them are measured on the same seeds: one of which a run failed is no candidate.
+    """
+    found = [(choice, ends[choice.label, scene]) for choice in own]
+    _check_ended(found, scene, grid)
     sign = 1.0 if grid.metric.goal == "maximize" else -1.0
-    known = [each for each in own if (each.label, scene) in found]
-    if len(own) < 2 or len(known) < len(own):  # noqa: PLR2004 - one is no choice
+    notes: list[str] = []
+    candidates: list[tuple[float, Choice]] = []
+    for choice, by_seed in found:
+        values = [value for value in by_seed.values() if value is not None]
+        if len(values) == len(by_seed):
+            candidates.append((sign * mean(values), choice))
+        else:
+            notes.append(_no_candidate(choice, scene, by_seed, grid))
+    if not candidates:
+        raise _nothing_to_choose(own, scene, grid)
+    return max(candidates, key=lambda each: each[0])[1], notes
+
+
+def _nothing_to_choose(own: Sequence[Choice], scene: str, grid: Grid) -> UserError:
+    return UserError(
+        "no parameters can be chosen",
+        where=f"{scene}, arm {own[0].arm.name}",
+        expected=f"a value with a finished run of each seed that has {grid.metric.name}",
+        found=f"for each of the {len(own)} a run that failed or has no such figure",
+        todo="see why they failed with --list; change the values, or the name of the metric",
+    )
+
+
+def _check_ended(
+    found: Sequence[tuple[Choice, Mapping[int, float | None]]], scene: str, grid: Grid
+) -> None:
+    ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in found)
+    if len(found) < 2 or ended < len(found):  # noqa: PLR2004 - one is no choice
         raise UserError(
             "the best parameters are not known yet",
-            where=f"{scene}, arm {own[0].arm.name}",
-            expected="parameters that vary, and a finished run of each of their values",
-            found=f"{len(known)} of {len(own)} finished",
+            where=f"{scene}, arm {found[0][0].arm.name}",
+            expected="parameters that vary, and a finished run of each of their values and seeds",
+            found=f"{ended} of {len(found)} values finished",
             todo="finish the sweep first: the same command without --best",
         )
-    return max(known, key=lambda each: sign * found[each.label, scene])
+
+
+def _no_candidate(
+    choice: Choice, scene: str, by_seed: Mapping[int, float | None], grid: Grid
+) -> str:
+    seeds = [seed for seed, value in by_seed.items() if value is None]
+    return (
+        f"{scene}, {choice.label}: not among the candidates, as the run failed or has no "
+        f"{grid.metric.name} with seed {listed(map(str, seeds))}"
+    )
 
 
 def _at_the_end(best: Choice, scene: str, own: list[Choice]) -> Iterator[str]:

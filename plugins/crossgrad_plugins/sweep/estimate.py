@@ -18,16 +18,18 @@ class Estimate:
     Attributes:
         seconds: Wall seconds of those of which something is known.
         unknown: Number of the others.
+        longest: Seconds of the longest of those of which something is known.
     """
 
     seconds: float
     unknown: int
+    longest: float = 0.0
 
     def text(self, at_a_time: int) -> str:
         """The estimate in words, for so many runs at a time."""
         if not self.seconds:
             return "their time is known once one has finished" if self.unknown else "nothing to do"
-        known = f"about {duration(self.seconds / at_a_time)}"
+        known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
         runs = "run" if self.unknown == 1 else "runs"
         others = f" and {self.unknown} {runs} of which nothing is known yet" if self.unknown else ""
         return known + others
@@ -49,7 +51,7 @@ def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Reco
                 same.setdefault(key, []).append(record.seconds)
     found = [_seconds(job, same) for job in jobs]
     known = [each for each in found if each is not None]
-    return Estimate(sum(known), len(found) - len(known))
+    return Estimate(sum(known), len(found) - len(known), max(known, default=0.0))
 
 
 def _seconds(job: Job, same: Mapping[tuple[str, ...], Sequence[float]]) -> float | None:

@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from crossgrad_core.commands import disk_errors
+
 #: How an attempt at a run ended: `stopped` by the sweep, `died` by anything else that left it
 #: unfinished without an error of its own.
 Status = Literal["finished", "failed", "stopped", "died"]
@@ -50,11 +52,19 @@ def append(folder: Path, record: Mapping[str, Any]) -> None:
     Args:
         folder: Where the files of workers are.
         record: The fields of a `Record` besides those.
+
+    Raises:
+        UserError: The disk is full, or the folder is read-only.
     """
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     line = asdict(Record(**{"time": now, "host": platform.node(), **record}))
     content = json.dumps({name: value for name, value in line.items() if value is not None})
     path = folder / f"{record['worker']}.jsonl"
+    with disk_errors(path):
+        _add(path, content)
+
+
+def _add(path: Path, content: str) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         # Begins with a line end where somebody was killed in the middle of a line.

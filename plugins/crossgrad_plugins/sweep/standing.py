@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,9 +63,9 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
 
 
 def figure(standing: Standing, name: str) -> float | None:
-    """A figure of all held-out views of a finished run; None where there is none."""
+    """A figure of all held-out views of a finished run; None where it is none or not finite."""
     value = ((standing.summary or {}).get("overall") or {}).get(name)
-    return float(value) if isinstance(value, int | float) else None
+    return float(value) if isinstance(value, int | float) and isfinite(value) else None
 
 
 def begun(folder: Path) -> bool:

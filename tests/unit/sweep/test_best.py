@@ -2,8 +2,10 @@
 
 import pytest
 import yaml
+from support.scenes import write_tiny_scene
 
 from crossgrad_core.commands import UserError, write_mapping
+from crossgrad_plugins.sweep.app import Request, Sweep
 from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.grid import choices, read_grid, scene_name
 from crossgrad_plugins.sweep.job import Job
@@ -69,6 +71,12 @@ def test_each_arm_stands_there_as_it_is_and_at_its_best(swept, tmp_path):
     ]
 
 
+def test_a_grid_without_a_name_makes_one_without_a_name(swept, tmp_path):
+    grid, cells, standings = swept
+    nameless = grid.model_copy(update={"name": None})
+    assert "name" not in best_grid(nameless, cells, standings, tmp_path)[0]
+
+
 def test_less_may_be_better(swept, tmp_path):
     grid, cells, standings = swept
     metric = grid.metric.model_copy(update={"goal": "minimize"})
@@ -76,10 +84,57 @@ def test_less_may_be_better(swept, tmp_path):
     assert content["arms"][1]["by_scene"]["beach"] == {"rate_factor": 0.5}
 
 
+def with_ends(swept, ends):
+    """The grid swept, with other ends: (configuration, scene, seed) -> state, or figure."""
+    grid, cells, standings = swept
+    found = []
+    for each in standings:
+        key = (each.job.label, each.job.scene, each.job.seed)
+        end = ends.get(key)
+        if isinstance(end, str):
+            found.append(Standing(each.job, end))
+        elif key in ends:
+            found.append(Standing(each.job, "finished", summary={"overall": {"psnr": end}}))
+        else:
+            found.append(each)
+    return grid, cells, found
+
+
+def test_values_are_compared_on_the_same_seeds(swept, tmp_path):
+    # Seed 4 has higher figures: a mean over it alone would win.
+    left = with_ends(swept, {("one, rate_factor=0.5", "town", 2): "interrupted"})
+    with pytest.raises(UserError, match="2 of 3 values finished"):
+        best_grid(*left, tmp_path)
+    for end in ("failed", None, float("nan")):
+        gone = with_ends(swept, {("one, rate_factor=0.5", "town", 2): end})
+        content, notes = best_grid(*gone, tmp_path)
+        assert content["arms"][1]["by_scene"]["town"] == {"rate_factor": 1}
+        assert notes[0].startswith("town, one, rate_factor=0.5: not among the candidates")
+        assert notes[0].endswith("with seed 2")
+
+
+def test_where_all_values_failed_there_is_none_to_choose(swept, tmp_path):
+    labels = [f"two, rate_factor={factor}" for factor in (0.5, 1, 2)]
+    gone = with_ends(swept, {(label, "beach", 4): "failed" for label in labels})
+    with pytest.raises(UserError, match="no parameters can be chosen") as error:
+        best_grid(*gone, tmp_path)
+    assert error.value.where == "beach, arm two"
+
+
+def test_a_file_that_is_there_is_kept(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene", views=9)
+    path, best = tmp_path / "grid.yaml", tmp_path / "best.yaml"
+    path.write_text(f"scenes: [{scene}]\nbase: {{steps: 9}}\n")
+    best.write_text("mine")
+    with pytest.raises(UserError, match="the file is there already"):
+        Sweep(Request(path, out=tmp_path / "out"), looks_only=True).write_best(best)
+    assert best.read_text() == "mine"
+
+
 def test_it_is_refused_before_all_is_finished(swept, tmp_path):
     grid, cells, standings = swept
     left = [
         Standing(each.job, "waiting") if each.job.scene == "beach" else each for each in standings
     ]
-    with pytest.raises(UserError, match="0 of 3 finished"):
+    with pytest.raises(UserError, match="0 of 3 values finished"):
         best_grid(grid, cells, left, tmp_path)

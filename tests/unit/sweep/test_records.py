@@ -1,9 +1,12 @@
 """Records of workers: append-only, whole whatever happened."""
 
+import errno
 import json
+import os
 
 import pytest
 
+from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.records import append, read_records
 
 
@@ -33,3 +36,12 @@ def test_a_line_is_json_with_time_and_machine(tmp_path):
     add(tmp_path, event="ended", status="finished", seconds=1.5)
     line = json.loads((tmp_path / "1.jsonl").read_text())
     assert line.keys() == {"event", "run", "worker", "time", "host", "status", "seconds"}
+
+
+def test_a_full_disk_is_said_as_such(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(UserError, match="not enough disk space"):
+        add(tmp_path)

@@ -90,6 +90,16 @@ def test_times_are_those_of_like_runs(sweep):
     assert total.text(2) == "about 81 s and 1 run of which nothing is known yet"
 
 
+def test_no_sweep_is_shorter_than_its_longest_run(sweep):
+    jobs = [Job(name, "arm", "city", n, {}, seconds=600.0) for n, name in enumerate("abc")]
+    found = estimated(jobs, {job.id: job for job in jobs}, [])
+    assert [found.text(workers) for workers in (1, 2, 16)] == [
+        "about 31 min",
+        "about 15 min",
+        "about 10 min",
+    ]
+
+
 def test_durations_are_rounded_for_people():
     given = (3, 119.4, 120, 7199, 9000)
     assert list(map(duration, given)) == ["3 s", "119 s", "2 min", "120 min", "2.5 h"]
