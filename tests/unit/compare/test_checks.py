@@ -151,3 +151,14 @@ def test_names_that_are_not_there_are_refused(tmp_path, options, match):
     with pytest.raises(UserError, match=match) as error:
         comparison(tmp_path, RunFolder(), RunFolder(views_per_step=2), **options)
     assert "psnr" in error.value.expected or "views=1" in error.value.expected
+
+
+def test_what_is_advised_about_figures_can_be_done(tmp_path):
+    with pytest.raises(UserError, match="no run has this figure") as lacking:
+        comparison(tmp_path / "1", RunFolder(), metric="lpips")
+    other = RunFolder(views_per_step=2, definitions={"psnr": "of means"})
+    with pytest.raises(UserError, match="define psnr differently") as unlike:
+        comparison(tmp_path / "2", RunFolder(), other)
+    assert "crossgrad run --metrics NAME" in lacking.value.todo
+    # `crossgrad eval` measures what a run measures, and writes elsewhere.
+    assert not any("crossgrad eval" in each.value.todo for each in (lacking, unlike))
