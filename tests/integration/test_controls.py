@@ -119,7 +119,7 @@ class Observed:
     """Keeps which views density control got."""
 
     def __init__(self):
-        self.drawn, self.got = [], []
+        self.drawn, self.got, self.shares = [], [], []
 
     @hookimpl(wrapper=True)
     def crossgrad_sample_views(self, context):
@@ -130,6 +130,7 @@ class Observed:
     @hookimpl(wrapper=True)
     def crossgrad_densify(self, context):
         self.got.append(tuple(view.index for view in context.views))
+        self.shares.append(context.share)
         assert all(view.screen.mean_gradient is not None for view in context.views)
         return (yield)
 
@@ -138,6 +139,7 @@ def test_statistics_of_one_view_are_those_of_each_place_in_turn():
     seen = Observed()
     _, state = trained(12, seen, views=3, density_views="one")
     assert seen.got == [(views[(k + 1) % 3],) for k, views in enumerate(seen.drawn)]
+    assert seen.shares == [1 / 3] * 12
     assert (state.counters.views, state.counters.backward_passes) == (36, 36)
 
 
@@ -151,6 +153,7 @@ def test_an_extra_view_is_rendered_while_density_control_lasts(views):
     extra = sum(map(setup.schedule.collects, range(1, 41)))
     assert [len(got) - views for got in seen.got] == [1] * extra + [0] * (40 - extra)
     assert [got[:views] for got in seen.got] == seen.drawn
+    assert seen.shares == [(views + 1) / views] * extra + [1.0] * (40 - extra)
     assert state.counters.views == state.counters.backward_passes == 40 * views + extra
     assert len({got[views] for got in seen.got[:extra]}) > 4
 
