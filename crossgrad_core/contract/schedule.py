@@ -29,6 +29,11 @@ USUAL_EDITS = 6
 LEAST_INTERVAL = 8
 
 
+def is_published(mode: ScheduleMode, reference: int | None) -> bool:
+    """Whether the numbers of a schedule are the published ones, whatever the length of the run."""
+    return mode == "absolute" and reference is None
+
+
 @dataclass(frozen=True)
 class Counting:
     """The unit in which a schedule counts, and the numbers that it needs for that.
@@ -115,9 +120,9 @@ class Schedule:
             length=length,
             lr_until=length,
             sh_interval=max(100, length // 30),
-            densify_from=max(length // 60, SHORTEST_WARM_UP),
-            densify_until=length // 2,
-            densify_every=max(SHORTEST_INTERVAL, length // 300),
+            densify_from=0,  # The edits are planned below.
+            densify_until=0,
+            densify_every=1,
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
             anchors_from=length // 20,
             anchors_every=max(SHORTEST_ANCHOR_INTERVAL, length // 300),
@@ -125,9 +130,9 @@ class Schedule:
             counting=counting,
             pace=pace,
         )
-        if counting.unit == "views" and not schedule._published:
+        if counting.unit == "views" and not schedule.published:
             schedule = replace(schedule, fewest_edits=counting.fewest_edits)
-        return schedule.with_edits(until=schedule.densify_until)
+        return schedule.with_edits(until=length // 2)
 
     def with_edits(
         self, *, until: int, start: int | None = None, every: int | None = None
@@ -146,16 +151,16 @@ class Schedule:
         start = max(self.length // 60, SHORTEST_WARM_UP) if start is None else start
         every = max(SHORTEST_INTERVAL, self.length // 300) if every is None else every
         last, photos = until - 1, self.counting.photos
-        if self.counting.unit == "views" and not self._published:
+        if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.fewest_edits:
             start, every = _fitted(start, last, max(every, photos), photos, self.fewest_edits)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
 
     @property
-    def _published(self) -> bool:
-        """Whether the numbers are the published ones, whatever the length."""
-        return self.mode == "absolute" and self.counting.reference is None
+    def published(self) -> bool:
+        """See `is_published`."""
+        return is_published(self.mode, self.counting.reference)
 
     def counted(self, step: int) -> int:
         """The count after a step: of the views drawn by then, or of the steps."""
@@ -174,9 +179,10 @@ class Schedule:
         return self.counted(step) / self.lr_until
 
     def edits(self, after: int = 0) -> int:
-        """Number of steps behind step `after` that density control follows with an edit."""
+        """Number of the run's steps behind step `after` that density control follows."""
         first = self.next_edit(self.counted(after))
-        ahead = range(first, self.densify_until, self.densify_every)
+        end = min(self.densify_until, self.counted(self.total) + 1)
+        ahead = range(first, end, self.densify_every)
         if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
             return len(ahead)
         return len({self.pace.step_of(count) for count in ahead})

@@ -181,7 +181,7 @@ def _told(before: Setup, after: Setup) -> Setup:
         schedule = after.schedule
         start, end = map(schedule.step_of, (schedule.densify_from, schedule.densify_until))
         text = f"density control after all: in {schedule.total} steps it lasts from step "
-        before.hook.crossgrad_message(text=f"{text}{start} to step {end}")
+        before.hook.crossgrad_message(text=f"{text}{start} to step {min(end, schedule.total)}")
     elif now and not was:
         before.hook.crossgrad_message(text=now[0])
     return after

@@ -7,7 +7,7 @@ from typing import Any
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
-from crossgrad_core.contract.schedule import Counting, Schedule, Unit
+from crossgrad_core.contract.schedule import Counting, Schedule, Unit, is_published
 from crossgrad_core.training.setup import Setup
 
 #: Times of density control that the user may set.
@@ -30,7 +30,7 @@ def unit_of(config: RunConfig) -> Unit:
     """What events are counted in: steps where published numbers are to hold, elsewhere views."""
     if config.events is not None:
         return config.events
-    published = config.schedule == "absolute" and config.reference is None
+    published = is_published(config.schedule, config.reference)
     return "steps" if published or config.preset == "inria" else "views"
 
 

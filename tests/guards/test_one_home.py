@@ -39,6 +39,7 @@ HOMES = {
         # An attempt of a sweep may also have died.
         {f"{CORE}/run/results/summary.py", "plugins/crossgrad_plugins/sweep/records.py"},
     ),
+    "published numbers": (r"== \"absolute\" and", {f"{CORE}/contract/schedule.py"}),
     "a calibration": (r"class (Pinhole|Camera)\b", {SCENE}),
     "the rule set of rasterizers": (
         r"^(ALPHA_THRESHOLD|TRANSMITTANCE_STOP|JACOBIAN_MARGIN)\b.*=",

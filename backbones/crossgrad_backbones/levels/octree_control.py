@@ -53,8 +53,7 @@ class OctreeControl(AnchorDensifier):
 
     @override
     def window(self, schedule: Schedule) -> Schedule:
-        published = schedule.mode == "absolute" and schedule.counting.reference is None
-        length = _LENGTH if published else schedule.length
+        length = _LENGTH if schedule.published else schedule.length
         edited = schedule.with_edits(
             start=length * _FROM // _LENGTH,
             until=length * _UNTIL // _LENGTH,

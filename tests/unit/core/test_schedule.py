@@ -44,12 +44,13 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
     assert Schedule.for_run(30_000).sh_degree(step) == degree
 
 
-@pytest.mark.parametrize("total", [900, 1200, 1201, 1202, 2000, 30_000, 45_000])
-def test_edits_are_counted_without_looking_at_every_step(total):
-    schedule = Schedule.for_run(total)
-    edits = [step for step in range(1, total) if schedule.densifies(step)]
+@pytest.mark.parametrize("mode", ["scaled", "absolute"])
+@pytest.mark.parametrize("total", [400, 600, 900, 1200, 1201, 1202, 2000, 30_000, 45_000])
+def test_edits_are_counted_without_looking_at_every_step(total, mode):
+    schedule = Schedule.for_run(total, mode)
+    edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     assert schedule.grows == bool(edits)
-    assert edits[:1] in ([], [schedule.first_edit])
+    assert edits[:1] == ([schedule.first_edit] if edits else [])
     for after in (0, 500, 599, 600, 650, total // 2, total):
         assert schedule.edits(after) == sum(step > after for step in edits)
 
@@ -198,6 +199,16 @@ def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
         assert flat.sh_degree(step) == short.sh_degree(step)
     assert flat.progress(2400) == 2.0 and flat.coarse_until == short.coarse_until
     assert LearningRate(1e-2, 1e-4).at(flat.progress(1800)) == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize("text", ["1", "2", "5..1@0.5"])
+@pytest.mark.parametrize("views", [250, 600, 605, 2400])
+def test_edits_of_a_flat_schedule_behind_the_end_of_the_run_do_not_count(text, views):
+    total = ViewPlan.parsed(text).steps_of(views)
+    schedule = Schedule.for_run(total, "absolute", in_views(text, reference=1200))
+    edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
+    for after in (0, total // 2, total):
+        assert schedule.edits(after) == sum(step > after for step in edits)
 
 
 def test_a_flat_schedule_in_steps_has_the_floors_of_before():

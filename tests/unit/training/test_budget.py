@@ -48,12 +48,12 @@ class Run:
     notes: tuple[str, ...] = ("a note on the scene",)
 
 
-def setup(densifier="adc", steps=1000):
+def setup(densifier="adc", steps=1000, mode="scaled"):
     return Run(
-        RunConfig(steps=steps),
+        RunConfig(steps=steps, schedule=mode),
         build("densifiers", densifier, {}),
         SimpleNamespace(names={"densifier": densifier}),
-        Schedule.for_run(steps),
+        Schedule.for_run(steps, mode),
     )
 
 
@@ -69,6 +69,16 @@ def setup(densifier="adc", steps=1000):
 )
 def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
     assert _fitting(partial(_cost, setup()), affordable) == steps
+
+
+@pytest.mark.parametrize(
+    ("affordable", "steps"),
+    [(400.0, 400), (599.0, 599), (1200.0, 799), (18_000.0, 9000)],
+)
+def test_edits_that_a_run_never_reaches_cost_nothing(affordable, steps):
+    run = setup(mode="absolute")
+    assert _fitting(partial(_cost, run), affordable) == steps
+    assert bool(growth_note(setup(steps=steps, mode="absolute"))) == (steps < 600)
 
 
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
@@ -185,3 +195,9 @@ def test_the_user_is_told_where_density_control_is_left_out_later():
     run = noted(setup(steps=3000))
     Planned(((20, 900),)).revised(run, SimpleNamespace(step=20))
     assert run.hook.texts == list(growth_note(setup(steps=900)))
+
+
+def test_the_user_is_told_of_no_step_behind_the_end():
+    run = noted(setup(steps=550, mode="absolute"))
+    Planned(((20, 700),)).revised(run, SimpleNamespace(step=20))
+    assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
