@@ -17,7 +17,6 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
-from crossgrad_core.training.schedules import unit_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
@@ -54,7 +53,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_components(config, setup),
         *_of_density_control(config, setup),
         *_of_views(config, setup),
-        *_of_the_schedule(config),
+        *_of_the_schedule(config, setup),
         *_of_groups(config, setup),
         *_of_exposure(config, setup),
         *_of_the_split(config),
@@ -113,11 +112,14 @@ def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
         yield "batch_rule", "a step has one view; ask for more --views"
 
 
-def _of_the_schedule(config: RunConfig) -> Iterator[tuple[str, str]]:
+def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.reference is not None and config.schedule == "scaled":
         yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
-    if config.fewest_edits is not None and unit_of(config) == "steps":
-        yield "fewest_edits", "density control counts steps; --events views counts views"
+    if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
+        yield "clock", "the length of the run is not in seconds; add --seconds"
+    if config.fewest_edits is not None and not setup.schedule.fewest_edits:
+        why = "are published or have times that were set are not made to fit"
+        yield "fewest_edits", f"edits that count steps, {why}"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -115,6 +115,11 @@ IDLE = [
         "rasterizer.dilation",
     ),
     ({"reading": {"split": "none", "test_every": 4}}, "reading.test_every"),
+    ({"clock": "cpu"}, "clock"),
+    ({"fewest_edits": 6, "events": "steps"}, "fewest_edits"),
+    ({"fewest_edits": 6, "densify_until": 600}, "fewest_edits"),
+    ({"fewest_edits": 6, "densify_from": 0, "densify_every": 9}, "fewest_edits"),
+    ({"fewest_edits": 6, "schedule": "absolute", "events": "views"}, "fewest_edits"),
     ({"final_rate": 0.5}, "final_rate"),
     (
         {
@@ -139,6 +144,9 @@ AT_WORK = [
     {"grouping": {"name": "gmm"}, "observers": [{"name": "diagnostics"}]},
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
+    {"fewest_edits": 6},
+    {"fewest_edits": 6, "schedule": "absolute", "reference": 600},
+    {"seconds": 9.0, "clock": "cpu"},
     {"final_decay": 0.5, "final_rate": 0.5},
     {"backbone": {"name": "scaffold"}, "final_decay": 0.5},
     # A value that is the default is never refused.
