@@ -42,7 +42,7 @@ def resolved(setup: Setup) -> RunConfig:
             "exposure_from": None if known is None else known.resolve(),
             "out": None,
             "views_per_step": selection.views.setting,
-            "steps": config.steps or setup.schedule.total,
+            "steps": None if config.seconds else config.steps or setup.schedule.total,
             "events": setup.schedule.counting.unit,
             "final_decay": final_decay_of(config),
             "average": average_of(config),

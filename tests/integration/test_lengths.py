@@ -15,6 +15,7 @@ from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.opening import parsed
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.settings import merged
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.budget import _cost, _cost_ahead, seconds_ahead
 from crossgrad_core.training.loop import timed_step
@@ -81,6 +82,15 @@ def test_a_run_shorter_than_a_step_is_refused():
 def test_a_run_has_one_length(lengths):
     with pytest.raises(UserError, match="one length"):
         app.with_defaults(RunConfig(**lengths))
+
+
+def test_the_dry_run_of_a_budget_is_a_configuration_of_it(scene, tmp_path, capsys):
+    settings = {"scene": str(scene), "seconds": 60.0, "threads": 1}
+    assert app.run(settings, dry_run=True, verbosity=-1) == 0
+    (tmp_path / "config.yaml").write_text(capsys.readouterr().out)
+    again = merged(tmp_path / "config.yaml", {}, ())
+    assert (again["seconds"], again["steps"]) == (60.0, None)
+    assert app.run(again, dry_run=True, verbosity=-1) == 0
 
 
 def test_one_view_and_two_edit_after_as_many_views():
