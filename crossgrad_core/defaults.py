@@ -15,6 +15,8 @@ RESOLUTION: Final = "full"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
+#: What runs of 0.1 measure: their configurations did not say it.
+METRICS_OF_0_1: Final = "psnr+ssim+ssim-skimage+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
 #: The reader that says what is missing in a folder that no reader accepts.

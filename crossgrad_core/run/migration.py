@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from crossgrad_core.defaults import METRICS_OF_0_1
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
 from crossgrad_core.system.version import VERSION
@@ -50,9 +51,10 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest["operator"] = _operators(rest["operator"])
     if version == _FIRST and "reading" in rest:
         rest["reading"] = _reading(rest["reading"], rest.get("scene"))
-    if "revisions" in rest and "events" not in rest:
-        # What a run wrote before schedules counted views: it goes on, and is repeated, in steps.
-        rest["events"] = "steps"
+    if "revisions" in rest:
+        # What a run wrote: it goes on, and is repeated, in steps and with the columns that it had.
+        rest.setdefault("events", "steps")
+        rest.setdefault("metrics", [{"name": name} for name in METRICS_OF_0_1.split("+")])
     return rest
 
 

@@ -62,6 +62,21 @@ def test_the_configuration_of_a_run_of_0_1_repeats_it(old, scene, tmp_path):
     assert written == {**again.summary["config"]}
 
 
+def test_a_stopped_run_of_0_1_goes_on(old):
+    config = old / "config.yaml"
+    config.write_text(config.read_text().replace("steps: 20", "steps: 24"))
+    header, *rows = (old / "metrics.csv").read_text().splitlines()
+    assert cg.resume(old, quiet=True).summary["status"] == "finished"
+    now = (old / "metrics.csv").read_text().splitlines()
+    assert now[0] == header.replace("train_seconds", "train_seconds,cpu_seconds")
+    assert [row.partition(",")[0] for row in now[1 + len(rows) :]] == ["22", "24"]
+
+
+def test_a_file_by_hand_without_a_version_measures_what_this_version_does():
+    assert "metrics" not in migrated({"steps": 24}, FILE)
+    assert migrated({"revisions": [], "metrics": ["psnr"]}, FILE)["metrics"] == ["psnr"]
+
+
 def test_a_run_of_0_1_keeps_the_photos_that_it_held_out(tmp_path):
     def split(**more):
         return migrated({"scene": str(tmp_path), **more}, FILE).get("reading")
