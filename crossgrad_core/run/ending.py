@@ -16,6 +16,7 @@ from crossgrad_core.run.results.summary import Status
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import checked_meanwhile, fits
 from crossgrad_core.training.budget import Length
+from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -85,22 +86,24 @@ class Course:
         ):
             setup.hook.crossgrad_run_start(run=self._info())
             self._catch_up()
+            state, keeper = self.state, Keeper(self.state)
             while True:
-                ended = train(self.setup, self.state, self.session, self.stopper, length.due)
+                ended = train(self.setup, state, self.session, self.stopper, length.due, keeper)
                 if ended != "paused":
                     self.ending = Ending(ended)
                     return
-                revised = length.revised(self.setup, self.state)
+                revised = length.revised(self.setup, state)
+                if revised is not self.setup:
+                    keeper.copy(state)  # A length is written down with its step: none goes behind.
                 if revised.config is not self.setup.config:  # A planned length is written already.
                     write_config(self.session.folder, revised.config)
                 self.setup = revised
 
     def _catch_up(self) -> None:
         """Evaluates where an earlier session ended before it could."""
-        if evaluates_after(self.setup, self.state.step) and not self.session.has_row(
-            self.state.step
-        ):
-            self.session.evaluate(self.setup, self.state)
+        setup, state, session = self.setup, self.state, self.session
+        if evaluates_after(setup, state.step) and not session.has_row(state.step):
+            session.evaluate(setup, state)
 
     def _describe(self) -> None:
         setup, state, session = self.setup, self.state, self.session

@@ -103,13 +103,18 @@ class Timed:
         self._step = 0
         self._clock = 0.0
         self._each: float | None = None
+        self._rewinds = self._seen = self._next = 0
 
     def due(self, state: TrainState) -> bool:
         """After some steps and a share of the budget."""
-        if state.step < self._step:  # The loop went back to the last good state.
+        if state.rewinds > self._rewinds:
+            # A length is written down with its step: it has to be one that is done only once.
+            self._rewinds, self._next = state.rewinds, self._seen + 1
             self._look(state)
+        self._seen = state.step
         seconds = state.clock.trained(self._kind) - self._clock
-        return state.step - self._step >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
+        steps = 0 if state.step < self._next else state.step - self._step
+        return steps >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that now fits; its configuration says so."""

@@ -49,8 +49,11 @@ def train(
     sink: Sink,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None = None,
+    keeper: Keeper | None = None,
 ) -> Ending:
     """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
+
+    A `keeper` that outlives a pause goes back behind it; by default none does.
 
     Raises:
         TrainingFailedError: Something was not finite twice, or at the start; names step, views and
@@ -59,7 +62,7 @@ def train(
             note. After any exception `state` is the last good one.
     """
     check_start(state)
-    keeper = Keeper(state)
+    keeper = keeper or Keeper(state)
     try:
         status = _steps(setup, state, sink, stopper, pauses, keeper)
     except TrainingFailedError:

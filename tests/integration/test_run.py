@@ -288,6 +288,27 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 
+@pytest.mark.parametrize("seconds", [0.001, 1.0])
+def test_where_training_goes_back_to_does_not_depend_on_the_clock(
+    scene, tmp_path, monkeypatch, seconds
+):
+    each_step_takes(monkeypatch, seconds)  # Of a second: the run thinks about its length at once.
+    poisoned(monkeypatch, Poison([7]))
+    assert run(scene, tmp_path / "run", save_every=100) == 0
+    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+
+
+def test_a_run_within_a_budget_that_was_rewound_is_repeated(scene, tmp_path, monkeypatch):
+    each_step_takes(monkeypatch, 1.0)
+    poisoned(monkeypatch, Poison([17]))
+    given = {"scene": str(scene), "save_every": 1000, "eval_every": 1000}
+    assert app.run({**given, "seconds": 20.0, "out": str(tmp_path / "timed")}, verbosity=-1) == 0
+    poisoned(monkeypatch, Poison([17]))
+    stored = read_config(tmp_path / "timed")
+    assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
+    assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
+
+
 def test_a_bad_value_right_before_the_length_is_revised_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0

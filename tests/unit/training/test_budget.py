@@ -97,7 +97,7 @@ def test_without_density_control_every_step_costs_the_same():
 
 def timed(seconds, planned, cost):
     """A run whose step s takes cost(s, schedule) seconds, and its clock at the end."""
-    run, state = setup(steps=planned), SimpleNamespace(step=0, clock=Clock())
+    run, state = setup(steps=planned), SimpleNamespace(step=0, rewinds=0, clock=Clock())
     length = Timed(seconds)
     while state.step < run.schedule.total:
         state.step += 1
@@ -180,7 +180,7 @@ def test_notes_that_the_clock_overtakes_are_withdrawn():
 
 @pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
 def test_the_user_is_told_once_that_density_control_takes_place_after_all(length):
-    run, state = noted(setup(steps=935)), SimpleNamespace(step=0, clock=Clock())
+    run, state = noted(setup(steps=935)), SimpleNamespace(step=0, rewinds=0, clock=Clock())
     while state.step < run.schedule.total:
         state.step += 1
         state.clock.train += 0.04
