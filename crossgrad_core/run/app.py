@@ -32,7 +32,7 @@ from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
 from crossgrad_core.run.results.scene_file import write_scene
-from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
 from crossgrad_core.run.session import Session, totals
 from crossgrad_core.run.settings_for_nothing import (
@@ -150,14 +150,13 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     if config.seconds is not None:
         setup = _within(setup, config.seconds)
         length = Timed(config.seconds, config.clock)
-    setup = replace(setup, notes=(*setup.notes, *growth_note(setup)))
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
     state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
-        write_config(folder, setup.config)
-        _write_scene(folder, setup)
+        write_config(folder, setup.config, setup.notes)
+        write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         with way_on(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
 
@@ -208,7 +207,8 @@ def _within(setup: Setup, seconds: float) -> Setup:
     update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
     config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
-    return replace(setup, config=config, schedule=schedule, notes=(*setup.notes, note))
+    setup = replace(setup, config=config, schedule=schedule)
+    return replace(setup, notes=(*setup.notes, note, *growth_note(setup)))
 
 
 @contextmanager
@@ -288,18 +288,19 @@ def resumed(
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
     with way_on(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, accept_scene=accept_scene)
-        if state.step >= setup.schedule.total and _is_described(folder, state.step):
+        step, total = state.step, setup.schedule.total
+        if step >= total and summarised_step(folder, "finished") == step:
             raise UserError(
                 "the run is finished",
                 where=folder,
-                found=f"all {setup.schedule.total} steps done",
+                found=f"all {total} steps done",
                 todo="start a new run; --init point_cloud.ply starts from its Gaussians",
             )
-        if state.step < setup.schedule.total:
+        if step < total:
             state.clock.load += _held_out_decoded(setup)
             state.clock.compile += warm_up(setup, state)
-        _write_scene(folder, setup)
-        session = Session.resumed(folder, setup, state.step)
+        write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
+        session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))
         return _train(setup, state, session, length, way.tell)
 
@@ -310,19 +311,6 @@ def _held_out_decoded(setup: Setup) -> float:
     keep = fits(setup.scene, setup.config.reading.cache_mib)
     check_photos(setup.scene.test_views, keep=keep)
     return perf_counter() - start
-
-
-def _write_scene(folder: Path, setup: Setup) -> None:
-    write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
-
-
-def _is_described(folder: Path, step: int) -> bool:
-    """Whether nothing is missing of a run that did all its steps, `step` in number."""
-    try:
-        summary = read_summary(folder)
-    except UserError:
-        return False
-    return summary.get("status") == "finished" and summary.get("step") == step
 
 
 def _print_dry_run(setup: Setup) -> None:

@@ -38,7 +38,7 @@ from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.schedules import counting_of, schedule_of
+from crossgrad_core.training.schedules import counting_of, growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on
 from crossgrad_core.wording import listed, plural
@@ -165,9 +165,10 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=choose_device(config.device),
         notes=tuple(notes),
     )
-    return replace(
-        setup, notes=(*setup.notes, *_linear_note(setup), *idle_note(setup), *notes_on(config))
-    )
+    # The length of a run within a budget is not known yet.
+    growth = growth_note(setup) if config.seconds is None else ()
+    added = (*_linear_note(setup), *idle_note(setup), *notes_on(config), *growth)
+    return replace(setup, notes=(*setup.notes, *added))
 
 
 def _with_first_degree(config: RunConfig) -> RunConfig:

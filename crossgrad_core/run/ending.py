@@ -9,7 +9,7 @@ from shlex import quote
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
-from crossgrad_core.run.results.config_file import write_config
+from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.summary import Status
@@ -96,7 +96,8 @@ class Course:
                 if revised is not self.setup:
                     keeper.copy(state)  # A length is written down with its step: none goes behind.
                 if revised.config is not self.setup.config:  # A planned length is written already.
-                    write_config(self.session.folder, revised.config)
+                    folder = self.session.folder
+                    write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised
 
     def _catch_up(self) -> None:

@@ -15,6 +15,8 @@ from crossgrad_core.system.version import VERSION
 #: The key that says which version wrote a configuration, and the version of this one.
 KEY: Final = "crossgrad"
 CURRENT: Final = ".".join(VERSION.split(".")[:2])
+#: The key of what is written down beside the settings.
+NOTES: Final = "notes"
 #: What wrote files without the key.
 _FIRST: Final = "0.1"
 _KNOWN: Final = (_FIRST, CURRENT)
@@ -28,7 +30,7 @@ def marked(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """The settings of a file as this version has them, without the version.
+    """The settings of a file as this version has them, without version and notes.
 
     Args:
         settings: What a file holds, choices of components in their long form.
@@ -46,7 +48,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
             found=version,
             todo=f"install crossgrad {version}, or remove the line if the file is of this version",
         )
-    rest = {name: value for name, value in settings.items() if name != KEY}
+    rest = {name: value for name, value in settings.items() if name not in {KEY, NOTES}}
     if version == _FIRST and "operator" in rest:
         rest["operator"] = _operators(rest["operator"])
     if version == _FIRST and "reading" in rest:

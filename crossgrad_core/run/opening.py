@@ -19,7 +19,7 @@ from crossgrad_core.run.checkpoint.checkpoint import load_latest
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.run.persist import from_checkpoint
 from crossgrad_core.run.results.config_file import FILE as CONFIG
-from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.resumable import CHANGEABLE
@@ -83,7 +83,7 @@ def require_checkpoint(folder: Path) -> None:
         UserError: It is no run, or it has no checkpoint.
     """
     read_config(folder)
-    if not _has_checkpoint(folder):
+    if not complete_checkpoints(folder / CHECKPOINTS):
         writer = writer_of(folder)
         raise UserError(
             "the run has no checkpoint yet",
@@ -140,12 +140,12 @@ def continued(
         UserError: It is no run, a setting would change the training, or the scene is another one.
     """
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
-    if _has_checkpoint(folder):
+    if complete_checkpoints(folder / CHECKPOINTS):
         return _from(folder, settings, verbosity, check)
     setup, seconds = set_up(_config(folder, settings), verbosity)
     state = first_state(setup)
     state.clock.load = seconds
-    return replace(setup, notes=(BEGINS_AGAIN, *setup.notes)), state
+    return replace(setup, notes=(BEGINS_AGAIN, *_noted(folder, setup))), state
 
 
 def _from(
@@ -159,11 +159,13 @@ def _from(
     setup, seconds = set_up(_config(folder, settings), verbosity, check)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
-    return caught_up(setup, state.step), state
+    return caught_up(replace(setup, notes=_noted(folder, setup)), state.step), state
 
 
-def _has_checkpoint(folder: Path) -> bool:
-    return bool(complete_checkpoints(folder / CHECKPOINTS))
+def _noted(folder: Path, setup: Setup) -> tuple[str, ...]:
+    """What the scene says now, and what the run noted when it decided what is a setting now."""
+    stored = read_notes(folder)
+    return tuple(dict.fromkeys((*setup.scene.notes, *stored))) if stored else setup.notes
 
 
 def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:

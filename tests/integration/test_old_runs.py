@@ -14,7 +14,7 @@ from support.scenes import write_tiny_scene
 import crossgrad_core as cg
 from crossgrad_core.cli.main import main
 from crossgrad_core.run.migration import migrated
-from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.settings import merged
 
 OLD = Path(__file__).parent / "data" / "run-0.1"
@@ -59,6 +59,7 @@ def test_the_configuration_of_a_run_of_0_1_repeats_it(old, scene, tmp_path):
     assert again.summary["config"]["operator"] == {"name": "pcgrad", "granularity": "kind"}
     written = yaml.safe_load((again.folder / "config.yaml").read_text())
     assert written.pop("crossgrad") == "0.2"
+    assert tuple(written.pop("notes")) == read_notes(again.folder)
     assert written == {**again.summary["config"]}
 
 

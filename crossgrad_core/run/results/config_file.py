@@ -1,20 +1,22 @@
 """config.yaml: the resolved configuration, which repeats the run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.migration import marked, migrated
+from crossgrad_core.run.migration import NOTES, marked, migrated
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 
 FILE = "config.yaml"
 
 
-def write_config(folder: Path, config: RunConfig) -> None:
-    """Writes what repeats the run; a run that follows the clock renews it as it goes."""
-    write_atomically(folder / FILE, as_yaml(config).encode())
+def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
+    """Writes what repeats the run, with its first notes; one that follows the clock renews it."""
+    noted = write_yaml({NOTES: list(notes)}) if notes else ""
+    write_atomically(folder / FILE, f"{as_yaml(config)}{noted}".encode())
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -32,9 +34,19 @@ def read_config(folder: Path) -> dict[str, Any]:
             expected=f"a folder with {FILE}",
             todo="name the folder that `crossgrad run` printed",
         )
-    return migrated(read_mapping(path, "the configuration of the run", "start a new run"), path)
+    return migrated(_content(folder), path)
+
+
+def read_notes(folder: Path) -> tuple[str, ...]:
+    """What a run noted at its start; nothing where it is of an earlier version."""
+    notes = _content(folder).get(NOTES)
+    return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
 
 def as_yaml(config: RunConfig) -> str:
     """The configuration as a user would write it, and the version that writes it."""
     return write_yaml(marked(config.model_dump(mode="json")))
+
+
+def _content(folder: Path) -> dict[str, Any]:
+    return read_mapping(folder / FILE, "the configuration of the run", "start a new run")

@@ -95,12 +95,13 @@ def read_summary(folder: Path) -> dict[str, Any]:
     )
 
 
-def summarised_step(folder: Path) -> int | None:
-    """The step that a run's summary.json and the files beside it describe; None without one."""
+def summarised_step(folder: Path, status: Status | None = None) -> int | None:
+    """The step that summary.json and the files beside it describe; None without that status."""
     try:
-        step = read_summary(folder).get("step")
+        summary = read_summary(folder)
     except UserError:
         return None
+    step = summary.get("step") if status in (None, summary.get("status")) else None
     return step if isinstance(step, int) else None
 
 
