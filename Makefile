@@ -9,7 +9,7 @@ FUZZ_SECONDS ?= 600
 FUZZ_EXECUTIONS ?= 100000
 FUZZ_SEED ?= 0
 BIN = $(VENV)/bin
-PIP_FLAGS = --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
+PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
 .PHONY: demo install test slow matrix exposures compat faults fuzz lint bench clean
 

@@ -13,15 +13,14 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
-# Installing compiles no bytecode: most of it would never be imported, and it takes a minute.
 pip="$venv/bin/python -m pip --quiet --disable-pip-version-check"
-$pip install --no-compile --constraint "$here/constraints.txt" build hatchling
+$pip install --constraint "$here/constraints.txt" build hatchling
 "$venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$here" >"$work/build.log" 2>&1 ||
     { cat "$work/build.log"; exit 1; }
 wheel=$(ls "$work"/dist/crossgrad-*.whl)
-$pip install --no-compile --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
+$pip install --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
-$pip install --no-compile --force-reinstall --no-deps "$wheel"
+$pip install --force-reinstall --no-deps "$wheel"
 
 cd "$work"
 types=
