@@ -15,6 +15,7 @@ from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.scene import photo_check
 
 STEPS, FAILS_IN = 8, 5
 RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}
@@ -298,10 +299,15 @@ def test_a_held_out_photo_that_cannot_be_decoded_costs_no_step(tmp_path):
 
 
 class Waiting:
-    """Holds up the first step until the run was asked to stop."""
+    """Holds up the first step until the run was asked to stop, and the photos until that step."""
+
+    def __init__(self, monkeypatch):
+        self.reached = threading.Event()
+        monkeypatch.setattr(photo_check, "_give_way", lambda: self.reached.wait(30))
 
     @hookimpl
     def crossgrad_step_end(self, record):
+        self.reached.set()
         for thread in threading.enumerate():
             if thread.name == "crossgrad-photos":
                 thread.join(30)
@@ -314,7 +320,7 @@ def test_a_training_photo_that_cannot_be_decoded_is_found_beside_training(
     scene = write_tiny_scene(tmp_path / "tiny", views=9)
     (scene / "train_list.txt").write_text("\n".join(f"{i:04}.png" for i in range(1, 8)))
     rotten(scene / "images" / "0007.png")
-    with_plugin["waiting"] = Waiting()
+    with_plugin["waiting"] = Waiting(monkeypatch)
     with_plugin["first"] = FirstViews()
     monkeypatch.setattr(app, "warm_up", lambda *args: 0.0)
     assert run(scene, tmp_path / "run") == 1
