@@ -10,10 +10,35 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Before torch and numba ar
 
 import pytest
 from PIL import Image
+from xdist.scheduler import LoadFileScheduling
 
 from crossgrad_core.run.results.curve import FILE, draw_curve
 
+CONTRACTS = "test_contracts.py"
 SESSION = "crossgrad_core.run.session.draw_curve"
+
+
+class ByFileOrComponent(LoadFileScheduling):
+    """Tests of a file run in one process, which makes what they share once; contracts are divided.
+
+    The contracts of a component stay together, as they compile the same kernels.
+    """
+
+    def _split_scope(self, nodeid):
+        if CONTRACTS in nodeid:
+            return nodeid.rpartition("-")[0]
+        return super()._split_scope(nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """How tests are divided among processes."""
+    return ByFileOrComponent(config, log)
+
+
+def pytest_collection_modifyitems(items):
+    """Contracts first: no two processes compile a kernel that all later tests find compiled."""
+    items.sort(key=lambda item: item.path.name != CONTRACTS)
 
 
 def without_drawing(folder, *_):

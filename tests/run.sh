@@ -18,7 +18,9 @@ $pip install --constraint "$here/constraints.txt" build hatchling
 "$venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$here" >"$work/build.log" 2>&1 ||
     { cat "$work/build.log"; exit 1; }
 wheel=$(ls "$work"/dist/crossgrad-*.whl)
-$pip install --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
+# Bytecode is made when a module is imported, in the tests' environment: most never are.
+unset PYTHONDONTWRITEBYTECODE
+$pip install --no-compile --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
 $pip install --force-reinstall --no-deps "$wheel"
 
@@ -32,10 +34,8 @@ case ",$extras," in *,lint,*)
     types=$!
     ;;
 esac
-# A file's tests stay together: what they share is made once. In the order of the files the
-# contracts compile the kernels that the matrix uses, not both at a time.
-"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --dist loadfile \
-    --no-loadscope-reorder --quiet --rootdir "$here" --config-file "$here/pyproject.toml" \
-    "$here/tests" "$@" && tests=0 || tests=$?
+# tests/conftest.py says which tests stay together, and which come first.
+"$venv/bin/python" -m pytest --numprocesses "${TEST_WORKERS:-auto}" --no-loadscope-reorder --quiet \
+    --rootdir "$here" --config-file "$here/pyproject.toml" "$here/tests" "$@" && tests=0 || tests=$?
 [ -z "$types" ] || wait "$types" || { cat "$work/types.log"; exit 1; }
 exit "$tests"

@@ -42,15 +42,19 @@ PLACES = {
 }
 #: Files at the top of the core.
 MOST_FILES = 9
-GRAPH = import_graph()
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return import_graph()
 
 
 def room(module):
     return [*module.split("."), "__init__"][1]
 
 
-def test_there_is_no_circle():
-    assert not circle(GRAPH)
+def test_there_is_no_circle(graph):
+    assert not circle(graph)
 
 
 def test_a_circle_would_be_found(tmp_path):
@@ -69,10 +73,10 @@ def test_every_room_has_a_floor():
 
 
 @pytest.mark.parametrize("here", FLOOR)
-def test_imports_go_down(here):
+def test_imports_go_down(here, graph):
     upward = [
         f"{module} -> {other}"
-        for module, others in GRAPH.items()
+        for module, others in graph.items()
         if module.split(".")[0] == CORE and room(module) == here
         for other in others
         # What the core's own __init__ holds, its version, is no room.
@@ -82,10 +86,10 @@ def test_imports_go_down(here):
     assert not upward
 
 
-def test_the_core_imports_no_shelf():
+def test_the_core_imports_no_shelf(graph):
     assert not [
         f"{module} -> {other}"
-        for module, others in GRAPH.items()
+        for module, others in graph.items()
         if module.split(".")[0] == CORE
         for other in others
         if other.split(".")[0] in SHELVES
@@ -93,9 +97,9 @@ def test_the_core_imports_no_shelf():
 
 
 @pytest.mark.parametrize("shelf", SHELVES)
-def test_shelves_come_through_the_doors(shelf):
+def test_shelves_come_through_the_doors(shelf, graph):
     beside = []
-    for module, others in GRAPH.items():
+    for module, others in graph.items():
         if module.split(".")[0] != shelf:
             continue
         doors = next((doors for place, doors in PLACES.items() if _in(module, place)), DOORS)

@@ -54,7 +54,8 @@ def config_of(row: Row) -> RunConfig:
         for slot, name in zip(SLOTS, row, strict=True)
     }
     views = _several_views(choices["sampler"], choices["operator"])
-    return RunConfig.model_validate({"steps": 100, "views": views, **choices, **_TIMES})
+    few = {"steps": 100, "views": views, "metrics": [{"name": "psnr"}]}
+    return RunConfig.model_validate({**few, **choices, **_TIMES})
 
 
 @cache
