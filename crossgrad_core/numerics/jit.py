@@ -41,6 +41,15 @@ def strict_device(function: Callable[P, R]) -> Callable[P, R]:
     return inlined(function)
 
 
+def strict_section(function: Callable[P, R]) -> Callable[P, R]:
+    """A section of one strict kernel: its code stands in the caller before that is compiled.
+
+    Parts and devices are optimised by themselves and again in each caller, which for large ones
+    takes seconds at every level.
+    """
+    return cast("Callable[P, R]", _COMPILE(inline="always", **_OPTIONS)(function))
+
+
 def strict_part(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of its own that only strict kernels call."""
     return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -195,20 +195,25 @@ def _sources(source: Path) -> set[Path]:
         path = waiting.pop()
         found.add(path)
         if path.parent.name == _FOLDERS or path.parent == source.parent:
-            waiting |= set(_imported(path)) - found
+            waiting |= _imported(path) - found
     return found
 
 
-def _imported(path: Path) -> Iterator[Path]:
-    """The files of modules that a file imports from its own package or from the core."""
-    packages = {_CORE, _package_of(path)}
+@cache
+def _imported(path: Path) -> frozenset[Path]:
+    """The files of modules that a file imports from its own package or from the core.
+
+    Cached: most kernels' files have most of what they import in common.
+    """
+    packages, found = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):
         names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         for name in names:
             if name.partition(".")[0] in packages:
-                yield from _file_of(name)
+                found.update(_file_of(name))
+    return frozenset(found)
 
 
 def _package_of(path: Path) -> str:

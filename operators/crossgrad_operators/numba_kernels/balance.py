@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
 from crossgrad_operators.numba_kernels.linear import (
     eigen,
     smallest_pivot,
@@ -37,7 +37,7 @@ CLOSE = 0.25
 ENDLESS = 3e7
 
 
-@strict_kernel
+@strict_part
 def _compact(
     gramian: Floats, present: Flags, norms: Floats, cosines: Floats, places: Indices
 ) -> int:
@@ -57,7 +57,7 @@ def _compact(
     return count
 
 
-@strict_kernel
+@strict_part
 def _shortest_solution(norms: Floats, cosines: Floats, rank: int) -> Floats:
     """The shortest v with least |G v - (|g_k|)| for G of the given rank below full."""
     n = norms.size
@@ -82,7 +82,7 @@ def _shortest_solution(norms: Floats, cosines: Floats, rank: int) -> Floats:
     return v
 
 
-@strict_kernel
+@strict_part
 def _equal_projections(norms: Floats, cosines: Floats, v: Floats) -> float:
     """Solves G v = (|g_k|); the shortest least-squares solution where G is singular.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_section
 from crossgrad_operators.numba_kernels.digits import (
     Exact,
     Pair,
@@ -41,7 +41,7 @@ def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
         z[0, 0] -= first
 
 
-@strict_part
+@strict_section
 def _projected(problem: Polyhedron, z: Pairs) -> None:
     """Coefficients z of the projection of b; zero where only rounding noise is left of it."""
     exact = problem.rounding.exact

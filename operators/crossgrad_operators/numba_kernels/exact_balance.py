@@ -3,7 +3,7 @@
 import numpy as np
 
 from crossgrad_core.numerics.double_double import add, divide, multiply, square_root
-from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
 from crossgrad_operators.numba_kernels.balance import bargain, geometric_mean
 from crossgrad_operators.numba_kernels.exact_linear import (
     exact_cosines,
@@ -19,7 +19,7 @@ from crossgrad_operators.numba_kernels.normal import CANCELLED, EPSILON, OPPOSIT
 POLISHING = 20
 
 
-@strict_kernel
+@strict_part
 def _polish(cosines: Floats, beta: Floats) -> None:
     """Newton steps of the bargain with exact slopes: C beta = 1 / beta to the last digits."""
     n = beta.size
@@ -78,7 +78,7 @@ def exact_nash(gramians: Floats, remainders: Floats, present: Flags) -> Floats:
     return result
 
 
-@strict_kernel
+@strict_part
 def _spectral(
     matrix: Floats, vectors: Floats, right: Floats, kept: Flags, power: int, out: Floats
 ) -> None:
@@ -105,7 +105,7 @@ def _spectral(
             out[0, k], out[1, k] = add(out[0, k], out[1, k], y, y_low)
 
 
-@strict_kernel
+@strict_part
 def _equal_projections(cosines: Floats, norms: Floats, v: Floats) -> None:
     """Solves G v = (|g_k|), or its shortest least-squares solution, for norms in units of one."""
     n = norms.shape[1]
@@ -133,7 +133,7 @@ def _equal_projections(cosines: Floats, norms: Floats, v: Floats) -> None:
     _spectral(matrix, vectors, norms, kept, 2, v)
 
 
-@strict_kernel
+@strict_part
 def _normalised_sum(cosines: Floats, norms: Floats, v: Floats, weights: Floats) -> bool:
     """Weights v / sum v; False where nothing but a pole or noise is left."""
     n = norms.shape[1]

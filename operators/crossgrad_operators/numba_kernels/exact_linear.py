@@ -11,7 +11,7 @@ from crossgrad_core.numerics.double_double import (
     multiply,
     square_root,
 )
-from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Off-diagonal elements up to this share of the diagonal ones count as zero.
@@ -77,7 +77,7 @@ def _turn(
     return one, one_low, other, other_low
 
 
-@strict_kernel
+@strict_part
 def _rotation(matrix: Floats, p: int, q: int, rotation: Floats) -> None:
     """Cosine and sine [2, 2] of the rotation that clears the element (p, q), and both diagonals."""
     x, x_low = matrix[0, p, q], matrix[1, p, q]
@@ -107,7 +107,7 @@ def _rotation(matrix: Floats, p: int, q: int, rotation: Floats) -> None:
     matrix[:, q, p] = 0.0
 
 
-@strict_kernel
+@strict_part
 def _rotate(matrix: Floats, vectors: Floats, p: int, q: int, rotation: Floats) -> None:
     """One Jacobi rotation of the rest of a matrix and of its eigenvectors."""
     for k in range(matrix.shape[1]):

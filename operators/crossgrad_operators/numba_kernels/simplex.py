@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part, strict_section
 from crossgrad_operators.numba_kernels.digits import (
     Exact,
     Pair,
@@ -99,7 +99,7 @@ def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
                 x[0, 0], x[1, 0] = first, second
 
 
-@strict_part
+@strict_section
 def _shortest(problem: Polyhedron, x: Pairs) -> float:
     """Fills x and returns the share of it that is not rounding noise; heights are r."""
     exact, r = problem.rounding.exact, problem.heights
@@ -204,7 +204,7 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
     return same
 
 
-@strict_part
+@strict_section
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
     """The level at which the nearest point is at distance rho, and its multipliers.
 
@@ -235,7 +235,7 @@ def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) 
     return level
 
 
-@strict_device
+@strict_section
 def _reach(problem: Polyhedron, search: Search) -> None:
     """Raises the level of all constraints until the nearest point is as far away as rho."""
     forget(problem)
@@ -249,7 +249,7 @@ def _reach(problem: Polyhedron, search: Search) -> None:
             return
 
 
-@strict_part
+@strict_section
 def _defined(problem: Polyhedron, search: Search) -> float:
     """The share of CAGrad's direction that is defined; forgets no multipliers.
 
@@ -333,7 +333,7 @@ def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
     return Search(q, r, (product(rho, rho, exact), rho))
 
 
-@strict_part
+@strict_section
 def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
     """Fills the weights [K] of at least two gradients; q is room to work in.
 
@@ -369,7 +369,7 @@ def _least_cosine(problem: Polyhedron) -> float:
     return least
 
 
-@strict_device
+@strict_section
 def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
     """Fills the weights [K] of one block; the heights are r."""
     views, exact = len(norms), problem.rounding.exact

@@ -63,11 +63,12 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     stops = float(np.log2(wanted.sum() / light.sum()))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)
-        stops = float(tried[np.argmin([_distance(light * 2.0**gain, wanted) for gain in tried])])
+        distances = _distances(light * 2.0 ** tried[:, None], wanted)
+        stops = float(tried[np.argmin(distances)])
     return stops
 
 
-def _distance(light: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
-    """Mean square of what two brightnesses in linear light differ by in sRGB values."""
-    one, other = (encoded(torch.from_numpy(each)) for each in (light, wanted))
-    return float((one - other).square().mean())
+def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean squares of what brightnesses [L, N] in linear light differ by from [N], as sRGB."""
+    some, others = (encoded(torch.from_numpy(each)) for each in (lights, wanted))
+    return (some - others).square().mean(dim=1).numpy()
