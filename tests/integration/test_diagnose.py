@@ -12,12 +12,21 @@ from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.training import loop
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_plugins.diagnostics import exposure_figure, figure
 from crossgrad_plugins.diagnostics.app import diagnose
 from crossgrad_plugins.diagnostics.command import Options
 
 PROBED = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
 FILES = {*PROBED, "exposure.csv", "exposure.png"}
 QUICK = Options(per_group=4, probes=2, seconds=1.0)
+
+
+@pytest.fixture(autouse=True)
+def _without_pictures(request, monkeypatch):
+    """Drawing takes half of the time of these tests; those that want pictures ask for `drawn`."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(figure, "draw", lambda *_: b"a picture")
+        monkeypatch.setattr(exposure_figure, "draw_exposure", lambda *_: b"a picture")
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +99,7 @@ def test_a_resumed_run_continues_its_table(scene, tmp_path):
     assert figures(parts) == figures(whole)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
     printed = capsys.readouterr().out
@@ -101,7 +111,8 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     assert len({row["step"] for row in rows}) == 2
     assert {row["metric"] for row in rows} == {"plain", "adam"}
     assert {"means", "opacities", "all"} <= {row["block"] for row in rows}
-    assert (tmp_path / "out" / "diagnostics.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("diagnostics.png", "exposure.png"):
+        assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_run_is_diagnosed_where_it_is(scene, tmp_path, capsys):

@@ -2,14 +2,20 @@
 
 import pytest
 
+from crossgrad_core.run.results.machine import Calibration
 from crossgrad_core.training.clock import Clock, Laps
 
 
 def each_step_takes(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    """Every step of the runs of this process counts so many seconds on both of its clocks."""
+    """Every step of the runs of this process counts so many seconds on both of its clocks.
+
+    Runs that become long by that do not measure the machine for two real seconds.
+    """
 
     def count(self: Clock, laps: Laps) -> None:
         counted(self, Laps(total=seconds, spent={"other": seconds}, cpu=seconds))
 
     counted = Clock.count
     monkeypatch.setattr(Clock, "count", count)
+    known = Calibration(2.0, 1.0, 1.0)
+    monkeypatch.setattr("crossgrad_core.run.results.machine.calibrated", lambda: known)
