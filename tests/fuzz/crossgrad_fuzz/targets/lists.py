@@ -1,6 +1,6 @@
 """Lists that users write: split lists, and labels of views."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from crossgrad_core.contract.scene_options import SceneOptions
@@ -36,8 +36,16 @@ def _parse_split(folder: Path) -> None:
     assert set(found.test) <= set(_NAMES)
     assert not set(found.train) & set(found.test)
     assert split_views(_NAMES[:1], SceneOptions(split="every"), folder).train
-    for each in (SceneOptions(split="none"), SceneOptions(split="every", test_every=2)):
-        assert set(split_views(_NAMES, each, folder).train) <= set(_NAMES)
+    for how in ("none", "every", "stratified", "auto"):
+        options = SceneOptions(split=how, test_every=2)
+        elsewhere = folder if how != "auto" else folder / "without lists"
+        parted = split_views(_NAMES, options, elsewhere, label=_regimes)
+        assert parted.train
+        assert set(parted.train) <= set(_NAMES)
+
+
+def _regimes(names: Sequence[str]) -> Mapping[str, str]:
+    return {name: "far" if name.startswith("far/") else "near" for name in names}
 
 
 def _label_seeds() -> Sequence[Case]:
