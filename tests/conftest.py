@@ -1,7 +1,7 @@
 """What all tests share.
 
-Runs do not draw their curve, which is half of the time of a tiny one. Threads that wait do not
-spin: the processes of the tests share the cores, and spinning took as much time as the work.
+Runs do not draw their curve. Threads that wait do not spin: the processes of the tests share the
+cores, and spinning took as much time as the work.
 """
 
 import os
@@ -9,13 +9,12 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Before torch and numba are imported.
 
 import pytest
-from PIL import Image
+from support.curves import DRAWN_BY, without_drawing
 from xdist.scheduler import LoadFileScheduling
 
-from crossgrad_core.run.results.curve import FILE, draw_curve
+from crossgrad_core.run.results.curve import draw_curve
 
 CONTRACTS = "test_contracts.py"
-SESSION = "crossgrad_core.run.session.draw_curve"
 
 
 class ByFileOrComponent(LoadFileScheduling):
@@ -41,20 +40,14 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.name != CONTRACTS)
 
 
-def without_drawing(folder, *_):
-    """The file that stands where the curve would."""
-    Image.new("L", (1, 1)).save(folder / FILE)
-    return folder / FILE
-
-
 @pytest.fixture(scope="session", autouse=True)
 def _undrawn():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SESSION, without_drawing)
+        patch.setattr(DRAWN_BY, without_drawing)
         yield
 
 
 @pytest.fixture
 def drawn(monkeypatch):
     """Runs of this process draw their curve."""
-    monkeypatch.setattr(SESSION, draw_curve)
+    monkeypatch.setattr(DRAWN_BY, draw_curve)

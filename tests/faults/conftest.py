@@ -24,7 +24,8 @@ def reference(tmp_path_factory):
     scene = folder / "scene"
     write_tiny_scene(scene, views=6, suffix=".jpg")
     install_plugin(folder)
-    found = (os.environ.get("PYTHONPATH"), str(folder), str(Path(__file__).parent))
+    here = Path(__file__).parent
+    found = (os.environ.get("PYTHONPATH"), str(folder), str(here), str(here.parent))
     path = os.pathsep.join(filter(None, found))
     nursery = Nursery(folder, {**os.environ, "PYTHONPATH": path}, scene)
     yield undisturbed(nursery, scene, folder / "undisturbed")

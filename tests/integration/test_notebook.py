@@ -10,7 +10,7 @@ from support.scenes import write_tiny_scene
 
 PAGE = Path(__file__).parents[2] / "docs" / "python.md"
 #: Long enough to be interrupted on the way.
-STEPS = 200
+STEPS = 120
 RUN = f"""
 import crossgrad_core as cg
 run = cg.run("SCENE", out="run", steps={STEPS}, eval_every={STEPS}, save_every={STEPS})
@@ -42,7 +42,7 @@ def test_the_page_on_python_runs_in_a_notebook(folder):
 
 def test_an_interrupted_cell_stops_its_run_which_goes_on_with_the_same_bits(folder):
     log = folder / "run" / "log.txt"
-    stopped = executed([RUN], folder, lambda: log.is_file() and "step 40/" in log.read_text())
+    stopped = executed([RUN], folder, lambda: log.is_file() and "step 24/" in log.read_text())
     (error,) = errors(stopped)
     assert error.startswith("KeyboardInterrupt: the run is stopped")
     assert "stopping: what there is gets saved" in shown(stopped.cells[0], "stderr")
@@ -51,5 +51,5 @@ def test_an_interrupted_cell_stops_its_run_which_goes_on_with_the_same_bits(fold
     notebook = executed([resume, SAME], folder)
     assert errors(notebook) == []
     step, status = shown(notebook.cells[0], "stdout").split()
-    assert 40 <= int(step) < STEPS and status == "finished"
+    assert 24 <= int(step) < STEPS and status == "finished"
     assert bits(folder / "run", {str(STEPS)}) == bits(folder / "same")
