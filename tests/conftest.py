@@ -14,18 +14,21 @@ from xdist.scheduler import LoadFileScheduling
 
 from crossgrad_core.run.results.curve import draw_curve
 
-CONTRACTS = "test_contracts.py"
+CONTRACTS, MATRIX = "test_contracts.py", "tests/matrix/"
 
 
 class ByFileOrComponent(LoadFileScheduling):
-    """Tests of a file run in one process, which makes what they share once; contracts are divided.
+    """Tests of a file run in one process, which makes what they share once.
 
-    The contracts of a component stay together, as they compile the same kernels.
+    Files of thousands of cases are divided: the contracts of a component stay together, as they
+    compile the same kernels, and so do combinations of the same sampler or exposure.
     """
 
     def _split_scope(self, nodeid):
         if CONTRACTS in nodeid:
             return nodeid.rpartition("-")[0]
+        if MATRIX in nodeid:
+            return nodeid.partition(" x ")[0]
         return super()._split_scope(nodeid)
 
 
