@@ -20,11 +20,19 @@ from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.records import read_records
 from crossgrad_plugins.sweep.standing import standings
 
+#: A node that is gone is missed within a second or two, not in the fifteen of Ray's defaults.
+SOON = {
+    "health_check_initial_delay_ms": 500,
+    "health_check_period_ms": 500,
+    "health_check_failure_threshold": 2,
+}
+
 
 def main():
     """Runs it."""
     grid, out, kill = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] == "kill"
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    head = {"num_cpus": 1, "_system_config": SOON}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
     other = cluster.add_node(num_cpus=1)
     cluster.wait_for_nodes()
     work = made(grid, out, sys.argv[4:], cluster.address)
