@@ -29,8 +29,8 @@ test:  ## Build the wheel, install it into a fresh environment, run all tests ag
 matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.md says how long)
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m matrix
 
-slow:  ## The tests that take minutes: statistics of many repetitions, gradients entry by entry
-	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m slow
+slow:  ## The tests that take minutes: statistics of many repetitions, gradients entry by entry, Ray
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" EXTRAS=test,lint,ray sh tests/run.sh -m slow
 
 exposures:  ## Train every exposure x backbone x K for sixty steps, and photos of all extremes
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m exposures
@@ -39,7 +39,8 @@ compat:  ## The tests on Python 3.12, 3.13 and the lowest versions of packages, 
 	COMPAT_VENVS="$(abspath .venv-compat)" sh tests/compat.sh
 
 faults:  ## Kill, starve and interrupt runs, a hundred times each, and look at what is left
-	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" FAULTS="$(FAULTS)" sh tests/run.sh -m faults
+	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" EXTRAS=test,lint,ray FAULTS="$(FAULTS)" \
+	    sh tests/run.sh -m faults
 
 fuzz: install  ## Ten minutes of mutated files for each parser; findings go to fuzz-findings/
 	$(BIN)/pip install $(PIP_FLAGS) --editable ".[test]"

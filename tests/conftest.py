@@ -16,14 +16,15 @@ from crossgrad_core.run.results.curve import draw_curve
 
 #: Their kernels take longest to compile and have none in common; many others share theirs.
 HEAVIEST = ("rasterizers-numba-", "operators-cagrad-")
-CONTRACTS, MATRIX = "test_contracts.py", "tests/matrix/"
+CONTRACTS, MATRIX, FAULTS = "test_contracts.py", "tests/matrix/", "tests/faults/"
 
 
 class ByFileOrComponent(LoadFileScheduling):
     """Tests of a file run in one process, which makes what they share once.
 
     Files of thousands of cases are divided: the contracts of a component stay together, as they
-    compile the same kernels, and so do combinations of the same sampler or exposure.
+    compile the same kernels, and so do combinations of the same sampler or exposure. The tests of
+    faults share a run that nothing happens to.
     """
 
     def _split_scope(self, nodeid):
@@ -31,6 +32,8 @@ class ByFileOrComponent(LoadFileScheduling):
             return nodeid.rpartition("-")[0]
         if MATRIX in nodeid:
             return nodeid.partition(" x ")[0]
+        if nodeid.startswith(FAULTS) and "FAULTS" not in os.environ:
+            return FAULTS
         return super()._split_scope(nodeid)
 
 
@@ -54,6 +57,14 @@ def pytest_collection_modifyitems(items):
 def _undrawn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DRAWN_BY, without_drawing)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _unsynced():
+    """Nothing here cuts the power, and waiting for the disk took a tenth of the tests of runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 

@@ -32,9 +32,15 @@ class _Manager(pluggy.PluginManager):
     A component has a hundred attributes, and pluggy takes its time over each: 0.3 s of every start.
     """
 
+    def __init__(self, project: str) -> None:
+        super().__init__(project)
+        self._asked: tuple[object, frozenset[str]] = (None, frozenset())
+
     @override
     def parse_hookimpl_opts(self, plugin: object, name: str) -> Any:
-        return super().parse_hookimpl_opts(plugin, name) if _may_be_hook(plugin, name) else None
+        if self._asked[0] is not plugin:  # pluggy asks for one plugin after the other.
+            self._asked = plugin, _may_be_hooks(plugin)
+        return super().parse_hookimpl_opts(plugin, name) if name in self._asked[1] else None
 
 
 def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
@@ -116,18 +122,24 @@ def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: obj
                 raise _no_such_hook(name, plugin, hook)
 
 
-def _may_be_hook(plugin: object, name: str) -> bool:
-    """Whether an attribute is marked, or of a kind that only pluggy can tell."""
+def _may_be_hooks(plugin: object) -> frozenset[str]:
+    """The attributes that are marked, or of a kind that only pluggy can tell."""
     if inspect.isclass(plugin) or inspect.ismodule(plugin):
-        return True
-    if name in getattr(plugin, "__dict__", {}):
-        return True
-    kinds = (vars(kind) for kind in type(plugin).__mro__)
-    found = next((attributes[name] for attributes in kinds if name in attributes), None)
-    if isinstance(found, staticmethod | classmethod | MethodType):
-        return hasattr(found, _MARK) or hasattr(found.__func__, _MARK)
-    marked = isinstance(found, FunctionType) and hasattr(found, _MARK)
-    return marked or isinstance(found, MemberDescriptorType)
+        return frozenset(dir(plugin))
+    found: dict[str, object] = {}
+    for kind in reversed(type(plugin).__mro__):
+        found |= vars(kind)
+    own = getattr(plugin, "__dict__", {})
+    return frozenset(name for name, value in found.items() if _may_be_hook(value)).union(own)
+
+
+def _may_be_hook(attribute: object) -> bool:
+    """Whether an attribute of a class is marked, or of a kind that only pluggy can tell."""
+    if isinstance(attribute, FunctionType):
+        return hasattr(attribute, _MARK)
+    if isinstance(attribute, staticmethod | classmethod | MethodType):
+        return hasattr(attribute, _MARK) or hasattr(attribute.__func__, _MARK)
+    return isinstance(attribute, MemberDescriptorType)
 
 
 def _is_function(plugin: object, attribute: str) -> bool:

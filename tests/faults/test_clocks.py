@@ -4,7 +4,7 @@ import pytest
 from crossgrad_faults import laws
 
 
-@pytest.mark.parametrize("at", [2, 9])
+@pytest.mark.parametrize("at", [pytest.param(2, marks=pytest.mark.slow), 9])
 def test_jumps(reference, tmp_path, at):
     folder = tmp_path / "run"
     fault = {"below": str(folder), "at": at, "what": "jump"}

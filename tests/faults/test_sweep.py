@@ -15,6 +15,7 @@ from crossgrad_faults import laws
 from support.scenes import write_tiny_scene
 
 import crossgrad_core
+from crossgrad_core.cli.main import main
 from crossgrad_core.commands import write_settings
 from crossgrad_plugins.sweep.app import Request, Sweep
 from crossgrad_plugins.sweep.records import read_records
@@ -184,6 +185,7 @@ def slow(tmp_path, monkeypatch):
     (folder / "slow_steps.py").write_text(SLOW)
     found = (os.environ.get("PYTHONPATH"), str(folder))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, found)))
+    monkeypatch.syspath_prepend(str(folder))
     return tmp_path / "go"
 
 
@@ -203,19 +205,24 @@ class Slow(Observer):
 """
 
 
-def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path):
+def in_this_process(*arguments):
+    with pytest.raises(SystemExit) as end:
+        main(list(map(str, arguments)))
+    return end.value.code or 0
+
+
+def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path, capsys):
     out = tmp_path / "sweep"
     observer = json.dumps({"name": "slow", "go": str(slow)})
-    more = ("--seed", "7", "--set", f"observers={observer}")
+    more = ("--seed", "7", "--set", "steps=12", "--set", f"observers={observer}")
     process = start(grid, out, *more)
     wait_for(lambda: begins(out) if out.exists() else False)
     run = out / "runs" / begins(out)[0].run
     wait_for((run / "config.yaml").is_file)
-    assert start(grid, out, *more).wait() == 2
-    assert f"process {process.pid}, sweeping since" in said(out)
-    command = [sys.executable, "-m", "crossgrad_core", "sweep", str(grid), "--out", str(out), *more]
-    listed = subprocess.run([*command, "--list"], capture_output=True, text=True, check=True)
-    assert f"{run.name}  training " in listed.stdout
+    assert in_this_process("sweep", grid, "--out", out, *more) == 2
+    assert f"process {process.pid}, sweeping since" in capsys.readouterr().err
+    assert in_this_process("sweep", grid, "--out", out, *more, "--list") == 0
+    assert f"{run.name}  training " in capsys.readouterr().out
     process.send_signal(signal.SIGINT)
     assert process.wait() == 130, said(out)
     ends = [each.status for each in read_records(out / "workers") if each.event == "ended"]

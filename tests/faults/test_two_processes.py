@@ -27,6 +27,7 @@ def test_two_runs_into_one_folder(reference, second, tmp_path):
     laws.same_bits(reference.folder, folder)
 
 
+@pytest.mark.slow
 def test_two_resume_one_run(reference, second, tmp_path):
     folder = tmp_path / "run"
     end = reference.nursery.run(*reference.command(folder, "--stop-after", "20"))

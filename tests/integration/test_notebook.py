@@ -40,6 +40,7 @@ def test_the_page_on_python_runs_in_a_notebook(folder):
     assert (folder / "first.ply").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_an_interrupted_cell_stops_its_run_which_goes_on_with_the_same_bits(folder):
     log = folder / "run" / "log.txt"
     stopped = executed([RUN], folder, lambda: log.is_file() and "step 24/" in log.read_text())

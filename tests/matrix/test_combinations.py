@@ -96,6 +96,7 @@ def check_repeats(run, repetition):
     assert all(torch.equal(after[name], again[name]) for name in after)
 
 
+@pytest.mark.matrix
 def test_exactly_the_written_combinations_are_refused_for_the_written_reasons():
     rows = every_combination()
     found = as_lines(refused(rows), rows)

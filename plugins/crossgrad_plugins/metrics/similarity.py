@@ -58,7 +58,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
     rendered, photo = (
         masked(eight_bit(i).to(torch.float64) / 255, mask).numpy() for i in (image, target)
     )
-    _, full = structural_similarity(  # type: ignore[no-untyped-call]
+    _, full = structural_similarity(
         rendered,
         photo,
         gaussian_weights=True,

@@ -11,7 +11,7 @@ from support import fake_run
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.engines import Work, engine
 
-pytest.importorskip("ray")
+pytestmark = pytest.mark.slow
 TWO_NODES = Path(fake_run.__file__).with_name("two_nodes.py")
 
 
