@@ -9,7 +9,7 @@ from crossgrad_faults.runs import Nursery, undisturbed
 from support.scenes import write_tiny_scene
 
 #: How many kills, and how many of the writes, in the short version; `make faults` sets more.
-SHORT = 2
+SHORT = 1
 
 
 @pytest.fixture(scope="session")

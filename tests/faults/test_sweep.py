@@ -211,6 +211,7 @@ def in_this_process(*arguments):
     return end.value.code or 0
 
 
+@pytest.mark.slow
 def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path, capsys):
     out = tmp_path / "sweep"
     observer = json.dumps({"name": "slow", "go": str(slow)})

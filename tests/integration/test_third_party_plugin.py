@@ -1,5 +1,6 @@
 """The example plugin, installed by pip beside crossgrad as a stranger's package would be."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,21 @@ import pytest
 import yaml
 from support.scenes import write_tiny_scene
 
+#: Carries out command lines one after the other, as starting takes longer than most of them.
+COMMANDS = """
+import contextlib, io, json, sys
+from crossgrad_core.cli.main import main
+
+for line in sys.stdin:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(json.loads(line))
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+    print(json.dumps((code, out.getvalue(), err.getvalue())), flush=True)
+"""
 EXAMPLE = Path(__file__).parents[2] / "examples" / "plugin"
 
 
@@ -28,21 +44,26 @@ def python(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def crossgrad(python):
-    """Runs a command of that environment, away from the checkout."""
+def crossgrad(python, installed):
+    """Runs commands of that environment, away from the checkout."""
+    command = [python, "-c", COMMANDS]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=python.parent, **pipes) as process:
 
-    def run(*arguments, code=0):
-        ended = subprocess.run(
-            [python, "-m", "crossgrad_core", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            cwd=python.parent,
-            check=False,
-        )
-        assert ended.returncode == code, ended.stdout + ended.stderr
-        return " ".join(ended.stdout.split()), ended.stderr
+        def run(*arguments):
+            process.stdin.write(json.dumps([str(each) for each in arguments]) + "\n")
+            process.stdin.flush()
+            code, out, err = json.loads(process.stdout.readline())
+            return code, " ".join(out.split()), err
 
-    return run
+        yield run
+
+
+def checked(python, name):
+    """What a fresh process says of a plugin: a package is imported once."""
+    command = [python, "-m", "crossgrad_core", "plugins", "check", name]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=python.parent, check=False)
+    return done.returncode, " ".join(done.stdout.split())
 
 
 def install(python, source):
@@ -85,17 +106,17 @@ def replace(path, old, new):
     path.write_text(text.replace(old, new))
 
 
-@pytest.mark.usefixtures("installed")
 def test_it_is_listed_and_shown(crossgrad):
-    assert "equal-length crossgrad-example 0.1.0" in crossgrad("plugins", "list")[0]
-    shown, _ = crossgrad("plugins", "show", "clip")
+    assert "equal-length crossgrad-example 0.1.0" in crossgrad("plugins", "list")[1]
+    code, shown, _ = crossgrad("plugins", "show", "clip")
+    assert code == 0
     assert "observer clip, from crossgrad-example 0.1.0" in shown
     assert "max_norm (float, default 1.0, > 0.0)" in shown
 
 
-@pytest.mark.usefixtures("installed")
 def test_it_keeps_the_contract(crossgrad):
-    report, _ = crossgrad("plugins", "check", "crossgrad_example")
+    code, report, _ = crossgrad("plugins", "check", "crossgrad_example")
+    assert code == 0
     assert "operator equal-length pass" in report
     assert "sampler least-seen pass" in report
     assert "observer clip pass" in report
@@ -104,8 +125,9 @@ def test_it_keeps_the_contract(crossgrad):
 
 
 @pytest.mark.usefixtures("broken")
-def test_a_broken_one_fails_with_the_reasons(crossgrad):
-    report, _ = crossgrad("plugins", "check", "crossgrad-example", code=1)
+def test_a_broken_one_fails_with_the_reasons(python):
+    code, report = checked(python, "crossgrad-example")
+    assert code == 1
     assert "operator equal-length FAIL" in report
     assert "compare lengths with each other, never with a constant" in report
     assert "draws from the global generator of numpy" in report
@@ -113,28 +135,28 @@ def test_a_broken_one_fails_with_the_reasons(crossgrad):
     assert "11 of 14 plugins keep the contract of their slot" in report
 
 
-@pytest.mark.usefixtures("installed")
 def test_its_command_is_one_of_crossgrad_s(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "tiny", views=6)
-    assert "count-views Count the training views of a scene." in crossgrad("--help")[0]
-    assert crossgrad("count-views", scene)[0] == "tiny: 5 training views, read by colmap"
+    assert "count-views Count the training views of a scene." in crossgrad("--help")[1]
+    counted = crossgrad("count-views", scene)
+    assert counted[:2] == (0, "tiny: 5 training views, read by colmap")
 
 
-@pytest.mark.usefixtures("installed")
 def test_a_run_uses_it_by_name(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=6)
     out = tmp_path / "run"
     choice = ["--sampler", "least-seen", "--operator", "equal-length", "--observe", "clip"]
     options = ["--set", "observers.clip.max_norm=1e-4", "--rasterizer", "torch"]
-    crossgrad("run", scene, "--steps", 3, *choice, *options, "--out", out)
+    code, _, err = crossgrad("run", scene, "--steps", 3, *choice, *options, "--out", out)
+    assert code == 0, err
     written = yaml.safe_load((out / "config.yaml").read_text())
     assert written["sampler"]["name"] == "least-seen"
     assert written["operator"]["name"] == "equal-length"
     assert {"name": "clip", "max_norm": 1e-4} in written["observers"]
 
 
-@pytest.mark.usefixtures("installed")
 def test_what_is_not_there_is_refused_by_name(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=6)
-    _, err = crossgrad("run", scene, "--operator", "equal-lenght", code=2)
+    code, _, err = crossgrad("run", scene, "--operator", "equal-lenght")
+    assert code == 2
     assert "did you mean 'equal-length'?" in err

@@ -1,0 +1,32 @@
+"""`crossgrad sweep` carries out real runs, once each."""
+
+import json
+
+import pytest
+import yaml
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.cli.main import main
+
+
+def ended(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as error:
+        main([str(each) for each in arguments])
+    return int(error.value.code or 0)
+
+
+def test_a_run_of_a_grid_is_carried_out_once(tmp_path, capsys):
+    write_tiny_scene(tmp_path / "tiny", views=6)
+    grid, out = tmp_path / "grid.yaml", tmp_path / "out"
+    content = {"scenes": ["tiny"], "base": {"steps": 2}, "seeds": [3]}
+    grid.write_text(yaml.safe_dump(content))
+    assert ended("sweep", grid, "--out", out) == 0
+    (summary,) = out.glob("runs/*/summary.json")
+    told = json.loads(summary.read_text())
+    assert (told["status"], told["step"], told["seed"]) == ("finished", 2, 3)
+    written = summary.stat().st_mtime_ns
+    capsys.readouterr()
+    assert ended("sweep", grid, "--out", out) == 0
+    assert summary.stat().st_mtime_ns == written
+    assert ended("sweep", grid, "--out", out, "--list") == 0
+    assert f"{summary.parent.name}  finished " in capsys.readouterr().out
