@@ -24,7 +24,7 @@ unset PYTHONDONTWRITEBYTECODE
 "$venv/bin/python" "$here/tests/beside_torch.py" "$extras" >"$work/needs.txt"
 $pip install --no-compile --no-deps --constraint "$constraints" torch &
 torch=$!
-$pip install --no-compile --constraint "$constraints" --requirement "$work/needs.txt"
+$pip install --no-compile --no-warn-conflicts --constraint "$constraints" --requirement "$work/needs.txt"
 wait "$torch"
 $pip install --no-compile --constraint "$constraints" "crossgrad[$extras] @ file://$wheel"
 # The version stays the same while the code changes: the wheel itself must always be renewed.
