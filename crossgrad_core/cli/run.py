@@ -13,11 +13,16 @@ from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.startup import announce
 
 
-def _own(name: str, kind: object, option: object, default: object = None) -> Parameter:
-    """An option of this start of the command, which is no setting."""
+def _parameter(name: str, kind: object, info: object, default: object = None) -> Parameter:
     return Parameter(
-        name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
+        name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info]
     )
+
+
+def _own(name: str, kind: object, *flags: str, heading: str = RESULTS, **shown: str) -> Parameter:
+    """An option of this start of the command, which is no setting."""
+    info = typer.Option(*flags, rich_help_panel=heading, **shown)  # type: ignore[arg-type]
+    return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
 #: What is no setting, below its heading: in front of the settings, behind the first of them, last.
@@ -25,75 +30,46 @@ _FRONT: Final = (
     _own(
         "config",
         Path | None,
-        typer.Option(
-            "--config",
-            metavar="FILE",
-            help="YAML file with settings, such as the config.yaml of a run. Options given here "
-            "win over the file.",
-            rich_help_panel=CONFIGURATION,
-        ),
+        "--config",
+        heading=CONFIGURATION,
+        metavar="FILE",
+        help="YAML file with settings, such as the config.yaml of a run. Options given here "
+        "win over the file.",
     ),
     _own(
         "assignments",
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="One setting, repeatable: operator.c=0.4, rasterizer.max_alpha=0.999. Wins over "
-            "everything else.",
-            rich_help_panel=CONFIGURATION,
-        ),
+        "--set",
+        heading=CONFIGURATION,
+        metavar="KEY=VALUE",
+        help="One setting, repeatable: operator.c=0.4, rasterizer.max_alpha=0.999. Wins over "
+        "everything else.",
     ),
 )
 _RESUMING: Final = (
     _own(
         "resume",
         Path | None,
-        typer.Option(
-            "--resume",
-            metavar="RUN",
-            help="Continues the stopped run in that folder, bit for bit.",
-            rich_help_panel=RESULTS,
-        ),
+        "--resume",
+        metavar="RUN",
+        help="Continues the stopped run in that folder, bit for bit.",
     ),
     _own(
         "accept_scene",
         bool,
-        typer.Option(
-            "--accept-scene",
-            help="With --resume: go on although photos, masks or points of the scene have changed.",
-            rich_help_panel=RESULTS,
-        ),
-        default=False,
+        "--accept-scene",
+        help="With --resume: go on although photos, masks or points of the scene have changed.",
     ),
 )
 _LAST: Final = (
     _own(
         "dry_run",
         bool,
-        typer.Option(
-            "--dry-run",
-            help="Checks everything and prints the resolved settings; trains nothing.",
-            rich_help_panel=RESULTS,
-        ),
-        default=False,
+        "--dry-run",
+        help="Checks everything and prints the resolved settings; trains nothing.",
     ),
-    _own(
-        "quiet",
-        bool,
-        typer.Option(
-            "--quiet", "-q", help="Prints errors and the result only.", rich_help_panel=RESULTS
-        ),
-        default=False,
-    ),
-    _own(
-        "verbose",
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Prints every decision and event.", rich_help_panel=RESULTS
-        ),
-        default=False,
-    ),
+    _own("quiet", bool, "--quiet", "-q", help="Prints errors and the result only."),
+    _own("verbose", bool, "--verbose", "-v", help="Prints every decision and event."),
 )
 
 
@@ -125,7 +101,7 @@ def _setting(option: Option) -> Parameter:
         if flag.heading
         else typer.Argument(metavar=flag.metavar, help=option.help, show_default=False)
     )
-    return _own(option.name, option.kind | None, info)
+    return _parameter(option.name, option.kind | None, info)
 
 
 def _with_options(function: Callable[..., None]) -> Callable[..., None]:
