@@ -17,7 +17,7 @@ WHOLE = {TIME: IFDRational(1, 250), APERTURE: IFDRational(8, 1), SENSITIVITY: 20
 def photo(path, tags):
     image = Image.new("RGB", (8, 8))
     exif = Image.Exif()
-    exif.get_ifd(0x8769).update(tags)
+    exif[0x8769] = tags
     image.save(path, exif=exif)
     return path
 

@@ -69,7 +69,9 @@ def _centred(o: Observations, gains: _Floats) -> _Floats:
 
     count = len(gains)
     size = count + int(o.points.max()) + 1
-    edges = coo_array((np.ones(o.count), (o.photos, count + o.points)), shape=(size, size))
+    # Graphs of older scipy have indices of 32 bits alone.
+    ends = o.photos.astype(np.int32), (count + o.points).astype(np.int32)
+    edges = coo_array((np.ones(o.count), ends), shape=(size, size))
     parts = connected_components(edges, directed=False)[1][:count]
     means = np.bincount(parts, gains) / np.maximum(np.bincount(parts), 1)
     return np.asarray(gains - means[parts])
