@@ -302,9 +302,8 @@ def with_exif(path, stops):
 
     image = Image.open(path)
     exif = Image.Exif()
-    exif.get_ifd(0x8769).update(
-        {33434: IFDRational(round(1e6 * 2.0**stops), 10**8), 33437: IFDRational(4, 1), 34855: 100}
-    )
+    time, aperture = IFDRational(round(1e6 * 2.0**stops), 10**8), IFDRational(4, 1)
+    exif[0x8769] = {33434: time, 33437: aperture, 34855: 100}
     image.save(path.with_suffix(".jpg"), exif=exif, quality=95)
     path.unlink()
 
