@@ -62,7 +62,7 @@ def _undrawn():
 
 @pytest.fixture(scope="session", autouse=True)
 def _unsynced():
-    """Nothing here cuts the power, and waiting for the disk took a tenth of the tests of runs."""
+    """Nothing here cuts the power; waiting for the disk took up to a tenth of the tests of runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield
