@@ -9,6 +9,7 @@ What these packages need themselves is left to pip.
 import re
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
@@ -16,11 +17,11 @@ EXTRAS = ("torchjd", "test")
 BOUND = re.compile(r"^(?P<name>[\w.-]+)(?:\[[\w,-]+\])?>=(?P<version>[\d.]+)")
 
 
-def requirements(project: Path = PROJECT) -> list[str]:
-    """What the package and its tests need, as pyproject.toml says it."""
+def requirements(wanted: Sequence[str], project: Path = PROJECT) -> list[str]:
+    """What the package and some of its extras need, as pyproject.toml says it."""
     table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     extras = table["optional-dependencies"]
-    return [*table["dependencies"], *(each for extra in EXTRAS for each in extras[extra])]
+    return [*table["dependencies"], *(each for extra in wanted for each in extras[extra])]
 
 
 def lowest(requirement: str) -> str:
@@ -32,4 +33,5 @@ def lowest(requirement: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write("".join(f"{pin}\n" for pin in dict.fromkeys(map(lowest, requirements()))))
+    pins = dict.fromkeys(map(lowest, requirements(EXTRAS)))
+    sys.stdout.write("".join(f"{pin}\n" for pin in pins))

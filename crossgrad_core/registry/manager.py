@@ -126,17 +126,20 @@ def _may_be_hooks(plugin: object) -> frozenset[str]:
     """The attributes that are marked, or of a kind that only pluggy can tell."""
     if inspect.isclass(plugin) or inspect.ismodule(plugin):
         return frozenset(dir(plugin))
-    found = {name: it for kind in reversed(type(plugin).__mro__) for name, it in vars(kind).items()}
+    found: dict[str, object] = {}
+    for kind in reversed(type(plugin).__mro__):
+        found |= vars(kind)
     own = getattr(plugin, "__dict__", {})
     return frozenset(name for name, value in found.items() if _may_be_hook(value)).union(own)
 
 
 def _may_be_hook(attribute: object) -> bool:
     """Whether an attribute of a class is marked, or of a kind that only pluggy can tell."""
+    if isinstance(attribute, FunctionType):
+        return hasattr(attribute, _MARK)
     if isinstance(attribute, staticmethod | classmethod | MethodType):
         return hasattr(attribute, _MARK) or hasattr(attribute.__func__, _MARK)
-    marked = isinstance(attribute, FunctionType) and hasattr(attribute, _MARK)
-    return marked or isinstance(attribute, MemberDescriptorType)
+    return isinstance(attribute, MemberDescriptorType)
 
 
 def _is_function(plugin: object, attribute: str) -> bool:

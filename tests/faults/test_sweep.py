@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import yaml
 from crossgrad_faults import laws
+from support.commands import ended
 from support.scenes import write_tiny_scene
 
 import crossgrad_core
-from crossgrad_core.cli.main import main
 from crossgrad_core.commands import write_settings
 from crossgrad_plugins.sweep.app import Request, Sweep
 from crossgrad_plugins.sweep.records import read_records
@@ -205,12 +205,6 @@ class Slow(Observer):
 """
 
 
-def in_this_process(*arguments):
-    with pytest.raises(SystemExit) as end:
-        main(list(map(str, arguments)))
-    return end.value.code or 0
-
-
 @pytest.mark.slow
 def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path, capsys):
     out = tmp_path / "sweep"
@@ -220,9 +214,9 @@ def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path, capsys)
     wait_for(lambda: begins(out) if out.exists() else False)
     run = out / "runs" / begins(out)[0].run
     wait_for((run / "config.yaml").is_file)
-    assert in_this_process("sweep", grid, "--out", out, *more) == 2
+    assert ended("sweep", grid, "--out", out, *more) == 2
     assert f"process {process.pid}, sweeping since" in capsys.readouterr().err
-    assert in_this_process("sweep", grid, "--out", out, *more, "--list") == 0
+    assert ended("sweep", grid, "--out", out, *more, "--list") == 0
     assert f"{run.name}  training " in capsys.readouterr().out
     process.send_signal(signal.SIGINT)
     assert process.wait() == 130, said(out)

@@ -2,19 +2,12 @@
 
 import csv
 
-import pytest
+from support.commands import ended
 from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.cli.main import main
 from crossgrad_core.run import app
 from crossgrad_plugins.compare.source import read_runs
-
-
-def ended(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as error:
-        main(list(arguments))
-    return int(error.value.code or 0)
 
 
 def test_runs_as_they_are_written(tmp_path, capsys):

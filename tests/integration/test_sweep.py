@@ -2,17 +2,9 @@
 
 import json
 
-import pytest
 import yaml
+from support.commands import ended
 from support.scenes import write_tiny_scene
-
-from crossgrad_core.cli.main import main
-
-
-def ended(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as error:
-        main([str(each) for each in arguments])
-    return int(error.value.code or 0)
 
 
 def test_a_run_of_a_grid_is_carried_out_once(tmp_path, capsys):
