@@ -19,7 +19,7 @@ class Densifier(Component):
 
     Attributes:
         needs: Screen statistics beyond the radii and the mean gradient that it needs
-            (`pixels`, `abs_gradient`, `directions`); given while `schedule.collects(step)`.
+            (`pixels`, `abs_gradient`, `directions`, `count`), while `schedule.collects(step)`.
         tensors: Names of the parameter tensors that it needs a backbone to have.
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.

@@ -84,6 +84,8 @@ class Screen:
             and y; unit vectors of the gradient in NDC units, that is times width and height),
             the sums of |x| and |y| of the gradient itself (per pixel unit; over all bins they
             are `abs_gradient`), and their number.
+        count: [H, W] bool -> [N] int32, in how many of these pixels the Gaussian was blended; None
+            unless asked for. It keeps alive what it needs of the render.
     """
 
     radii: Tensor
@@ -91,6 +93,7 @@ class Screen:
     mean_gradient: Tensor | None = None
     abs_gradient: Tensor | None = None
     directions: Tensor | None = None
+    count: Callable[[Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True)

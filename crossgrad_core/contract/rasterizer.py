@@ -19,7 +19,8 @@ class Rasterizer(Component):
         max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
         near: Gaussians whose centre is nearer than this camera depth are not drawn, local units.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        provides: Optional outputs it can give: `depth`, `pixels`, `abs_gradient`, `directions`.
+        provides: Optional outputs it can give: `depth`, `pixels`, `abs_gradient`, `directions`,
+            `count`.
         responses: Pixel responses that it draws.
         devices: Torch device types it runs on.
     """

@@ -1,5 +1,6 @@
 """The CPU rasterizer: tiles, hand-written backward pass, all cores, the same bits on any number."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     Frame,
     GaussianArrays,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
+from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward, marked_pixels
 
 #: The differentiable inputs in the order in which autograd sees them.
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
@@ -27,7 +28,7 @@ class NumbaRasterizer(Rasterizer):
     """Draws float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
 
     provides: ClassVar[frozenset[str]] = frozenset(
-        {"depth", "pixels", "abs_gradient", "directions"}
+        {"depth", "pixels", "abs_gradient", "directions", "count"}
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
 
@@ -81,6 +82,7 @@ class _Call:
         self.screen = screen
         self.absolute = "abs_gradient" in outputs
         self.directions = "directions" in outputs
+        self.counts = "count" in outputs
         self.frame: Frame | None = None
 
 
@@ -108,6 +110,16 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
     )
 
 
+def _counter(frame: Frame) -> Callable[[Tensor], Tensor]:
+    """What `Screen.count` is; does not keep the images of the frame alive."""
+    drawn = frame.projected, frame.lists, frame.masks, frame.options
+
+    def count(marked: Tensor) -> Tensor:
+        return torch.from_numpy(marked_pixels(*drawn, marked.contiguous().numpy().view(np.uint8)))
+
+    return count
+
+
 class _Draw(torch.autograd.Function):
     @staticmethod
     @override
@@ -127,6 +139,8 @@ class _Draw(torch.autograd.Function):
         call.frame = frame
         call.screen.radii = torch.from_numpy(frame.projected.radii)
         call.screen.pixels = None if frame.pixels is None else torch.from_numpy(frame.pixels)
+        if call.counts:
+            call.screen.count = _counter(frame)
         ctx.call = call
         ctx.set_materialize_grads(False)
         depth = None if frame.depth is None else torch.from_numpy(frame.depth)

@@ -13,6 +13,7 @@ from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Respons
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.reference.compositing import (
     Drawing,
+    PixelCounter,
     composite_tiles,
     splat_table,
 )
@@ -38,7 +39,7 @@ class TorchRasterizer(Rasterizer):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset(
-        {"depth", "pixels", "abs_gradient", "directions"}
+        {"depth", "pixels", "abs_gradient", "directions", "count"}
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
@@ -72,9 +73,8 @@ class TorchRasterizer(Rasterizer):
         recorder = Recorder(screen, index, len(gaussians), "abs_gradient" in outputs, axes)
         table, probe = recorded(table, recorder)
         drawing = Drawing(size, gaussians.response, self.max_alpha, probe.shape[1])
-        channels, touched, blended = composite_tiles(
-            torch.cat([probe, table], -1), tile_lists(boxes, size), drawing
-        )
+        table, lists = torch.cat([probe, table], -1), tile_lists(boxes, size)
+        channels, touched, blended = composite_tiles(table, lists, drawing)
         radii = shapes.radii.detach().ceil().clamp(min=1)
         screen.radii[index] = torch.where(touched, radii, 0.0).int()
         if published is not None:
@@ -82,6 +82,8 @@ class TorchRasterizer(Rasterizer):
         if "pixels" in outputs:
             screen.pixels = torch.zeros_like(screen.radii)
             screen.pixels[index] = blended.int()
+        if "count" in outputs:
+            screen.count = PixelCounter(table.detach(), lists, drawing, index, len(gaussians))
         colors, depth, alpha = torch.split(channels, [3, 1, 1], -1)
         return Render(
             image=colors + (1 - alpha) * background.to(channels),

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from support.brute_force import trace
 from support.brute_gradients import pixel_gradients, places
 from support.gaussians import posed_camera, random_gaussians
@@ -28,7 +30,7 @@ from crossgrad_core.registry.entries import build, entries, load
 REFERENCE = "torch"
 OURS = [name for name, entry in entries("rasterizers").items() if entry.distribution == "crossgrad"]
 FAST = [name for name in OURS if name != REFERENCE]
-OUTPUTS = frozenset({"depth", "pixels", "abs_gradient", "directions"})
+OUTPUTS = frozenset({"depth", "pixels", "abs_gradient", "directions", "count"})
 BINNED = ("directions", "bin sums", "bin counts")
 TENSORS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 MARGIN = 2e-4
@@ -267,6 +269,7 @@ def test_agrees_with_the_reference(name, case_name):
         worst = error / limit.clamp(min=1e-300)
         assert (error <= limit).all(), f"{key}: {worst.amax():.3g} times what is allowed"
     assert_same_footprints(screen, fast, exact, unsettled)
+    assert_same_counts(screen, fast, exact, unsettled)
 
 
 def test_equal_depths_are_drawn_in_the_order_of_rows(name):
@@ -296,6 +299,42 @@ def assert_same_footprints(screen, fast, exact, unsettled):
     at_whole_pixel = np.abs(exact.extents - np.rint(exact.extents)) <= MARGIN * exact.extents
     vanished = (slack > 0) & (np.minimum(radii, found) == 0)
     assert np.all((radii == found) | vanished | ((np.abs(radii - found) == 1) & at_whole_pixel))
+
+
+def assert_same_counts(screen, fast, exact, unsettled):
+    """Marked pixels are counted exactly, also against brute force; a rounding may turn others."""
+    for density in (0.0, 0.02, 0.4, 1.0):
+        marked = np.random.default_rng(5).random(unsettled.shape) < density
+        sure = torch.from_numpy(marked & ~unsettled)
+        expected = torch.from_numpy(exact.blended[:, sure.numpy()].sum(1)).int()
+        assert torch.equal(screen.count(sure), expected)
+        assert torch.equal(fast.count(sure), expected)
+        whole = torch.from_numpy(marked)
+        slack = ((exact.raw > (1 - MARGIN) / 255) & unsettled & marked).sum((1, 2))
+        assert ((screen.count(whole) - fast.count(whole)).abs().numpy() <= slack).all()
+    assert torch.equal(screen.count(whole), screen.pixels)
+    assert torch.equal(fast.count(whole), fast.pixels)
+
+
+@given(
+    seed=st.integers(0, 2**20),
+    response=st.sampled_from(["plain", "antialiased", "analytic"]),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    sigmas=st.sampled_from([(1e-3, 0.5), (0.5, 5.0), (0.05, 100.0)]),
+    density=st.floats(0.0, 1.0),
+)
+@settings(deadline=None, max_examples=25)
+def test_marked_pixels_of_random_views_are_counted_exactly(seed, response, size, sigmas, density):
+    made, exact = settled(case(25, size, seed=seed, response=response, sigmas=sigmas))
+    marked = np.random.default_rng(seed).random(exact.pixel_gaps.shape) < density
+    marked = torch.from_numpy(marked & (exact.pixel_gaps > MARGIN))
+    expected = torch.from_numpy(exact.blended[:, marked.numpy()].sum(1)).int()
+    for name, dtype in (("numba", torch.float32), (REFERENCE, torch.float64)):
+        gaussians = mapped(made.gaussians, lambda tensor, dtype=dtype: tensor.to(dtype))
+        background = torch.zeros(3, dtype=dtype)
+        rasterizer = build("rasterizers", name, made.options)
+        render = rasterizer.render(gaussians, made.camera, background, frozenset({"count"}))
+        assert torch.equal(render.screen.count(marked), expected), name
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_WIDTH,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.longest_axes import add_directions, longest_axes
+from crossgrad_plugins.rasterizers.numba_kernels.marked import count_marked
 from crossgrad_plugins.rasterizers.numba_kernels.projection import project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
@@ -77,17 +78,7 @@ def forward(
         projected.limits,
         masks,
     )
-    pixels = None
-    if counts is not None:
-        pixels = np.zeros_like(projected.radii)
-        share(
-            count_pixels,
-            projected.drawn,
-            projected.owners,
-            lists.shelves,
-            counts,
-            pixels,
-        )
+    pixels = None if counts is None else _pixels(projected, lists, counts)
     return Frame(image, alpha, depth, pixels, gaussians, options, projected, lists, masks)
 
 
@@ -243,6 +234,44 @@ def _directions(
         directions,
     )
     return directions
+
+
+def marked_pixels(
+    projected: Projected,
+    lists: TileLists,
+    masks: NDArray[np.uint64],
+    options: DrawOptions,
+    marked: NDArray[np.uint8],
+) -> Int32:
+    """Returns in how many marked pixels of a drawn view each Gaussian was blended, [N].
+
+    Args:
+        projected: Of the view's `Frame`, like all up to `options`.
+        lists: See `projected`.
+        masks: See `projected`.
+        options: See `projected`.
+        marked: [H, W], not 0 where a pixel is marked.
+    """
+    counts = np.zeros(lists.slots, np.int32)
+    share(
+        count_marked,
+        lists.starts,
+        lists.entries,
+        masks,
+        projected.records,
+        vector_constants(options.max_alpha),
+        marked,
+        _analytic(options),
+        counts,
+    )
+    return _pixels(projected, lists, counts)
+
+
+def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
+    """Sums of the counts [slots] by Gaussian, [N]."""
+    pixels = np.zeros_like(projected.radii)
+    share(count_pixels, projected.drawn, projected.owners, lists.shelves, counts, pixels)
+    return pixels
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:

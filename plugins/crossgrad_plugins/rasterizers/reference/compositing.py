@@ -97,8 +97,50 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
         bool: whether the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
         number of pixels in which it was blended.
     """
+    touching, blended, weights = _blends(table, centers, drawing)
+    colors_depths = table[:, drawing.probed + 3 : drawing.probed + 7]
+    features = torch.cat([colors_depths, torch.ones_like(colors_depths[:, :1])], -1)
+    return weights @ features, touching.any(0), blended.sum(0)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCounter:
+    """Counts pixels of a drawn view; see `Screen.count`.
+
+    Attributes:
+        table: [V, R + 7 + S] as of `composite_tiles`, detached.
+        lists: The rows of each tile.
+        drawing: Data common to all tiles.
+        index: [V] int64, the Gaussian of each row.
+        total: Number N of all Gaussians.
+    """
+
+    table: Tensor
+    lists: TileLists
+    drawing: Drawing
+    index: Tensor
+    total: int
+
+    @torch.no_grad()
+    def __call__(self, marked: Tensor) -> Tensor:
+        """[N] int32, in how many of the marked pixels [H, W] each Gaussian was blended."""
+        rows = self.lists.rows
+        tiles = torch.split(self.table[rows], self.lists.sizes)
+        found = rows.new_zeros(len(rows))
+        first = 0
+        for tile, centers in zip(tiles, _tile_centers(self.drawing.size, self.table), strict=True):
+            column, row = centers.long().flatten(0, 1).unbind(-1)
+            _, blended, _ = _blends(tile, centers.flatten(0, 1), self.drawing)
+            found[first : first + len(tile)] = blended[marked[row, column]].sum(0)
+            first += len(tile)
+        counts = rows.new_zeros(self.total)
+        return counts.index_add_(0, self.index[rows], found).int()
+
+
+def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
+    """[P, G] of a tile: whether alpha >= 1/255, whether it was blended, and with which weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
-    probe, means, opacities, colors_depths, parameters = torch.split(table, columns, -1)
+    probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)
     alpha = opacities.T * coverage(dx, dy, parameters, drawing.response)
     alpha = alpha.clamp(max=drawing.max_alpha)
@@ -108,6 +150,4 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
     before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
     # Transmittance only falls, so this also stops everything behind the first that stops.
     blended = touching & (after >= TRANSMITTANCE_STOP)
-    weights = torch.where(blended, alpha * before, 0.0)
-    features = torch.cat([colors_depths, torch.ones_like(opacities)], -1)
-    return weights @ features, touching.any(0), blended.sum(0)
+    return touching, blended, torch.where(blended, alpha * before, 0.0)

@@ -1,0 +1,170 @@
+"""In how many of some marked pixels each Gaussian of a drawn view was blended.
+
+A pass of its own over a finished render, for those who can only tell from it which pixels they ask
+about: it takes the tile lists of the forward pass and repeats its blending, without colours, in the
+segments that hold a marked pixel. The operations are those of `forward`, and so are the decisions.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.simd import (
+    LANES,
+    as_negative,
+    bits,
+    broadcast,
+    count_bits,
+    fnma,
+    load,
+    lowest_bit,
+    prefetch,
+    smaller,
+    splat,
+    store,
+    where,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
+    axis_offsets,
+    coverages,
+    fill_axis_rows,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.constants import (
+    LARGEST_ALPHA,
+    LEAST,
+    OFFSETS,
+    STOPPED,
+    TOUCHED,
+    exp2,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
+    ROW_CENTRE,
+    ROW_EXPONENT,
+    ROWS,
+    fill_rows,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    COSINE,
+    DECAY,
+    INVERSE_1,
+    INVERSE_2,
+    PEAK,
+    RECORD,
+    SEGMENT,
+    SEGMENTS,
+    SINE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+
+#: Entries ahead for whose records memory is asked.
+_AHEAD = 8
+
+
+@device
+def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left: int) -> np.uint64:
+    """Writes the transmittances of a tile: 1 in marked pixels, -1 (finished) in all others.
+
+    Returns:
+        The segments that hold a marked pixel, as bits.
+    """
+    state[:] = np.float32(-1.0)
+    live = np.uint64(0)
+    for y in range(min(TILE_HEIGHT, marked.shape[0] - top)):
+        for x in range(min(TILE_WIDTH, marked.shape[1] - left)):
+            if marked[top + y, left + x] != 0:
+                segment = (x // SEGMENT) * TILE_HEIGHT + y
+                state[segment * LANES + x % SEGMENT] = np.float32(1.0)
+                live |= np.uint64(1) << np.uint64(segment)
+    return live
+
+
+@device
+def _count(
+    reached: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    analytic: NDArray[np.float32] | None,
+) -> int:
+    """Blends one Gaussian into the reached segments; returns the number of pixels."""
+    decay = broadcast(records, record + DECAY)
+    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
+    inverse_1 = broadcast(records, record + INVERSE_1)
+    inverse_2 = broadcast(records, record + INVERSE_2)
+    peak = broadcast(records, record + PEAK)
+    zero = splat(np.float32(0.0))
+    pixels = 0
+    while reached != np.uint64(0):
+        segment = lowest_bit(reached)
+        reached &= reached - np.uint64(1)
+        row = segment & (TILE_HEIGHT - 1)
+        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+        if analytic is None:
+            dx = offsets - broadcast(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+            touched = power >= load(constants, TOUCHED)
+            alpha = exp2(power, constants)
+        else:
+            u, v = axis_offsets(cosine, sine, offsets, rows, row)
+            alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
+            touched = alpha >= load(constants, LEAST)
+        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
+        before = load(state, segment * LANES)
+        after = before - alpha * before
+        blended = after >= load(constants, STOPPED)
+        store(state, segment * LANES, where(blended, after, as_negative(before)))
+        pixels += count_bits(bits(touched & blended))
+    return pixels
+
+
+@kernel
+def count_marked(
+    jobs: Jobs,
+    starts: NDArray[np.int64],
+    entries: NDArray[np.int32],
+    masks: NDArray[np.uint64],
+    records: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    marked: NDArray[np.uint8],
+    analytic: NDArray[np.float32] | None,
+    counts: NDArray[np.int32],
+) -> None:
+    """Counts per entry the marked pixels of its tile in which it was blended.
+
+    Args:
+        jobs: From `share`.
+        starts: [T + 1] first entry of each tile.
+        entries: [E, 2] records and slots of each tile, front to back.
+        masks: [E] segments per entry, as the forward pass left them.
+        records: Records of the drawn Gaussians, flat.
+        constants: From `vector_constants`.
+        marked: [H, W], not 0 where a pixel counts.
+        analytic: As in `composite`.
+        counts: [slots] written; zero before.
+    """
+    columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
+    state = np.empty(SEGMENTS * LANES, np.float32)
+    rows = np.empty(ROWS, np.float32)
+    tile = take(jobs)
+    while tile < starts.shape[0] - 1:
+        top, left = (tile // columns) * TILE_HEIGHT, (tile % columns) * TILE_WIDTH
+        live = _start(state, marked, top, left)
+        entry, stop = starts[tile], starts[tile + 1]
+        while entry < stop and live != np.uint64(0):
+            reached = np.uint64(masks[entry]) & live
+            if reached != np.uint64(0):
+                prefetch(records, np.intp(entries[min(entry + _AHEAD, stop - 1), 0]) * RECORD)
+                record = np.intp(entries[entry, 0]) * RECORD
+                if analytic is None:
+                    fill_rows(records, record, np.float32(left), np.float32(top), rows, 0)
+                else:
+                    fill_axis_rows(records, record, np.float32(left), np.float32(top), rows, 0)
+                counts[entries[entry, 1]] = _count(
+                    reached, records, record, rows, state, constants, analytic
+                )
+            entry += 1
+        tile = take(jobs)
