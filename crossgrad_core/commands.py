@@ -31,16 +31,20 @@ from crossgrad_core.system.writability import check_file, check_folder
 from crossgrad_core.wording import did_you_mean, listed, plural, sentences, singular
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
     from torch import Tensor
 
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.blocks import Block
-    from crossgrad_core.contract.contexts import Model
     from crossgrad_core.contract.gradients import SeparateGradients
-    from crossgrad_core.contract.scene import Scene, View
-    from crossgrad_core.run.results.reading import RunResults
+    from crossgrad_core.contract.scene import Scene
+    from crossgrad_core.run.assemble import assemble
+    from crossgrad_core.run.results.panel_layout import panels_of, read_panel
+    from crossgrad_core.run.results.reading import RunResults, find_runs
+    from crossgrad_core.run.results.reading import read_run as read_results
+    from crossgrad_core.run.settings import layered
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+    from crossgrad_core.training.frozen import view_gradients
+    from crossgrad_core.training.model import model_of
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
@@ -121,23 +125,32 @@ __all__ = [
 
 #: Exit code of a command whose training failed.
 FAILED: Final = 1
-#: Classes that are imported when they are asked for -> where they are.
-_CLASSES: Final = {
-    "ComponentChoice": "crossgrad_core.config",
-    "NonFiniteError": "crossgrad_core.training.failure",
-    "RunConfig": "crossgrad_core.config",
-    "RunResults": "crossgrad_core.run.results.reading",
-    "Setup": "crossgrad_core.training.setup",
-    "TrainState": "crossgrad_core.training.state",
-    "TrainingFailedError": "crossgrad_core.training.failure",
+#: What is imported when it is asked for -> where it is, with another name where it has one there.
+_LATE: Final = {
+    "ComponentChoice": "config",
+    "NonFiniteError": "training.failure",
+    "RunConfig": "config",
+    "RunResults": "run.results.reading",
+    "Setup": "training.setup",
+    "TrainState": "training.state",
+    "TrainingFailedError": "training.failure",
+    "assemble": "run.assemble",
+    "find_runs": "run.results.reading",
+    "layered": "run.settings",
+    "model_of": "training.model",
+    "panels_of": "run.results.panel_layout",
+    "read_panel": "run.results.panel_layout",
+    "read_results": "run.results.reading:read_run",
+    "view_gradients": "training.frozen",
 }
 
 
 def __getattr__(name: str) -> object:
-    """The class of that name; imports its module."""
-    if name in _CLASSES:
-        return getattr(import_module(_CLASSES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """The class or function of that name; imports its module."""
+    if name not in _LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, there = _LATE[name].partition(":")
+    return getattr(import_module(f"crossgrad_core.{module}"), there or name)
 
 
 def names(slot: str) -> list[str]:
@@ -185,25 +198,6 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
     from crossgrad_core.system.yaml_values import write_yaml
 
     write_atomically(path, write_yaml(content).encode())
-
-
-def layered(
-    layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Settings of which the later ones win over the earlier ones, in their long form.
-
-    Args:
-        layers: What the options of `crossgrad run` or the keys of a configuration file are called
-            -> value. A layer that chooses another component drops the options that earlier layers
-            gave to the one before; a length replaces that of earlier layers.
-        assignments: `KEY=VALUE` texts as after `--set`, which win over all layers.
-
-    Raises:
-        UserError: An assignment, or a key with a dot, makes no sense.
-    """
-    from crossgrad_core.run import settings
-
-    return settings.layered(layers, assignments)
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
@@ -265,31 +259,16 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
     return assembling.read_scene(config, config.scene)
 
 
-def assemble(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
-    """Everything that a configuration names, loaded, fitted to the scene and checked.
-
-    Args:
-        config: The configuration.
-        scene: Its scene.
-        reader: Name of the reader that read the scene.
-
-    Raises:
-        UserError: A name or option is wrong, or the components cannot work together.
-    """
-    from crossgrad_core.run import assemble as assembling
-
-    return assembling.assemble(config, scene, reader)
-
-
 def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     """As `assemble`, and refuses what a new run refuses: settings and labels that do nothing.
 
     Raises:
         UserError: As `assemble`, or a setting would change nothing.
     """
+    from crossgrad_core.run import assemble as assembling
     from crossgrad_core.run import settings_for_nothing as nothing
 
-    setup = assemble(config, scene, reader)
+    setup = assembling.assemble(config, scene, reader)
     nothing.refuse_labels_for_nothing(setup)
     nothing.refuse_settings_for_nothing(config, setup)
     return setup
@@ -401,30 +380,6 @@ def open_run(
     return opened(folder, settings, -1, accept_scene=accept_scene)
 
 
-def model_of(setup: "Setup", state: "TrainState") -> "Model":
-    """The model of a run as plugins see it, for drawing views and for gradients."""
-    from crossgrad_core.training import model
-
-    return model.model_of(setup, state)
-
-
-def view_gradients(model: "Model", view: "View", tensors: Sequence[str]) -> "dict[str, Tensor]":
-    """Gradients of one view's photometric loss at the model's parameters, which stay as they are.
-
-    Args:
-        model: The model.
-        view: The view, of any part of the scene.
-        tensors: Names of tensors of `model.parameters`.
-
-    Returns:
-        Name -> gradient in the shape of its tensor; absent for a tensor that is frozen or that the
-        view does not touch.
-    """
-    from crossgrad_core.training import frozen
-
-    return frozen.view_gradients(model, view, tensors)
-
-
 def gathered(
     per_view: "Sequence[Mapping[str, Tensor | None]]", blocks: "tuple[Block, ...]"
 ) -> "SeparateGradients":
@@ -437,48 +392,6 @@ def gathered(
     from crossgrad_core.gradients.separate import DenseGradients
 
     return DenseGradients(per_view, blocks)
-
-
-def find_runs(root: Path) -> tuple[Path, ...]:
-    """The folders of runs at or below a folder, sorted; imports no torch."""
-    from crossgrad_core.run.results import reading
-
-    return reading.find_runs(root)
-
-
-def read_results(folder: Path) -> "RunResults":
-    """What a run wrote, of any version; it may be training meanwhile. Imports no torch.
-
-    Raises:
-        UserError: It is not the folder of a run, or one of its files is damaged.
-    """
-    from crossgrad_core.run.results import reading
-
-    return reading.read_run(folder)
-
-
-def panels_of(run: Path, step: int, views: Sequence[str]) -> dict[str, Path]:
-    """View name -> picture of its photo, render and error, of those held-out views that have one.
-
-    Args:
-        run: The run's folder.
-        step: The step of the evaluation.
-        views: Names of all held-out views, in the order of per_view.csv.
-    """
-    from crossgrad_core.run.results import panel_layout
-
-    return panel_layout.panels_of(run, step, views)
-
-
-def read_panel(path: Path) -> "dict[str, Image]":
-    """The images in such a picture by name: `photo`, `render` and `error`.
-
-    Raises:
-        UserError: It is no such picture.
-    """
-    from crossgrad_core.run.results import panel_layout
-
-    return panel_layout.read_panel(path)
 
 
 class _NoFolder:

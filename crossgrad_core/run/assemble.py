@@ -138,7 +138,12 @@ def _require_cuda(device: torch.device) -> None:
 
 
 def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
-    """Loads and checks everything that the configuration names.
+    """Everything that a configuration names, loaded, fitted to the scene and checked.
+
+    Args:
+        config: The configuration.
+        scene: Its scene.
+        reader: Name of the reader that read the scene.
 
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.

@@ -58,16 +58,16 @@ def merged(
 
 
 def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
-    """Settings of which the later ones win over the earlier ones.
+    """Settings of which the later ones win over the earlier ones, in their long form.
 
     Args:
-        layers: Option name or key of a configuration file -> value; a layer that chooses another
-            component drops the options that earlier layers gave to the one before, and a length
-            replaces that of earlier layers.
-        assignments: `KEY=VALUE` texts, values in YAML, which win over all layers.
+        layers: What the options of `crossgrad run` or the keys of a configuration file are called
+            -> value. A layer that chooses another component drops the options that earlier layers
+            gave to the one before; a length replaces that of earlier layers.
+        assignments: `KEY=VALUE` texts as after `--set`, values in YAML, which win over all layers.
 
     Raises:
-        UserError: An assignment makes no sense.
+        UserError: An assignment, or a key with a dot, makes no sense.
     """
     settings: Settings = {}
     for layer in layers:

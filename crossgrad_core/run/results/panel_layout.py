@@ -89,7 +89,7 @@ def folder_of(run: Path, step: int) -> Path:
 
 
 def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
-    """View name -> panel, of those held-out views that have one.
+    """View name -> picture of its photo, render and error, of those held-out views that have one.
 
     Args:
         run: The run's folder.
@@ -102,10 +102,10 @@ def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
 
 
 def read_panel(path: Path) -> "dict[str, Image]":
-    """The images of a panel by name: `photo`, `render` and `error`.
+    """The images in such a picture by name: `photo`, `render` and `error`.
 
     Raises:
-        UserError: It is no panel.
+        UserError: It is no such picture.
     """
     from PIL import Image
 

@@ -71,7 +71,7 @@ class RunResults:
 
 
 def read_run(folder: Path) -> RunResults:
-    """The results of one run; it may be training meanwhile.
+    """What a run wrote, of any version; it may be training meanwhile. Imports no torch.
 
     Raises:
         UserError: It is not the folder of a run, or one of its files is damaged.
@@ -82,5 +82,5 @@ def read_run(folder: Path) -> RunResults:
 
 
 def find_runs(root: Path) -> tuple[Path, ...]:
-    """The folders of runs at or below a folder, sorted."""
+    """The folders of runs at or below a folder, sorted; imports no torch."""
     return tuple(sorted(path.parent for path in root.rglob(CONFIG)))

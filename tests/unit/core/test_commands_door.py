@@ -12,8 +12,6 @@ from support.scenes import write_tiny_scene
 from crossgrad_core import commands
 from crossgrad_core.testing.commands import HEAVY
 
-FUNCTIONS = [name for name in commands.__all__ if name not in {"FAILED", *commands._CLASSES}]
-
 
 def test_importing_it_is_quick():
     program = "import sys, crossgrad_core.commands; print(*sys.modules)"
