@@ -226,10 +226,17 @@ class RunConfig(BaseModel):
         "black",
         description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
     )
-    max_gaussians: Annotated[int | None, Flag("N", TRAINING)] = Field(
-        None,
-        ge=1,
-        description="Density control stops growing here. Default: what fits into memory.",
+    max_gaussians: Annotated[PositiveInt | Literal["auto"] | None, Flag("N|auto", TRAINING)] = (
+        Field(
+            None,
+            description="Density control stops growing here; auto: as suits the length of the run. "
+            "Default: what fits into memory.",
+        )
+    )
+    growth: Annotated[Literal["free", "curve"], Flag("free|curve", TRAINING)] = Field(
+        "free",
+        description="Growth up to --max-gaussians: as it is asked for, or along a curve that gets "
+        "there with the last edit. Default: free.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None, ge=1, description="Steps between evaluations."

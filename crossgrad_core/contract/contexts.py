@@ -38,39 +38,48 @@ class Draw:
     labels: tuple[str, ...] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class ViewRecord:
-    """One rendered view of a step, after its backward pass.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderedView:
+    """A training view as it was rendered, beside what the render is compared with.
+
+    Attributes:
+        view: The view.
+        camera: The camera that it was rendered with: that of the view in another size where `scale`
+            is not 1.
+        scale: Sides of the render over those of the photo as trained.
+        gaussians: What was drawn.
+        screen: Screen statistics in pixels of the render, gradients included where a backward pass
+            has run; read in units of the full photo through `contract.screen_statistics`.
+        image: [H, W, 3] the image that is compared: the render after exposure.
+        photo: [H, W, 3] uint8 the photo that it is compared with, in the size of the render.
+        mask: [H, W] bool, True where the pixel counts; None where every pixel does.
+    """
+
+    view: View
+    camera: Camera
+    scale: float
+    gaussians: Gaussians
+    screen: Screen
+    image: Tensor
+    photo: Tensor
+    mask: Tensor | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewRecord(RenderedView):
+    """One rendered view of a step, after its backward pass, detached.
 
     Attributes:
         index: Position in `scene.train_views`.
-        view: The view.
         label: Its group label, or None.
         loss: Its own photometric loss.
-        gaussians: What was drawn, detached.
-        screen: Screen statistics in pixels of the render, gradients included; read in units of the
-            full photo, whatever the scale, through `contract.screen_statistics`.
         background: [3] RGB that it was drawn over.
-        camera: The camera that it was rendered with: that of the view in another size where `scale`
-            is not 1.
-        scale: Sides of the render over those of the photo as trained, as the resolution chose it.
-        image: [H, W, 3] the image that was compared, detached: the render after exposure.
-        photo: [H, W, 3] uint8 the photo that it was compared with, in the size of the render.
-        mask: [H, W] bool, True where the pixel counted; None where every pixel did.
     """
 
     index: int
-    view: View
     label: str | None
     loss: float
-    gaussians: Gaussians
-    screen: Screen
     background: Tensor
-    camera: Camera = field(kw_only=True)
-    scale: float = field(kw_only=True)
-    image: Tensor = field(kw_only=True)
-    photo: Tensor = field(kw_only=True)
-    mask: Tensor | None = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -111,30 +120,16 @@ def decoded(view: View) -> tuple[Tensor, Tensor | None]:
     return view.photo.image(), view.photo.mask()
 
 
-@dataclass(frozen=True, eq=False)
-class RequestedRender:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RequestedRender(RenderedView):
     """A training view as it was rendered on request, through the run's exposure and loss.
 
     Attributes:
-        view: The view.
-        camera: The camera that it was rendered with.
-        scale: Sides of the render over those of the photo as trained.
-        gaussians: What the backbone decoded.
         render: What the rasterizer made of it.
-        image: [H, W, 3] the render after exposure.
-        photo: [H, W, 3] uint8 the photo in the size of the render.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
         measure: Works out `loss`.
     """
 
-    view: View
-    camera: Camera
-    scale: float
-    gaussians: Gaussians
     render: Render
-    image: Tensor
-    photo: Tensor
-    mask: Tensor | None
     measure: Callable[[], Tensor]
 
     @cached_property
@@ -167,18 +162,9 @@ class RenderOnRequest(Protocol):
         ...
 
 
-class NoRenders:
-    """Stands where nothing can be rendered: a context that belongs to no run."""
-
-    def __call__(
-        self,
-        view: int,
-        scale: float = 1.0,
-        outputs: frozenset[str] = frozenset(),
-        background: Tensor | None = None,
-    ) -> RequestedRender:
-        """Raises RuntimeError."""
-        raise RuntimeError("this context belongs to no run: there is nothing to render views with")
+def no_renders(*_asked: object, **_named: object) -> RequestedRender:
+    """Stands where nothing can be rendered; raises RuntimeError."""
+    raise RuntimeError("this context belongs to no run: there is nothing to render views with")
 
 
 #: A view and its render [H, W, 3] -> the image as the view's camera would have taken it.
@@ -348,7 +334,7 @@ class DensifyContext(StepContext):
     views: tuple[ViewRecord, ...]
     means_lr: float
     room: int
-    render: RenderOnRequest = field(default_factory=NoRenders, kw_only=True)
+    render: RenderOnRequest = field(default=no_renders, kw_only=True)
     share: float = field(default=1.0, kw_only=True)
 
 
@@ -471,7 +457,7 @@ class Model:
     loss: "Loss"
     groups: tuple[str, ...] | None
     exposed: ExposedBy = field(default=unexposed)
-    render: RenderOnRequest = field(default_factory=NoRenders)
+    render: RenderOnRequest = field(default=no_renders)
 
 
 @dataclass(frozen=True)

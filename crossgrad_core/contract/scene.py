@@ -50,12 +50,6 @@ class Camera(Pinhole):
     """A pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 
     Attributes:
-        width: Pixels.
-        height: Pixels.
-        fx: Focal length in pixels; likewise `fy`.
-        fy: See `fx`.
-        cx: Principal point in pixels from the left (top for `cy`) image border.
-        cy: See `cx`.
         world_to_camera: [4, 4] float64 on the CPU, rigid, local frame to camera frame.
     """
 

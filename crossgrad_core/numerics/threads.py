@@ -18,25 +18,9 @@ def configure_threads(n: int | None = None) -> int:
 
     The threading layer of Numba is set to OpenMP where it can be loaded, else TBB, else Numba's own
     "workqueue", unless the environment names one (`NUMBA_THREADING_LAYER`,
-    `NUMBA_THREADING_LAYER_PRIORITY`) or a parallel kernel has run already. Reasons, measured on two
-    cores with the wheels of torch and Numba for Linux:
-
-    - OpenMP wakes its threads in about 3 microseconds, workqueue in 40 to 80.
-    - torch brings its own copy of libgomp and Numba loads the system's, so there are two pools, and
-      idle threads of a pool spin for a while before they sleep. Numba's and torch's parallel
-      operators in turn take as long as the two apart when both are OpenMP. With workqueue, whose
-      threads have to be woken by the scheduler while torch's spin, the same loop takes twice as
-      long or more. `OMP_WAIT_POLICY=passive` stops the spinning but costs 30 to 60 microseconds per
-      parallel call, which small operators feel more than large ones gain: the default is left
-      alone.
-    - workqueue ends the process when two Python threads enter parallel kernels at once; OpenMP and
-      TBB do not. OpenMP (GNU) in turn forbids parallel kernels in a forked child: start worker
-      processes with the "spawn" or "forkserver" method if they are to run any.
-
-    On the CPU torch runs backward passes in the thread that calls `backward`, so a parallel kernel
-    inside `torch.autograd.Function` meets the same pool as everywhere else. Numba's number of
-    threads belongs to the calling thread: a second thread that runs kernels has to call this
-    function too.
+    `NUMBA_THREADING_LAYER_PRIORITY`) or a parallel kernel has run already; docs/architecture.md
+    says why. Numba's number of threads belongs to the calling thread: a second thread that runs
+    kernels has to call this function too.
 
     Args:
         n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else

@@ -46,6 +46,7 @@ def renders_of(
             scale=scale,
             gaussians=gaussians,
             render=drawn,
+            screen=drawn.screen,
             image=drawn.image,
             photo=photo,
             mask=mask,

@@ -3,7 +3,7 @@
 from functools import partial
 
 from crossgrad_core.contract.contexts import Model
-from crossgrad_core.training.on_request import render_uncounted
+from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -22,6 +22,6 @@ def model_of(setup: Setup, state: TrainState) -> Model:
         background=eval_background(setup),
         loss=setup.loss,
         exposed=partial(exposed, setup, state),
-        render=partial(render_uncounted, setup, state),
+        render=OnRequest(setup, state, counted=False),
         groups=setup.groups,
     )

@@ -1,5 +1,7 @@
 """Renders of training views that a plugin asks for."""
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
 from crossgrad_core.contract.contexts import RequestedRender
@@ -10,57 +12,60 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import eval_background, target_at, weights_of
 
 
-def render_counted(
-    setup: Setup,
-    state: TrainState,
-    view: int,
-    scale: float = 1.0,
-    outputs: frozenset[str] = frozenset(),
-    background: Tensor | None = None,
-) -> RequestedRender:
-    """See `RenderOnRequest`; counted among the rendered views."""
-    state.counters.views += 1
-    return render_uncounted(setup, state, view, scale, outputs, background)
+@dataclass(frozen=True, eq=False)
+class OnRequest:
+    """Renders training views with the parameters as they are; a `RenderOnRequest`.
 
-
-def render_uncounted(
-    setup: Setup,
-    state: TrainState,
-    view: int,
-    scale: float = 1.0,
-    outputs: frozenset[str] = frozenset(),
-    background: Tensor | None = None,
-) -> RequestedRender:
-    """See `RenderOnRequest`.
-
-    Raises:
-        UserError: There is no such view, or the scale is out of bounds.
+    Attributes:
+        setup: The run.
+        state: Its state.
+        counted: Whether the renders are counted among the rendered views.
     """
-    _check(setup, view, scale)
-    target = target_at(setup, state, view, scale)
-    gaussians = setup.backbone.decode(
-        state.parameters, target.camera, setup.phase(state.step, training=True)
-    )
-    if background is None:
-        background = eval_background(setup)
-    render = setup.rasterizer.render(gaussians, target.camera, background, outputs)
-    image = exposed(setup, state, setup.train_views[view], render.image)
 
-    def measure() -> Tensor:
-        weights = weights_of(setup, state, view, target)
-        return setup.loss.loss(image, target.photo, target.mask, weights)
+    setup: Setup
+    state: TrainState
+    counted: bool
 
-    return RequestedRender(
-        view=setup.train_views[view],
-        camera=target.camera,
-        scale=scale,
-        gaussians=gaussians,
-        render=render,
-        image=image,
-        photo=target.photo,
-        mask=target.mask,
-        measure=measure,
-    )
+    def __call__(
+        self,
+        view: int,
+        scale: float = 1.0,
+        outputs: frozenset[str] = frozenset(),
+        background: Tensor | None = None,
+    ) -> RequestedRender:
+        """See `RenderOnRequest`.
+
+        Raises:
+            UserError: There is no such view, or the scale is out of bounds.
+        """
+        setup, state = self.setup, self.state
+        _check(setup, view, scale)
+        state.counters.views += self.counted
+        target = target_at(setup, state, view, scale)
+        gaussians = setup.backbone.decode(
+            state.parameters, target.camera, setup.phase(state.step, training=True)
+        )
+        if background is None:
+            background = eval_background(setup)
+        render = setup.rasterizer.render(gaussians, target.camera, background, outputs)
+        image = exposed(setup, state, setup.train_views[view], render.image)
+
+        def measure() -> Tensor:
+            weights = weights_of(setup, state, view, target)
+            return setup.loss.loss(image, target.photo, target.mask, weights)
+
+        return RequestedRender(
+            view=setup.train_views[view],
+            camera=target.camera,
+            scale=scale,
+            gaussians=gaussians,
+            render=render,
+            screen=render.screen,
+            image=image,
+            photo=target.photo,
+            mask=target.mask,
+            measure=measure,
+        )
 
 
 def _check(setup: Setup, view: int, scale: float) -> None:

@@ -1,9 +1,7 @@
 """One optimizer step: sample, render, aggregate, optimize, densify."""
 
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -28,15 +26,15 @@ from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.density_views import observed_views
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
-from crossgrad_core.training.on_request import render_counted
+from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
+from crossgrad_core.training.room import room_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import average_of, follow, restart
+from crossgrad_core.training.steady import follow, restart
 from crossgrad_core.training.views import (
     Rendered,
     TensorGradients,
@@ -185,8 +183,8 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         views=rendered.observed,
         share=len(rendered.observed) / len(rendered.records),
         means_lr=means_rate_at(setup, state.step),
-        room=_room(setup, state, rendered) if setup.schedule.densifies(state.step) else 0,
-        render=partial(render_counted, setup, state),
+        room=room_of(setup, state, rendered),
+        render=OnRequest(setup, state, counted=True),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
     state.commit(answer.states)
@@ -210,37 +208,6 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):
             restart(state)
-
-
-def _room(setup: Setup, state: TrainState, rendered: Rendered) -> int:
-    """How many primitives may be added now."""
-    rooms = []
-    if setup.config.max_gaussians is not None:
-        rooms.append(max(0, setup.config.max_gaussians - state.primitives(setup)))
-    memory = room_for_primitives(setup.device, _demand(setup, state, rendered))
-    if memory is not None:
-        rooms.append(memory)
-    return min(rooms, default=sys.maxsize)
-
-
-def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
-    """What a step keeps for each primitive."""
-    per_primitive = sum(
-        state.parameters[name][:1].numel() * state.parameters[name].element_size()
-        for block in setup.blocks
-        if block.per_primitive
-        for name in block.tensors
-    )
-    kept = kept_bytes(rendered.records, state.parameters.values())
-    return Demand(
-        parameters=per_primitive,
-        kept=kept // max(1, state.primitives(setup)),
-        views=len(rendered.records),
-        separate=setup.separate,
-        watched=bool(setup.watchers),
-        joint=setup.joint,
-        averaged=average_of(setup.config) > 0.0,
-    )
 
 
 def _check_finite(state: TrainState, rendered: Rendered, gradients: TensorGradients) -> None:

@@ -254,6 +254,12 @@ def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
     assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()
+    # On a curve growth is held back at every edit, as it should be.
+    run(scene, tmp_path / "curve", max_gaussians=230, growth="curve", **settings)
+    assert quality(tmp_path / "curve")[-1]["primitives"] == "230"
+    assert "growth held back" not in (tmp_path / "curve" / "log.txt").read_text()
+    summary = json.loads((tmp_path / "curve/summary.json").read_text())
+    assert summary["peak_primitives"] == 230
 
 
 class Poison:

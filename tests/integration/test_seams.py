@@ -22,7 +22,7 @@ from crossgrad_core.run import app, assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.training.clock import PHASES
-from crossgrad_core.training.on_request import render_uncounted
+from crossgrad_core.training.on_request import OnRequest
 
 PLUGINS = {
     "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
@@ -171,7 +171,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
 def test_a_render_that_there_cannot_be_is_refused(view, scale):
     setup = SimpleNamespace(train_views=(None,) * 3)
     with pytest.raises(UserError, match="asked for a render"):
-        render_uncounted(setup, None, view, scale)
+        OnRequest(setup, None, counted=False)(view, scale)
 
 
 class PairOnly(Operator):

@@ -15,7 +15,7 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.results.table import cost_line
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import memory, step
+from crossgrad_core.training import memory, room, step
 from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes
 from crossgrad_core.training.start import first_state
 
@@ -67,7 +67,7 @@ def looked(monkeypatch, available=GIB, **settings):
     demands = []
     room_for = memory.room_for_primitives
     monkeypatch.setattr(
-        step, "room_for_primitives", lambda d, demand: demands.append(demand) or room_for(d, demand)
+        room, "room_for_primitives", lambda d, demand: demands.append(demand) or room_for(d, demand)
     )
     times = {"densify_from": 1, "densify_until": 9, "densify_every": 2, "events": "steps"}
     given = {"steps": 9, **times, "sh_from": 3}

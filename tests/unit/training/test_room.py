@@ -1,0 +1,192 @@
+"""The budget of density control, and the curve that leads to it, for whatever grows."""
+
+from dataclasses import replace
+from fractions import Fraction
+from math import floor
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.schedule import Counting, Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
+from crossgrad_core.run.checkpoint.folders import Keep
+from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import room
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.room import curve, usual_budget
+from crossgrad_core.training.start import first_state
+
+#: Densifiers that want more than any curve gives them, and their backbones.
+GREEDY = {
+    "adc": {"grad_threshold": 1e-12, "prune_opacity": 0, "split_scale": 100},
+    "absgrad": {"grad_threshold": 1e-12, "abs_threshold": 1e-12, "prune_opacity": 0},
+    "pixel": {"grad_threshold": 1e-12, "prune_opacity": 0},
+    "dc4gs": {"split_threshold": 1e-12, "grad_threshold": 1e-12, "prune_opacity": 0},
+    "revising": {"growth_budget": 1, "error_threshold": 1e-9, "prune_opacity": 0},
+    "mcmc": {"growth": 1, "noise": 0, "dead_opacity": 1e-9},
+    "anchor": {"success_threshold": 0, "coarsest": 1, "grad_threshold": 1e-12, "prune_opacity": 0},
+    "octree": {"success_threshold": 0, "grad_threshold": 1e-12, "prune_opacity": 0},
+}
+BACKBONES = {
+    "anchor": {"name": "scaffold", "voxel_size": 1e-5},
+    "octree": {"name": "octree", "middle_cell": 1e-5},
+}
+EDITS = 4
+
+
+def setup_of(densifier, **settings):
+    """A run of 4 edits, after steps 2, 4, 6 and 8."""
+    config = RunConfig(
+        steps=10, events="steps", densify_from=1, densify_until=9, densify_every=2,
+        densifier=ComponentChoice(name=densifier, **GREEDY[densifier]),
+        backbone=ComponentChoice(**BACKBONES.get(densifier, {"name": "vanilla"})), **settings,
+    )  # fmt: skip
+    return assemble(config, sample_scene(), "none")
+
+
+def counts_of(setup, steps=9):
+    state = first_state(setup)
+    return [state.primitives(setup), *(timed_step(setup, state).primitives for _ in range(steps))]
+
+
+numbers = st.integers(0, 10**7)
+
+
+@given(start=numbers, budget=numbers, events=st.integers(1, 500), share=st.floats(0, 1))
+def test_the_curve_is_the_published_one(start, budget, events, share):
+    event = round(share * events)
+    a = Fraction(budget - start - 2 * events, events**2)
+    assert curve(event, events, start, budget) == floor(a * event**2 + 2 * event + start)
+    assert curve(0, events, start, budget) == start
+    assert curve(events, events, start, budget) == budget
+
+
+@pytest.mark.parametrize("name", GREEDY)
+def test_every_method_that_grows_follows_the_curve(name):
+    free = counts_of(setup_of(name))
+    start = free[0]
+    budget = start + (free[2] - start) // 2  # Less than the first edit alone would add.
+    assert budget > start + EDITS
+    found = counts_of(setup_of(name, max_gaussians=budget, growth="curve"))
+    for edit in range(1, EDITS + 1):
+        assert found[2 * edit] == curve(edit, EDITS, start, budget)
+        assert found[2 * edit - 1] == found[2 * edit - 2]
+    assert found[-1] == budget
+    at_once = counts_of(setup_of(name, max_gaussians=budget))
+    assert at_once[2] == budget
+
+
+def test_the_strongest_come_first():
+    """What the curve leaves out is what the method itself would have taken last."""
+    found = {}
+    for growth in ("free", "curve"):
+        setup = setup_of("adc", max_gaussians=60, growth=growth)
+        state = first_state(setup)
+        for _ in range(2):
+            timed_step(setup, state)
+        found[growth] = state.parameters["means"][40:].detach()
+    some, many = found["curve"], found["free"]
+    assert 0 < len(some) < len(many)
+    assert {tuple(row) for row in some.tolist()} <= {tuple(row) for row in many.tolist()}
+
+
+def test_what_was_pruned_may_be_added_again():
+    setup = setup_of("adc", max_gaussians=80, growth="curve")
+    state = first_state(setup)
+    for _ in range(3):
+        timed_step(setup, state)
+    few = {name: tensor[:10] for name, tensor in state.parameters.items()}
+    state.parameters = {n: t.detach().clone().requires_grad_() for n, t in few.items()}
+    state.adam = first_state(setup).adam
+    state.states = {**state.states, "densifier": PluginState()}
+    assert timed_step(setup, state).primitives == 20  # All are cloned: far from the curve.
+
+
+def test_a_budget_below_the_start_adds_nothing():
+    setup = setup_of("adc", max_gaussians=10, growth="curve")
+    assert set(counts_of(setup)) == {40}
+
+
+@pytest.mark.parametrize("growth", ["free", "curve"])
+def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
+    monkeypatch.setattr(room, "SHORT_BUDGET", 50)
+    found = counts_of(setup_of("adc", max_gaussians="auto", growth=growth))
+    assert found[-1] == 50 == max(found)
+    assert (found[2] == 50) == (growth == "free")
+
+
+def test_budgets_by_length():
+    assert [usual_budget(5_000, length) for length in (1, 300, 1_000)] == [30_000] * 3
+    assert usual_budget(5_000, 10_000) == 100_000
+    assert usual_budget(90_000, 1_000) == 90_000
+    assert usual_budget(90_000, 10_000) == 300_000
+    lengths = range(1_000, 30_001, 500)
+    budgets = [usual_budget(0, length) for length in lengths]
+    assert budgets == sorted(set(budgets))
+
+
+@pytest.mark.parametrize("longer", [700, 3_000, 5_000])
+def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
+    """The edits that are left share what is left, however many they have become."""
+    counting = Counting("views", ViewPlan((1,)), 50, fewest_edits=6)
+    first = Schedule.for_run(2_000, counting=counting)
+    turn = first.step_of(first.next_edit(first.densify_from + first.densify_every))
+    wanted = Schedule.for_run(longer, counting=counting)
+    schedule, present, reached = first, 1_000, []
+    config = SimpleNamespace(growth="curve", max_gaussians=9_000)
+    state = SimpleNamespace(states={}, step=0, primitives=lambda _: present)
+    for step in range(1, max(longer, 2_000) + 1):
+        if step == turn + 1:
+            schedule = first.lengthened(wanted, turn)
+        state.step = step
+        if step <= schedule.total and schedule.densifies(step):
+            setup = SimpleNamespace(config=config, schedule=schedule)
+            present = max(present, room._most(setup, state))
+            reached.append(present)
+    assert len(reached) >= 3
+    assert reached == sorted(reached) and reached[-1] == 9_000
+    assert reached[0] < 3_000
+
+
+def test_a_resumed_run_knows_where_it_started(tmp_path):
+    setup = setup_of("adc", max_gaussians=75, growth="curve")
+    whole = counts_of(setup)
+    state = first_state(setup)
+    for _ in range(3):
+        timed_step(setup, state)
+    save(tmp_path, to_checkpoint(state), Keep(every=None))
+    state = from_checkpoint(setup, load(latest(tmp_path)))
+    assert [timed_step(setup, state).primitives for _ in range(6)] == whole[4:]
+
+
+def test_a_run_without_a_budget_keeps_nothing_of_it():
+    state = first_state(setup := setup_of("adc", max_gaussians=60))
+    for _ in range(3):
+        timed_step(setup, state)
+    assert room.STATE not in state.states
+
+
+@pytest.mark.parametrize(("text", "value"), [("auto", "auto"), ("5000", 5000), (None, None)])
+def test_budgets_as_written(text, value):
+    assert RunConfig(max_gaussians=text).max_gaussians == value
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
+def test_budgets_that_are_none(text):
+    with pytest.raises(ValidationError):
+        RunConfig(max_gaussians=text)
+
+
+def test_room_is_none_between_edits():
+    setup = setup_of("adc")
+    schedule = replace(setup.schedule, densify_until=2)
+    state = SimpleNamespace(step=5)
+    assert room.room_of(SimpleNamespace(schedule=schedule), state, None) == 0
