@@ -97,6 +97,11 @@ class RunConfig(BaseModel):
         description="exposure.json of another run on these photos: the exposure starts from its "
         "values.",
     )
+    start: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+        ComponentChoice(name=defaults.START),
+        description="What is added to the points that a run starts from. "
+        f"Default: {defaults.START}, nothing.",
+    )
     resolution: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.RESOLUTION),
         description=f"At which scale a step renders its views. Default: {defaults.RESOLUTION}.",

@@ -11,6 +11,7 @@ SAMPLER: Final = "random"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"
+START: Final = "sfm"
 RESOLUTION: Final = "full"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"

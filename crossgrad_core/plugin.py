@@ -63,6 +63,7 @@ from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
+from crossgrad_core.contract.start import MorePoints, Start
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -119,6 +120,7 @@ __all__ = [
     "MatrixOperator",
     "Metric",
     "Model",
+    "MorePoints",
     "Observer",
     "Operator",
     "OperatorContext",
@@ -155,6 +157,7 @@ __all__ = [
     "Selection",
     "SeparateGradients",
     "Similarity",
+    "Start",
     "StepContext",
     "StepRecord",
     "UserError",

@@ -1,11 +1,11 @@
 """Vanilla 3DGS: one explicit Gaussian per primitive (Kerbl et al. 2023)."""
 
 from collections.abc import Mapping, Sequence
-from math import log
 from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
@@ -25,9 +25,6 @@ from crossgrad_core.plugin import (
     Selection,
 )
 
-#: Opacity of a new Gaussian.
-INITIAL_OPACITY = 0.1
-
 
 class Vanilla(Backbone):
     """The 3DGS representation with its published learning rates.
@@ -38,6 +35,7 @@ class Vanilla(Backbone):
 
     plain: ClassVar[bool] = True
 
+    initial_opacity: float = Field(0.1, gt=0.0, lt=1.0, description="of a Gaussian of a point")
     sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")
     lr_means: float = Field(1.6e-4, gt=0, description="initial, per scene extent")
     lr_means_final: float = Field(1.6e-6, gt=0, description="final, per scene extent")
@@ -94,19 +92,26 @@ class Vanilla(Backbone):
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
         count = scene.points.shape[0]
         means = torch.from_numpy(scene.points).float()
-        scales = torch.from_numpy(nearest_neighbour_scales(scene.points)).float()
+        scales = torch.from_numpy(_sizes(scene)).float()
         quats = torch.zeros(count, 4)
         quats[:, 0] = 1.0
         rgb = torch.from_numpy(scene.point_colors).float() / 255.0
-        opacity = log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
         tensors = {
             "means": means,
             "scales": scales.log()[:, None].repeat(1, 3),
             "quats": quats,
-            "opacities": torch.full((count,), opacity),
+            "opacities": torch.from_numpy(self._first_opacities(scene)).float(),
             "f_dc": ((rgb - 0.5) / SH_C0)[:, None, :],
         }
         return self._with_rest(tensors, count)
+
+    def _first_opacities(self, scene: Scene) -> NDArray[np.float64]:
+        """[P] logits."""
+        opacities = np.full(len(scene.points), self.initial_opacity)
+        if scene.point_opacities is not None:
+            known = ~np.isnan(scene.point_opacities)
+            opacities[known] = scene.point_opacities[known]
+        return np.log(opacities / (1.0 - opacities))
 
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
@@ -154,3 +159,13 @@ class Vanilla(Backbone):
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
         return self.splats(parameters, self.sh_degree).detached()
+
+
+def _sizes(scene: Scene) -> NDArray[np.float64]:
+    """[P] standard deviations of the first Gaussians; points of known size are no neighbours."""
+    if scene.point_sizes is None:
+        return nearest_neighbour_scales(scene.points)
+    sizes = scene.point_sizes.copy()
+    unknown = np.isnan(sizes)
+    sizes[unknown] = nearest_neighbour_scales(scene.points[unknown])
+    return sizes

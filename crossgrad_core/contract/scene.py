@@ -149,6 +149,9 @@ class Scene:
         point_colors: [P, 3] uint8 RGB.
         similarity: Maps the local frame back to the input frame.
         notes: What was done to the input and why (undistorted, resized, images left out ...).
+        point_sizes: [P] standard deviations of the first Gaussians, local units; NaN where the
+            distance to neighbours tells. None: at all points.
+        point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
     """
 
     name: str
@@ -159,6 +162,8 @@ class Scene:
     point_colors: NDArray[np.uint8]
     similarity: Similarity
     notes: tuple[str, ...] = ()
+    point_sizes: NDArray[np.float64] | None = None
+    point_opacities: NDArray[np.float64] | None = None
 
     @property
     def train_views(self) -> tuple[View, ...]:

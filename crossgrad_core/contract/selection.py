@@ -17,6 +17,7 @@ from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.start import Start
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Selection:
         rasterizer: The rasterizer.
         loss: The photometric loss.
         exposure: What cameras do to light.
+        start: What is added to the points that a run begins with.
         resolution: The scale of each view of a step.
         exporter: What writes the trained scene to a file.
         metrics: What is measured of held-out views, by name.
@@ -50,6 +52,7 @@ class Selection:
     rasterizer: Rasterizer
     loss: Loss
     exposure: Exposure
+    start: Start
     resolution: Resolution
     exporter: Exporter
     metrics: Mapping[str, Metric]
@@ -76,6 +79,7 @@ class Selection:
             "rasterizer": self.rasterizer,
             "loss": self.loss,
             "exposure": self.exposure,
+            "start": self.start,
             "resolution": self.resolution,
             "exporter": self.exporter,
             "grouping": self.grouping,

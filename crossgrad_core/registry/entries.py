@@ -37,6 +37,7 @@ _BASES: Final[dict[str, str]] = {
     "rasterizers": "crossgrad_core.contract.rasterizer:Rasterizer",
     "losses": "crossgrad_core.contract.loss:Loss",
     "exposures": "crossgrad_core.contract.exposure:Exposure",
+    "starts": "crossgrad_core.contract.start:Start",
     "resolutions": "crossgrad_core.contract.resolution:Resolution",
     "readers": "crossgrad_core.contract.reader:Reader",
     "exporters": "crossgrad_core.contract.exporter:Exporter",

@@ -14,6 +14,7 @@ GROUPS: Final[dict[str, str]] = {
         "rasterizers",
         "losses",
         "exposures",
+        "starts",
         "resolutions",
         "readers",
         "exporters",

@@ -162,10 +162,11 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
-    """The setup with what its exposure says about the scene, and the seconds that it took."""
-    start = perf_counter()
-    remarks = setup.exposure.remarks(setup.scene, known_starts(setup))
-    return replace(setup, notes=(*setup.notes, *remarks)), perf_counter() - start
+    """The setup with what exposure and start say about the scene, and the seconds it took."""
+    begun, scene = perf_counter(), setup.scene
+    remarks = setup.exposure.remarks(scene, known_starts(setup))
+    remarks += setup.selection.start.remarks(scene)
+    return replace(setup, notes=(*setup.notes, *remarks)), perf_counter() - begun
 
 
 def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]:

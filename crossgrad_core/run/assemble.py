@@ -27,6 +27,7 @@ from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.contract.start import Start
 from crossgrad_core.defaults import CHAIN, EXPORTER, METRICS, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
@@ -53,7 +54,7 @@ _MOST_VIEWS = 13
 #: Settings that name one component.
 SINGLE = (
     *("backbone", "sampler", "grouping", "densifier", "rasterizer", "loss"),
-    *("exposure", "resolution", "exporter", "reader"),
+    *("exposure", "start", "resolution", "exporter", "reader"),
 )
 
 
@@ -246,6 +247,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
         "exposure": fitted.name or config.exposure.name,
+        "start": config.start.name,
         "resolution": config.resolution.name,
         "exporter": config.exporter.name,
         "reader": reader,
@@ -262,6 +264,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         rasterizer=rasterizer,
         loss=_built(Loss, config.loss),
         exposure=fitted.exposure,
+        start=_built(Start, config.start),
         resolution=_built(Resolution, config.resolution),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),

@@ -12,7 +12,7 @@ from crossgrad_core.training.steady import average_of, final_decay_of
 #: Slots that every run fills with one component.
 ALWAYS = (
     *("backbone", "sampler", "densifier", "rasterizer"),
-    *("loss", "exposure", "resolution", "exporter"),
+    *("loss", "exposure", "start", "resolution", "exporter"),
 )
 
 

@@ -11,7 +11,7 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS
+from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS, START
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
@@ -57,6 +57,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_groups(config, setup),
         *_of_exposure(config, setup),
         *_of_the_split(config),
+        *_of_the_start(config),
         *_of_the_end(config, setup),
     ]
     if found:
@@ -162,6 +163,11 @@ def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
     lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
     if reading.split == "auto" and lists:
         yield "reading.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+
+
+def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
+    if config.start.name != START and config.reading.init != "points":
+        yield "start", f"--init {config.reading.init} has points of its own; leave one of them out"
 
 
 def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

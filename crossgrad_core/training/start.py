@@ -49,8 +49,8 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
     if reading.init_file is None:
         scene = setup.scene
         if reading.init == "random":
-            scene = with_random_points(scene, rng)
-        return setup.backbone.create(scene, rng)
+            return setup.backbone.create(with_random_points(scene, rng), rng)
+        return setup.backbone.create(setup.selection.start.begun(scene), rng)
     gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, setup.scene.similarity)
     return setup.backbone.adopt(gaussians, setup.scene, rng)
 

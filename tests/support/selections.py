@@ -14,6 +14,7 @@ _USUAL = {
     "rasterizer": "torch",
     "loss": "l1-ssim",
     "exposure": "none",
+    "start": "sfm",
     "resolution": "full",
     "exporter": "ply",
 }

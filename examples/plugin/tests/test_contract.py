@@ -13,6 +13,7 @@ from crossgrad_example.largest_error import LargestError
 from crossgrad_example.least_seen import LeastSeen
 from crossgrad_example.median_distance import MedianDistance
 from crossgrad_example.poses import Poses
+from crossgrad_example.sky import Sky
 from crossgrad_example.spheres import Spheres
 from crossgrad_example.xyz import Xyz
 
@@ -27,6 +28,7 @@ PLUGINS = {
     "rasterizers": Borrowed,
     "losses": Charbonnier,
     "exposures": Gain,
+    "starts": Sky,
     "resolutions": CoarseFirst,
     "readers": Poses,
     "exporters": Xyz,

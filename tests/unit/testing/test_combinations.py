@@ -2,7 +2,7 @@
 
 from itertools import product
 
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.combinations import as_lines, every_combination, from_lines, refused
 
@@ -10,6 +10,7 @@ ROWS = list(product("abc", "de", "fgh", "ij", "kl"))
 REASONS = ("needs K = 2 (--views); K is 1", "has no: tensors", "is late")
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # A busy machine is slow enough.
 @given(
     st.dictionaries(
         st.sampled_from(ROWS), st.sets(st.sampled_from(REASONS), min_size=1), max_size=len(ROWS)

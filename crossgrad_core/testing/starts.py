@@ -1,0 +1,48 @@
+"""Contract checks of starts."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from crossgrad_core.contract.start import MorePoints, Start
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
+from crossgrad_core.testing.fixtures import sample_scene
+
+
+def adds_points(make: Make[Start]) -> None:
+    """Positions and colours, sizes above 0 and opacities between 0 and 1, one of each a point."""
+    more = make().more_points(sample_scene())
+    if more is None:
+        return
+    good = isinstance(more, MorePoints)
+    require(good, f"more_points() answers {type(more).__name__}, not MorePoints")
+    count = len(more.positions)
+    shapes = {"positions": (count, 3), "colors": (count, 3), "sizes": (count,)}
+    for name, shape in {**shapes, "opacities": (count,)}.items():
+        found = getattr(more, name).shape
+        require(found == shape, f"{name} has the shape {found}; {count} points need {shape}")
+    require(more.colors.dtype == np.uint8, f"colors are {more.colors.dtype}, not uint8")
+    require(bool(np.isfinite(more.positions).all()), "a position is not finite")
+    sizes, opacities = more.sizes, more.opacities
+    require(bool((np.isfinite(sizes) & (sizes > 0.0)).all()), "a size is not a number above 0")
+    inside = bool(((opacities > 0.0) & (opacities < 1.0)).all())
+    require(inside, "an opacity does not lie between 0 and 1")
+
+
+def answers_alike(make: Make[Start]) -> None:
+    """Asked again, also as a new object, it gives the same points and says the same."""
+    scene = sample_scene()
+    with global_randomness_untouched():
+        one, other = make(), make()
+        first, second = one.more_points(scene), other.more_points(scene)
+        told = one.remarks(scene) == other.remarks(scene)
+    require(told, "remarks() differ from one call to the next")
+    require((first is None) == (second is None), "points are added the one time only")
+    if first is not None and second is not None:
+        for each in fields(first):
+            same = np.array_equal(getattr(first, each.name), getattr(second, each.name))
+            require(same, f"{each.name} differ from one call to the next")
+
+
+START_CHECKS: tuple[Check[Start], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)

@@ -1,0 +1,27 @@
+"""A dome over the scene, for what no photo's point stands for."""
+
+import numpy as np
+from typing_extensions import override
+
+from crossgrad_core.plugin import Field, MorePoints, Scene, Start
+
+
+class Sky(Start):
+    """Blue points on the upper half of a sphere around the cameras; z is up."""
+
+    radius: float = Field(10.0, gt=0.0, description="of the dome, scene extents")
+    count: int = Field(200, ge=1, description="points")
+
+    @override
+    def more_points(self, scene: Scene) -> MorePoints | None:
+        # A spiral of equal areas: the golden angle from one point to the next.
+        height = (np.arange(self.count) + 0.5) / self.count
+        angle = np.arange(self.count) * np.pi * (3.0 - np.sqrt(5.0))
+        flat = np.sqrt(1.0 - height**2)
+        dome = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
+        return MorePoints(
+            positions=scene.centers.mean(axis=0) + self.radius * dome,
+            colors=np.tile(np.array([135, 178, 220], dtype=np.uint8), (self.count, 1)),
+            sizes=np.full(self.count, self.radius / np.sqrt(self.count)),
+            opacities=np.full(self.count, 0.9),
+        )

@@ -1,0 +1,92 @@
+"""How deep a photo is where none of its SfM points lies: a plane, and what is near it bends it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.plugin import Camera
+
+#: Neighbours whose distance from the plane counts.
+_NEIGHBOURS = 8
+#: In parts of the longer side: below the first all distances count alike; a point as far away as
+#: the second is worth as much as the plane.
+_BLUR, _REACH = 0.02, 0.1
+#: Farther than so many times its farthest points a photo is not deep.
+_FARTHEST = 2.0
+#: Share of the points that may lie nearer, or farther, than any added one.
+_TAIL = 0.02
+#: Huber's constant, for 95 % of the efficiency of least squares.
+_HUBER, _PASSES = 1.345, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Depth:
+    """Depth of a photo, from the points that it observed.
+
+    Of a plane in space the inverse depth is a plane over the pixels, so that ground goes on beyond
+    its last point, up to the horizon; where that is behind the camera, something far away stands.
+
+    Attributes:
+        pixels: [S, 2] of the points, in units of the longer side from the middle.
+        rest: [S] their inverse depths less the plane's.
+        plane: [3] inverse depth over (x, y, 1).
+        median: Median of their depths.
+        nearest: Largest inverse depth of an added point.
+        farthest: Smallest inverse depth of an added point.
+    """
+
+    pixels: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    plane: NDArray[np.float64]
+    median: float
+    nearest: float
+    farthest: float
+
+    @classmethod
+    def of(cls, camera: Camera, points: NDArray[np.float64], fewest: int) -> "Depth | None":
+        """From the points [S, 3] that were observed; None with fewer than `fewest` in front."""
+        pixels, depth = camera.project(points)
+        ahead = depth > 0.0
+        if np.count_nonzero(ahead) < fewest:
+            return None
+        around, inverse = from_the_middle(camera, pixels[ahead]), 1.0 / depth[ahead]
+        plane = _plane(around, inverse)
+        far, near = np.quantile(inverse, [_TAIL, 1.0 - _TAIL])
+        rest, median = inverse - _on(plane, around), float(np.median(depth[ahead]))
+        return cls(around, rest, plane, median, near, far / _FARTHEST)
+
+    def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N] depths at pixels [N, 2], in units of the longer side from the middle."""
+        from scipy.spatial import cKDTree
+
+        count = min(_NEIGHBOURS, len(self.rest))
+        distances, rows = cKDTree(self.pixels).query(around, k=[*range(1, count + 1)])
+        weights = 1.0 / (distances**2 + _BLUR**2)
+        bent = (weights * self.rest[rows]).sum(axis=1) / (weights.sum(axis=1) + _REACH**-2)
+        inverse = np.clip(_on(self.plane, around) + bent, self.farthest, self.nearest)
+        return np.asarray(1.0 / inverse)
+
+
+def from_the_middle(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels [N, 2] in units of the photo's longer side, from its middle."""
+    middle = np.array([camera.width, camera.height]) / 2.0
+    return (pixels - middle) / max(camera.width, camera.height)
+
+
+def _on(plane: NDArray[np.float64], around: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(around @ plane[:2] + plane[2])
+
+
+def _plane(around: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] by Huber's loss, iteratively reweighted."""
+    columns = np.column_stack([around, np.ones(len(around))])
+    weights = np.ones(len(around))
+    for _ in range(_PASSES):
+        root = np.sqrt(weights)
+        plane = np.linalg.lstsq(columns * root[:, None], inverse * root, rcond=None)[0]
+        off = np.abs(inverse - columns @ plane)
+        # Of normal noise the median deviation is 0.6745 sigma.
+        limit = _HUBER * np.median(off) / 0.6745
+        weights = np.minimum(1.0, np.divide(limit, off, out=np.ones_like(off), where=off > limit))
+    return np.asarray(plane)

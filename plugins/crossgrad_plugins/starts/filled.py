@@ -1,0 +1,191 @@
+"""Large Gaussians where photos show something that no SfM point stands for, and around them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from crossgrad_core.plugin import Field, MorePoints, Scene, Start, View
+from crossgrad_plugins.starts.cells import Cells
+from crossgrad_plugins.starts.depth import Depth, from_the_middle
+
+#: A photo needs so many observed points to say how deep it is.
+FEWEST: Final = 8
+#: Standard deviation of an added Gaussian over the side of its cell.
+_SIZE: Final = 0.8
+_NEAREST: Final = 3
+
+
+@dataclass(eq=False)
+class _Filling:
+    """Points so far.
+
+    Attributes:
+        points: [P, 3] those of the scene and the added ones.
+        sizes: [P] what each of them covers, standard deviations, local units.
+        colors: Of the added ones, view by view.
+        inside: How many were added on photos.
+        left_aside: Photos with too few points.
+    """
+
+    points: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    colors: list[NDArray[np.uint8]] = field(default_factory=list)
+    inside: int = 0
+    left_aside: int = 0
+
+    def add(
+        self,
+        points: NDArray[np.float64],
+        sizes: NDArray[np.float64],
+        colors: NDArray[np.uint8],
+    ) -> None:
+        self.points = np.concatenate([self.points, points])
+        self.sizes = np.concatenate([self.sizes, sizes])
+        self.colors.append(colors)
+
+
+#: What was worked out, as long as its scene is in use.
+_KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
+
+
+class Filled(Start):
+    """Fills what is empty: cells of photos without points, and a margin beyond all photos.
+
+    Depth is that of a plane through the points that a photo observed, bent by those nearby. Cells
+    beyond a photo's edge have the colour at the edge, and are filled where no training photo looks:
+    held-out photos and viewers see the ground go on there instead of a black hole. Ours.
+    """
+
+    cells: int = Field(12, ge=2, le=200, description="along the longer side of a photo")
+    margin: float = Field(
+        0.5, ge=0.0, le=2.0, description="beyond each edge, in longer sides of the photo; 0: none"
+    )
+    opacity: float = Field(0.5, gt=0.0, lt=1.0, description="of the added Gaussians")
+    views: int = Field(200, ge=1, description="photos that are looked at, at most")
+
+    @override
+    def more_points(self, scene: Scene) -> MorePoints | None:
+        filling, own = self._filling(scene), len(scene.points)
+        added = len(filling.points) - own
+        if not added:
+            return None
+        return MorePoints(
+            positions=filling.points[own:],
+            colors=np.concatenate(filling.colors),
+            sizes=filling.sizes[own:],
+            opacities=np.full(added, self.opacity),
+        )
+
+    @override
+    def remarks(self, scene: Scene) -> tuple[str, ...]:
+        filling = self._filling(scene)
+        beyond = len(filling.points) - len(scene.points) - filling.inside
+        aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were left aside"
+        return (
+            f"start: {filling.inside} Gaussians fill what photos show without points, {beyond} "
+            f"stand beyond their edges{aside if filling.left_aside else ''}",
+        )
+
+    def _filling(self, scene: Scene) -> _Filling:
+        known = _KNOWN.setdefault(scene, {})
+        if self not in known:
+            known[self] = self._filled(scene)
+        return known[self]
+
+    def _filled(self, scene: Scene) -> _Filling:
+        filling = _Filling(scene.points, _spacings(scene.points))
+        views = _spread(scene.train_views, self.views)
+        deep = {view: Depth.of(view.camera, scene.points[view.seen], FEWEST) for view in views}
+        known = [(view, depth) for view, depth in deep.items() if depth is not None]
+        filling.left_aside = len(views) - len(known)
+        # What is near is filled finely first, and needs nothing coarse behind it any more.
+        known.sort(key=lambda each: each[1].median)
+        for view, depth in known:
+            self._fill(filling, view, depth, 0, None)
+        filling.inside = len(filling.points) - len(scene.points)
+        margin = round(self.margin * self.cells)
+        if margin:
+            pictures = _Pictures.of(scene.train_views)
+            for view, depth in reversed(known):
+                self._fill(filling, view, depth, margin, pictures)
+        return filling
+
+    def _fill(
+        self, filling: _Filling, view: View, depth: Depth, margin: int, seen: "_Pictures | None"
+    ) -> None:
+        """Fills a photo, or with a margin what is beyond its edges and in no picture `seen`."""
+        camera = view.camera
+        cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
+        empty = ~cells.covered(filling.points, filling.sizes)
+        if margin:
+            empty &= ~cells.on_photo
+        if not empty.any():
+            return
+        colors, has_pixels = cells.colors(view)
+        rows = np.flatnonzero(empty & has_pixels)
+        depths = depth.at(from_the_middle(camera, cells.pixels[rows]))
+        points = _behind(view, cells.pixels[rows], depths)
+        unseen = np.ones(len(points), dtype=np.bool_) if seen is None else ~seen.show(points)
+        sizes = _SIZE * cells.size * depths / camera.fx
+        filling.add(points[unseen], sizes[unseen], colors[rows][unseen])
+
+
+def _spread(views: Sequence[View], most: int) -> list[View]:
+    """At most so many of the views, evenly spread."""
+    if len(views) <= most:
+        return list(views)
+    return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
+
+
+def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[P] distance of each point from its neighbours, as 3DGS makes the first Gaussians."""
+    from scipy.spatial import cKDTree
+
+    count = min(_NEAREST, len(points) - 1)
+    if count < 1:
+        return np.zeros(len(points))
+    distances, _ = cKDTree(points).query(points, k=count + 1)
+    return np.asarray(np.sqrt((distances[:, 1:] ** 2).mean(axis=1)))
+
+
+def _behind(
+    view: View, pixels: NDArray[np.float64], depths: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[N, 3] points of the local frame behind pixels [N, 2] at depths [N]."""
+    camera, pose = view.camera, view.camera.world_to_camera.numpy()
+    rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    local = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
+    return np.asarray((local - pose[:3, 3]) @ pose[:3, :3])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The pictures of some views.
+
+    Attributes:
+        matrices: [V, 3, 4] homogeneous points of the local frame to pixels times depth.
+        ends: [V, 2] width and height.
+    """
+
+    matrices: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> "_Pictures":
+        cameras = [view.camera for view in views]
+        matrices = [(each.matrix @ each.world_to_camera[:3]).numpy() for each in cameras]
+        return cls(np.stack(matrices), np.array([[each.width, each.height] for each in cameras]))
+
+    def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[N] whether a point [N, 3] lies in one of the pictures."""
+        homogeneous = np.column_stack([points, np.ones(len(points))])
+        around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
+        depth = around[..., 2:]
+        # Both sides times the depth: nothing is divided by zero.
+        inside = (around[..., :2] >= 0.0) & (around[..., :2] <= self.ends[:, None] * depth)
+        return np.asarray((inside.all(axis=2) & (depth[..., 0] > 0.0)).any(axis=0))

@@ -1,0 +1,13 @@
+"""The points of the scene and no others."""
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import MorePoints, Scene, Start
+
+
+class SfmPoints(Start):
+    """Adds nothing."""
+
+    @override
+    def more_points(self, scene: Scene) -> MorePoints | None:
+        return None

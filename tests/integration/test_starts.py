@@ -1,0 +1,51 @@
+"""What a run starts from, through the whole of it."""
+
+import json
+
+import pytest
+from support.commands import ended
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.run.results.config_file import read_notes
+
+BASE = ["--steps", "8", "--threads", "1", "--max-size", "40", "--views", "2", "-q"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9)
+
+
+def primitives(folder):
+    return json.loads((folder / "summary.json").read_text())["primitives"]
+
+
+def run(scene, out, *options):
+    return ended("run", str(scene), *BASE, "--out", str(out), *options)
+
+
+@pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
+def test_filled_adds_primitives_and_says_so(scene, tmp_path, backbone):
+    options = ("--backbone", backbone, "--densifier", "none")
+    assert run(scene, tmp_path / "plain", *options) == 0
+    assert run(scene, tmp_path / "filled", *options, "--start", "filled") == 0
+    assert primitives(tmp_path / "filled") > primitives(tmp_path / "plain")
+    assert any(note.startswith("start: ") for note in read_notes(tmp_path / "filled"))
+    assert not any(note.startswith("start: ") for note in read_notes(tmp_path / "plain"))
+
+
+def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
+    options = ("--start", "filled", "--set", "start.cells=6")
+    assert run(scene, tmp_path / "whole", *options) == 0
+    assert run(scene, tmp_path / "broken", *options, "--stop-after", "4") == 0
+    assert ended("run", "--resume", str(tmp_path / "broken"), "-q") == 0
+    one, other = (
+        (tmp_path / name / "point_cloud.ply").read_bytes() for name in ("whole", "broken")
+    )
+    assert one == other
+
+
+def test_points_of_its_own_make_a_start_do_nothing(scene, tmp_path, capsys):
+    assert run(scene, tmp_path / "run", "--init", "random", "--start", "filled") == 2
+    assert "start: --init random has points of its own" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

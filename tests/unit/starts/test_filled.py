@@ -1,0 +1,236 @@
+"""`filled`: what it takes for empty, how deep, which colour."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.starts.cells import Cells
+from crossgrad_plugins.starts.depth import Depth, from_the_middle
+from crossgrad_plugins.starts.filled import Filled
+
+WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Photo of the ground z = 0: red grows with x, green with y."""
+
+    camera: Camera
+    hidden: bool = False
+
+    def image(self):
+        down, across = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        ground = on_ground(self.camera, np.column_stack([across.ravel(), down.ravel()]))
+        rgb = np.column_stack([127 + 20 * ground[:, 0], 127 + 20 * ground[:, 1], 0 * ground[:, 0]])
+        return torch.from_numpy(rgb.clip(0, 255).round().astype(np.uint8).reshape(HEIGHT, WIDTH, 3))
+
+    def mask(self):
+        return torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) if self.hidden else None
+
+
+@dataclass(frozen=True)
+class Watched(Picture):
+    """A photo that tells when it is looked at."""
+
+    told: Callable[[], None] = list
+
+    def image(self):
+        self.told()
+        return super().image()
+
+
+def on_ground(camera, pixels):
+    """[N, 3] where rays through pixels [N, 2] meet z = 0."""
+    pose = camera.world_to_camera.numpy()
+    rays = np.column_stack([(pixels - [camera.cx, camera.cy]) / FOCAL, np.ones(len(pixels))])
+    rays = rays @ pose[:3, :3]
+    center = camera.center.numpy()
+    return center - rays * (center[2] / rays[:, 2])[:, None]
+
+
+def looking_down(x, y, height=4.0, seen=(), tilt=0.3):
+    view = posed_view([x, y, height], f"{x}_{y}.png", forward=[0.0, tilt, -1.0], seen=seen)
+    camera = replace(
+        view.camera, width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2
+    )
+    return replace(view, camera=camera, photo=Picture(camera))
+
+
+def ground_scene(points, centers=((0.0, 0.0), (1.0, 0.5)), **changes):
+    views = [replace(looking_down(*each, seen=range(len(points))), **changes) for each in centers]
+    return posed_scene(views, points)
+
+
+def some_ground(count, x, y, seed=0):
+    """[count, 3] points of the ground with x and y in these ranges."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(*x, count), rng.uniform(*y, count), np.zeros(count)])
+
+
+LEFT = some_ground(400, (-2.5, 0.0), (-1.0, 4.0))
+
+
+def test_depth_of_a_plane_is_exact_far_from_its_points_and_through_outliers():
+    camera = looking_down(0.0, 0.0).camera
+    points = LEFT[camera.project(LEFT)[1] > 0]
+    wrong = points.copy()
+    wrong[::10] += [0.0, 0.0, 1.5]
+    pixels = np.array([[2.0, 3.0], [24.0, 18.0], [47.0, 35.0], [70.0, 40.0]])
+    true = camera.local(on_ground(camera, pixels))[:, 2]
+    around = from_the_middle(camera, pixels)
+    np.testing.assert_allclose(Depth.of(camera, points, 8).at(around), true, rtol=1e-9)
+    np.testing.assert_allclose(Depth.of(camera, wrong, 8).at(around), true, rtol=0.12)
+
+
+def test_depth_stays_between_near_and_twice_as_far_as_the_points():
+    camera = looking_down(0.0, 0.0, tilt=3.0).camera  # The horizon is in the picture.
+    ahead = some_ground(300, (-3.0, 3.0), (4.0, 20.0))
+    depths = camera.project(ahead)[1]
+    up = np.column_stack([np.linspace(0, WIDTH, 50), np.zeros(50)])
+    found = Depth.of(camera, ahead, 8).at(from_the_middle(camera, up))
+    assert found.min() >= np.quantile(depths, 0.02) * 0.99
+    assert found.max() <= 2.0 * np.quantile(depths, 0.98) * 1.01
+    assert Depth.of(camera, ahead[:7], 8) is None
+
+
+def covered_by_hand(cells, points, sizes):
+    """Cell by cell and disc by disc."""
+    camera = cells.camera
+    pixels, depth = camera.project(points)
+    found = []
+    for across, down in cells.places:
+        low = np.array([across, down]) * cells.size
+        area, under = 0.0, False
+        for point, size, far in zip(pixels, sizes, depth, strict=True):
+            if far <= 0.0:
+                continue
+            radius = min(2.0 * size * camera.fx / far, max(camera.width, camera.height) / 8)
+            if radius > cells.size / 2:
+                half = radius * np.sqrt(np.pi) / 2
+                under |= bool((np.abs(low + cells.size / 2 - point) <= half).all())
+            elif ((np.floor(point / cells.size)) == [across, down]).all():
+                area += np.pi * radius**2
+        found.append(under or area >= 0.5 * cells.size**2)
+    return np.array(found)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    count=st.integers(1, 40),
+    size=st.floats(2.0, 30.0),
+    margin=st.integers(0, 3),
+    scale=st.floats(-3.0, 0.5),
+)
+def test_cells_are_covered_as_by_hand(seed, count, size, margin, scale):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 3.0, (count, 3))
+    sizes = 10.0**scale * rng.uniform(0.1, 1.0, count)
+    cells = Cells(looking_down(0.0, 0.0).camera, size, margin)
+    np.testing.assert_array_equal(
+        cells.covered(points, sizes), covered_by_hand(cells, points, sizes)
+    )
+
+
+@pytest.mark.parametrize("size", [4.0, 5.0, 7.3, 48.0])
+def test_colors_are_means_of_what_counts(size):
+    view = looking_down(0.0, 0.0)
+    image = view.photo.image().numpy()
+    mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.3
+    photo = view.photo
+    masked = type("Masked", (), {"image": photo.image, "mask": lambda _: torch.from_numpy(mask)})()
+    cells = Cells(view.camera, size, 1)
+    colors, has_pixels = cells.colors(replace(view, photo=masked))
+    assert has_pixels.any()
+    for place, color, known in zip(cells.places, colors, has_pixels, strict=True):
+        rows, columns = cells.inner
+        x, y = np.clip(place, 0, [columns - 1, rows - 1])
+        part = np.s_[int(y * size) : int((y + 1) * size), int(x * size) : int((x + 1) * size)]
+        kept = image[part][mask[part]]
+        assert known == bool(len(kept))
+        if known:
+            np.testing.assert_array_equal(color, kept.mean(axis=0).round())
+
+
+def test_ground_without_points_is_filled_where_it_is_in_its_colours():
+    more = Filled(margin=0.0).more_points(ground_scene(LEFT))
+    assert len(more.positions) > 10
+    np.testing.assert_allclose(more.positions[:, 2], 0.0, atol=1e-6)
+    assert (more.positions[:, 0] > -0.3).all(), "the left is covered"
+    seen = 127 + 20 * more.positions[:, :2]
+    np.testing.assert_allclose(more.colors[:, :2], seen, atol=6)
+    # Each covers about its cell: an eighth of the photo's longer side, at its depth.
+    assert ((more.sizes > 0.2) & (more.sizes < 0.8)).all()
+
+
+def test_what_is_full_stays_as_it_is():
+    full = some_ground(4000, (-6.0, 6.0), (-5.0, 9.0))
+    scene = ground_scene(full)
+    assert Filled(margin=0.0).more_points(scene) is None
+    assert Filled(margin=0.0).begun(scene) is scene
+
+
+def test_the_margin_is_where_no_training_photo_looks():
+    scene = ground_scene(LEFT)
+    inner = Filled(margin=0.0).more_points(scene)
+    more = Filled(margin=0.5).more_points(scene)
+    beyond = more.positions[len(inner.positions) :]
+    assert len(beyond) > 10
+    # What would be nearer, or much farther, than any point is brought to where these are.
+    assert (np.abs(beyond[:, 2]) < 1e-6).mean() > 0.5
+    assert np.abs(beyond[:, 2]).max() < 1.0
+    for view in scene.train_views:
+        pixels, depth = view.camera.project(beyond)
+        shown = ((pixels >= 0) & (pixels <= [WIDTH, HEIGHT])).all(axis=1) & (depth > 0)
+        assert not shown.any()
+    told = Filled(margin=0.5).remarks(scene)
+    assert told == (
+        f"start: {len(inner.positions)} Gaussians fill what photos show without points, "
+        f"{len(beyond)} stand beyond their edges",
+    )
+
+
+def test_photos_that_say_nothing_are_left_aside():
+    scene = ground_scene(LEFT, seen=np.arange(7))
+    assert Filled().more_points(scene) is None
+    assert "2 photos with fewer than 8 points were left aside" in Filled().remarks(scene)[0]
+    hidden = ground_scene(LEFT)
+    views = tuple(
+        replace(view, photo=Picture(view.camera, hidden=True)) for view in hidden.train_views
+    )
+    assert Filled().more_points(replace(hidden, views=views)) is None
+
+
+def test_no_more_photos_are_looked_at_than_asked_for():
+    centers = [(0.3 * number, 0.0) for number in range(20)]
+    scene, looked_at = ground_scene(LEFT, centers), []
+    views = [
+        replace(view, photo=Watched(view.camera, told=partial(looked_at.append, view.name)))
+        for view in scene.train_views
+    ]
+    assert Filled(views=3).more_points(replace(scene, views=tuple(views))) is not None
+    assert len(set(looked_at)) == 3
+
+
+def test_gaussians_get_the_sizes_and_opacities_and_the_others_stay_as_they_were():
+    scene = ground_scene(LEFT)
+    begun = Filled(opacity=0.7).begun(scene)
+    rng = np.random.default_rng(0)
+    plain, filled = (Vanilla().create(each, rng) for each in (scene, begun))
+    own = len(LEFT)
+    for name, tensor in plain.items():
+        torch.testing.assert_close(filled[name][:own], tensor, rtol=0, atol=0)
+    more = Filled(opacity=0.7).more_points(scene)
+    added = {name: tensor.detach()[own:] for name, tensor in filled.items()}
+    np.testing.assert_allclose(added["scales"].exp()[:, 0], more.sizes, rtol=1e-6)
+    np.testing.assert_allclose(added["opacities"].sigmoid(), 0.7, rtol=1e-6)
+    np.testing.assert_allclose(added["means"], more.positions, rtol=1e-6, atol=1e-7)
