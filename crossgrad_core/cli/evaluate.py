@@ -1,11 +1,25 @@
 """`crossgrad eval`: figures of a run's held-out views."""
 
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
 from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
+
+Ply = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Evaluate the Gaussians of this PLY instead, drawn on black as viewers draw them.",
+    ),
+]
 
 
 def evaluate(
     run: RunFolder,
+    ply: Ply = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
@@ -15,4 +29,4 @@ def evaluate(
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
-    afterwards.evaluate(run, how)
+    afterwards.evaluate(run, how, ply)

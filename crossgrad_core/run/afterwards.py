@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Protocol
 
 from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.registry.entries import build, find
-from crossgrad_core.run.export import Exported, described, export_scene, renderer
+from crossgrad_core.run.export import Exported, described, drawer, export_scene, renderer
 from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_names import flat_names
@@ -20,7 +21,7 @@ from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.summary import summarised_step
-from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.run.session import CLOUD, totals
 from crossgrad_core.system.writability import check_file, check_folder
@@ -63,13 +64,41 @@ class How:
 AS_IT_IS = How()
 
 
-def evaluate(folder: Path, how: Opens = AS_IT_IS) -> None:
-    """Evaluates the held-out views of a run again; prints the table.
+def evaluate(folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None) -> None:
+    """Evaluates the held-out views of a run again, or those of a file; prints the table.
 
     Raises:
-        UserError: See `evaluated`.
+        UserError: See `evaluated` and `evaluated_file`.
     """
-    print(final_table(*evaluated(folder, how)))  # noqa: T201
+    if ply is None:
+        print(final_table(*evaluated(folder, how)))  # noqa: T201
+        return
+    result, gaussians = evaluated_file(folder, ply, how)
+    told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
+    print("\n".join([*metric_lines(result), told]))  # noqa: T201
+
+
+def evaluated_file(folder: Path, ply: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, int]:
+    """Evaluates Gaussians of a PLY on the held-out views of a run, exposures of the run included.
+
+    Nothing is written.
+
+    Args:
+        folder: The run's folder.
+        ply: The file, in the coordinates of the scene's input; this or another program wrote it.
+        how: How the run is opened.
+
+    Returns:
+        The figures, and the number of Gaussians.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, or the file cannot be read.
+    """
+    require_checkpoint(folder)
+    setup, state = how.open(folder)
+    gaussians = build(Exporter, EXPORTER, {}).read(ply, setup.scene.similarity)
+    draw, points = drawer(setup, state, gaussians), setup.scene.points
+    return measured(setup.scene.test_views, draw, setup.metrics, points=points), len(gaussians)
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:

@@ -32,9 +32,11 @@ class Exported:
             nothing had to be baked.
         views: Views on which it was compared with the live model: the one that it was baked for,
             else the held-out ones.
-        psnr: dB, mean over these views of the file's Gaussians, drawn again; None where nothing was
-            baked or there are no such views.
-        live_psnr: dB, the same of the live model.
+        psnr: dB, mean over these views of the file's Gaussians, drawn on black as viewers draw
+            them; None where the live model has the same Gaussians on the same background, or where
+            there are no such views.
+        live_psnr: dB, the same of the live model on its own background.
+        background: Name of that background, where it is not black; no file holds it.
         notes: What the user should know about the file.
     """
 
@@ -43,11 +45,12 @@ class Exported:
     views: int = 0
     psnr: float | None = None
     live_psnr: float | None = None
+    background: str | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def loss(self) -> float | None:
-        """What baking costs, dB."""
+        """What baking, and the background that no file holds, cost, dB."""
         if self.psnr is None or self.live_psnr is None:
             return None
         return self.live_psnr - self.psnr
@@ -60,6 +63,7 @@ class Exported:
             "views": self.views,
             "psnr": self.psnr,
             "live_psnr": self.live_psnr,
+            "background": self.background,
             "loss": self.loss,
         }
 
@@ -93,18 +97,25 @@ def export_scene(
     exporter = exporter or setup.selection.exporter
     comments = (f"crossgrad step {state.step}",)
     notes = exporter.write(baked, setup.scene.similarity, path, comments)
-    if setup.backbone.plain:
+    plain, background = setup.backbone.plain, _own_background(setup)
+    if plain and background is None:
         return Exported(len(baked), notes=notes)
     compared = setup.scene.test_views if view is None else (view,)
     drawn = drawer(setup, state, exporter.stored(baked))
     return Exported(
         gaussians=len(baked),
-        baked_for=camera or f"{len(views)} training views",
+        baked_for=None if plain else camera or f"{len(views)} training views",
         views=len(compared),
         psnr=_mean_psnr(compared, drawn),
         live_psnr=_mean_psnr(compared, renderer(setup, state)),
+        background=background,
         notes=notes,
     )
+
+
+def _own_background(setup: Setup) -> str | None:
+    """The background of evaluated views, where it is not black."""
+    return setup.config.background if bool(eval_background(setup).any()) else None
 
 
 def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> float | None:
@@ -155,8 +166,11 @@ def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tenso
 
 
 def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Renders a view of Gaussians that are the same for every camera, exposure included."""
-    background = eval_background(setup)
+    """Renders a view of Gaussians that are the same for every camera, exposure included.
+
+    On black: what a file holds is what viewers draw, and they draw it so.
+    """
+    background = torch.zeros(3, device=setup.device)
     moved = gaussians.mapped(lambda tensor: tensor.to(setup.device))
 
     def render_one(view: View) -> Tensor:
@@ -169,10 +183,13 @@ def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[V
 def described(exported: Exported, path: Path) -> Sequence[str]:
     """Lines for the user about a file."""
     lines = [*exported.notes]
-    if exported.loss is not None:
-        lines.append(
-            f"{path.name}: baked for {exported.baked_for}; drawn again it has "
-            f"{exported.psnr:.2f} dB, the live model {exported.live_psnr:.2f} dB "
-            f"(loss {exported.loss:.2f} dB, {exported.views} views)"
-        )
+    if exported.loss is None:
+        return lines
+    baked = "" if exported.baked_for is None else f"baked for {exported.baked_for}; "
+    over = "" if exported.background is None else f" over its background {exported.background}"
+    lines.append(
+        f"{path.name}: {baked}drawn on black, as viewers draw it, it has {exported.psnr:.2f} dB, "
+        f"the live model{over} {exported.live_psnr:.2f} dB (loss {exported.loss:.2f} dB, "
+        f"{exported.views} views)"
+    )
     return lines

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
@@ -148,3 +149,56 @@ def test_the_command_line_has_these_options():
     for name in ("eval", "render", "export"):
         text = CliRunner().invoke(command, [name, "--help"]).output
         assert "--device" in text and "--threads" in text
+
+
+def figures_of(folder, capsys, *options):
+    """PSNR overall that `crossgrad eval` prints, and all that it prints."""
+    assert ended("eval", str(folder), "--threads", "1", *options) == 0
+    printed = capsys.readouterr().out
+    (row,) = (line.split() for line in printed.splitlines() if line.startswith("overall"))
+    return float(row[2]), printed
+
+
+def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, capsys):
+    grey = tmp_path / "grey"
+    assert run(scene, grey, background="0.5,0.5,0.5") == 0
+    told = json.loads((grey / "summary.json").read_text())
+    ply = told["ply"]
+    assert (ply["background"], ply["baked_for"]) == ("0.5,0.5,0.5", None)
+    assert ply["live_psnr"] == pytest.approx(told["overall"]["psnr"], abs=1e-3)
+    assert ply["loss"] == pytest.approx(ply["live_psnr"] - ply["psnr"])
+    capsys.readouterr()
+    before = content(grey)
+    own, _ = figures_of(grey, capsys)
+    before = content(grey)
+    drawn, printed = figures_of(grey, capsys, "--ply", str(grey / "point_cloud.ply"))
+    assert not new_files(grey, before)
+    assert own == pytest.approx(ply["live_psnr"], abs=6e-3)
+    assert drawn == pytest.approx(ply["psnr"], abs=6e-3)
+    assert abs(own - drawn) > 0.05
+    assert f"{told['primitives']} Gaussians of" in printed
+    assert "drawn on black" in printed
+
+
+def test_the_user_is_told_what_a_background_costs_the_file(scene, tmp_path, capsys):
+    settings = {"scene": str(scene), "steps": STEPS, "threads": 1}
+    for name in ("white", "black", "random"):
+        out = tmp_path / name
+        assert app.run({**settings, "out": str(out), "background": name}, verbosity=0) == 0
+        told = capsys.readouterr().err
+        assert ("point_cloud.ply: drawn on black, as viewers draw it, it has" in told) == (
+            name == "white"
+        )
+        assert ("over its background white" in told) == (name == "white")
+
+
+def test_a_ply_of_black_is_as_good_as_the_run(scene, tmp_path, capsys):
+    out = tmp_path / "black"
+    assert run(scene, out) == 0
+    capsys.readouterr()
+    own, _ = figures_of(out, capsys)
+    drawn, _ = figures_of(out, capsys, "--ply", str(out / "point_cloud.ply"))
+    assert drawn == pytest.approx(own, abs=6e-3)
+    other = tmp_path / "none.ply"
+    assert ended("eval", str(out), "--ply", str(other)) == 2
+    assert str(other) in capsys.readouterr().err

@@ -11,10 +11,14 @@ _NULL = "-"
 
 def final_table(result: EvaluationResult | None, totals: Totals) -> str:
     """Metrics overall and per regime, and what they cost, as plain text without a final newline."""
-    lines = [] if result is None else _aligned(_rows(result))
-    if result is not None:
-        lines += [f"no {metric}: {reason}" for metric, reason in _shown(result)]
+    lines = () if result is None else metric_lines(result)
     return "\n".join([*lines, cost_line(totals)])
+
+
+def metric_lines(result: EvaluationResult) -> list[str]:
+    """Metrics overall and per regime, and why one is missing."""
+    reasons = (f"no {metric}: {reason}" for metric, reason in _shown(result))
+    return [*_aligned(_rows(result)), *reasons]
 
 
 def cost_line(totals: Totals) -> str:
