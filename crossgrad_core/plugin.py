@@ -22,6 +22,7 @@ from crossgrad_core.contract.contexts import (
     PixelContext,
     RegularizeContext,
     Regularized,
+    RenderedView,
     RenderOnRequest,
     RequestedRender,
     RunInfo,
@@ -70,6 +71,8 @@ from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
+from crossgrad_core.registry.entries import name_of as component_name
+from crossgrad_core.registry.entries import plain as plain_component
 from crossgrad_core.run.results.lines import (
     Pace,
     evaluation_line,
@@ -139,6 +142,7 @@ __all__ = [
     "Regularized",
     "Render",
     "RenderOnRequest",
+    "RenderedView",
     "RequestedRender",
     "Resolution",
     "Response",
@@ -170,6 +174,7 @@ __all__ = [
     "bimodality",
     "build_component",
     "centers_of",
+    "component_name",
     "diagonals",
     "eight_bit",
     "evaluation_line",
@@ -182,6 +187,7 @@ __all__ = [
     "masked",
     "objections_to_views",
     "octave",
+    "plain_component",
     "progress_line",
     "psnr",
     "radial_distances",

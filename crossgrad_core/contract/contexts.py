@@ -324,6 +324,7 @@ class DensifyContext(StepContext):
         share: Number of these over that of all views of the step; 1 but for `--density-views`.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
+        may_grow: [P] bool, the primitives that may grow; None where all may.
         render: Renders a training view of the densifier's choice: on the training clock, and
             counted among the rendered views.
     """
@@ -336,6 +337,7 @@ class DensifyContext(StepContext):
     room: int
     render: RenderOnRequest = field(default=no_renders, kw_only=True)
     share: float = field(default=1.0, kw_only=True)
+    may_grow: Tensor | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,29 +9,29 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
+from crossgrad_core.contract.contexts import DensifyContext, RenderedView
 from crossgrad_core.contract.state import PluginState
 
 
-def half_size(record: ViewRecord, like: Tensor) -> Tensor:
+def half_size(record: RenderedView, like: Tensor) -> Tensor:
     """[2] pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
     camera = record.camera
     return torch.tensor([camera.width / 2, camera.height / 2]).to(like)
 
 
-def ndc_gradient(record: ViewRecord) -> Tensor:
+def ndc_gradient(record: RenderedView) -> Tensor:
     """[N, 2] gradient of the view's loss by the projected mean, per NDC unit."""
     gradient = _present(record.screen.mean_gradient)
     return gradient * half_size(record, gradient)
 
 
-def ndc_abs_gradient(record: ViewRecord) -> Tensor:
+def ndc_abs_gradient(record: RenderedView) -> Tensor:
     """[N, 2] the pixels' absolute gradients by the projected mean, summed, per NDC unit."""
     gradient = _present(record.screen.abs_gradient)
     return gradient * half_size(record, gradient)
 
 
-def directions(record: ViewRecord) -> Tensor:
+def directions(record: RenderedView) -> Tensor:
     """[6, 5, N] `Screen.directions` with the absolute gradients per NDC unit; bins, then fields.
 
     With the Gaussians last, sums over bins are sums of whole rows: much faster on the CPU.
@@ -42,22 +42,27 @@ def directions(record: ViewRecord) -> Tensor:
     return bins
 
 
-def pixels(record: ViewRecord) -> Tensor:
+def pixels(record: RenderedView) -> Tensor:
     """[N] pixels of the full photo in which the Gaussian was blended, floating point."""
-    found = _present(record.screen.pixels).to(record.gaussians.means)
+    return of_photo(record, _present(record.screen.pixels))
+
+
+def of_photo(record: RenderedView, counts: Tensor) -> Tensor:
+    """[N] numbers of pixels of the full photo, floating point, from those of the render."""
+    found = counts.to(record.gaussians.means)
     if record.scale == 1.0:
         return found
     full, drawn = record.view.camera, record.camera
     return found * (full.width * full.height / (drawn.width * drawn.height))
 
 
-def radii(record: ViewRecord) -> Tensor:
+def radii(record: RenderedView) -> Tensor:
     """[N] radius on the screen over the image's longer side; 0 where it touches no pixel."""
     camera = record.camera
     return record.screen.radii.to(record.gaussians.means) / max(camera.width, camera.height)
 
 
-def visible(record: ViewRecord) -> Tensor:
+def visible(record: RenderedView) -> Tensor:
     """[N] 1 where the Gaussian touched a pixel, else 0."""
     return (record.screen.radii > 0).to(record.gaussians.means)
 
@@ -80,7 +85,7 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
     return {name: state.per_primitive.get(name, zeros).clone() for name in names}
 
 
-def add(record: ViewRecord, total: Tensor, values: Tensor) -> None:
+def add(record: RenderedView, total: Tensor, values: Tensor) -> None:
     """Adds a value of each Gaussian [N] to its primitive's sum [P], in place."""
     origin = record.gaussians.origin
     if origin is None:

@@ -194,6 +194,19 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         ) from None
 
 
+def name_of(component: "Component") -> str:
+    """The name under which a component is installed, else that of its class."""
+    kind = type(component)
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    names = (name for name, entry in entries(kind.slot).items() if entry.value == value)
+    return next(names, kind.__name__)
+
+
+def plain(component: "Component") -> dict[str, Any]:
+    """A component as a configuration has it: its name, and the options that are no defaults."""
+    return {"name": name_of(component), **component.model_dump(mode="json", exclude_defaults=True)}
+
+
 @cache
 def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
     """Slot -> entries; `path` is `sys.path`, so that a changed path is looked at again."""

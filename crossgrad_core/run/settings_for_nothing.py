@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS, START
@@ -92,8 +91,7 @@ def _of_choice(
 
 
 def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    densifier: Densifier = setup.densifier
-    name = setup.selection.names["densifier"]
+    densifier, name = setup.densifier, setup.selection.names["densifier"]
     for setting in _TIMES:
         if getattr(config, setting) is not None and not densifier.edits:
             yield setting, f"densifier {name} never edits"

@@ -143,6 +143,7 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
         mean_gradient=gradient,
         abs_gradient=2.0 * gradient.abs() if "abs_gradient" in needs else None,
         directions=_directions(radii, gradient, rng) if "directions" in needs else None,
+        count=(lambda _: radii * radii) if "count" in needs else None,
     )
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias, cast
 
-import numpy as np
 import torch
 
 from crossgrad_core.contract.adam_state import AdamState
@@ -179,8 +178,7 @@ def _model(step: int) -> Model:
 
 def _seams(hooks: Hooks, step: int) -> list[Answer]:
     """The answers of the three seams of a step, as the training loop asks for them."""
-    scene = sample_scene()
-    centers = np.stack([view.camera.center.numpy() for view in scene.train_views])
+    centers = sample_scene().centers
     sample = SampleContext(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=None
     )

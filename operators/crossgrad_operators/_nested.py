@@ -13,8 +13,9 @@ from crossgrad_core.plugin import (
     PluginState,
     Selection,
     build_component,
-    installed_plugins,
+    component_name,
     objections_to_views,
+    plain_component,
     set_for_nothing,
 )
 
@@ -36,31 +37,19 @@ def operator_of(value: object) -> MatrixOperator:
 def _checked(operator: Operator) -> MatrixOperator:
     if not isinstance(operator, MatrixOperator):
         raise ValueError(  # noqa: TRY004 - pydantic turns it into an error of validation
-            f"{name_of(operator)} needs the gradients themselves, and can only stand alone"
+            f"{component_name(operator)} needs the gradients themselves, and can only stand alone"
         )
     if isinstance(operator, GramianOperator) and operator.granularity != "block":
         raise ValueError(
-            f"{name_of(operator)} cannot have a granularity of its own here; set it on the whole"
+            f"{component_name(operator)} cannot have a granularity of its own here; set it on the "
+            "whole"
         )
     return operator
 
 
-def name_of(operator: Operator) -> str:
-    """The name under which an operator is installed, else that of its class."""
-    kind = type(operator)
-    value = f"{kind.__module__}:{kind.__qualname__}"
-    found = [name for name, entry in installed_plugins("operators").items() if entry.value == value]
-    return found[0] if found else kind.__name__
-
-
-def plain(operator: Operator) -> dict[str, Any]:
-    """Name and options that were set, as `operator_of` reads them."""
-    return {"name": name_of(operator), **operator.model_dump(mode="json", exclude_defaults=True)}
-
-
 #: A field that holds an operator and is written as its name with its options.
 OperatorField: TypeAlias = Annotated[
-    MatrixOperator, BeforeValidator(operator_of), PlainSerializer(plain)
+    MatrixOperator, BeforeValidator(operator_of), PlainSerializer(plain_component)
 ]
 
 
@@ -95,7 +84,7 @@ def outer_state(states: Mapping[str, PluginState]) -> PluginState:
 
 def inner_objections(selection: Selection, operator: Operator) -> list[str]:
     """What an inner operator objects to in a selection."""
-    name = name_of(operator)
+    name = component_name(operator)
     seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
     own = getattr(operator, "crossgrad_objections", None)
     return objections_to_views(operator, seen) + list(own(seen) or () if own else ())
@@ -104,7 +93,7 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
     """The option that holds inner operators, where one of these has options that do nothing."""
     found = [
-        f"{name_of(operator)}.{name}: {why}"
+        f"{component_name(operator)}.{name}: {why}"
         for operator in operators
         for name, why in set_for_nothing(operator, selection).items()
     ]

@@ -15,6 +15,7 @@ from crossgrad_core.plugin import (
     PluginState,
     Selection,
     UserError,
+    component_name,
     hookimpl,
 )
 from crossgrad_operators._nested import (
@@ -23,7 +24,6 @@ from crossgrad_operators._nested import (
     inner_idle,
     inner_objections,
     inner_state,
-    name_of,
     outer_state,
     reads_gramians,
 )
@@ -125,7 +125,7 @@ def _remainders(
 
 def _reshaped(link: MatrixOperator, rows: int, views: int) -> UserError:
     return UserError(
-        f"operator {name_of(link)} cannot be followed by another one",
+        f"operator {component_name(link)} cannot be followed by another one",
         expected=f"as many directions as views, {views}",
         found=str(rows),
         todo="put it last in the chain",

@@ -17,6 +17,7 @@ from crossgrad_core.plugin import (
     PluginState,
     Selection,
     hookimpl,
+    plain_component,
 )
 from crossgrad_operators._nested import (
     OperatorField,
@@ -25,7 +26,6 @@ from crossgrad_operators._nested import (
     inner_objections,
     inner_state,
     outer_state,
-    plain,
     reads_gramians,
 )
 from crossgrad_operators.confgate import ConfGate
@@ -52,7 +52,7 @@ def _rules(value: object) -> object:
 
 
 def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
-    return {rule.block: plain(rule.operator) for rule in rules}
+    return {rule.block: plain_component(rule.operator) for rule in rules}
 
 
 class Dispatch(GramianOperator):

@@ -30,6 +30,9 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
     ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
     ("densifier", "octree"): {"success_threshold": 0},
+    # In so small a scene no primitive is blended in many pixels.
+    ("densifier", "multiview"): {"importance": 0},
+    ("densifier", "multiview-gate"): {"importance": 0},
 }
 #: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
 STEPS: Final = 5

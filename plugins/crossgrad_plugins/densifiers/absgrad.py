@@ -46,18 +46,8 @@ class AbsGradDensityControl(CloneSplit):
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
         order = 1 if self.criterion == "quantile" else 2
-        for record in context.views:
-            seen = screen_statistics.visible(record)
-            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
-            absolute = torch.linalg.vector_norm(
-                screen_statistics.ndc_abs_gradient(record), ord=order, dim=1
-            )
-            screen_statistics.add(record, totals["gradient"], norms * seen)
-            screen_statistics.add(record, totals["absolute"], absolute * seen)
-            screen_statistics.add(record, totals["renders"], seen)
-        return PluginState(per_primitive=totals)
+        return PluginState(per_primitive=gradient_sums(context, state, order))
 
     @override
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
@@ -83,6 +73,27 @@ class AbsGradDensityControl(CloneSplit):
         share = float(moves.double().mean())
         among_largest = absolute >= quantile(absolute, 1.0 - share)
         return moves | (among_largest & (absolute > 0))
+
+
+def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -> dict[str, Tensor]:
+    """The sums [P] of g, of ga, and of the renders that showed a primitive, with this step's views.
+
+    Args:
+        context: The step.
+        state: With the sums of the steps before.
+        order: The norm of ga.
+    """
+    totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
+    for record in context.views:
+        seen = screen_statistics.visible(record)
+        norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+        absolute = torch.linalg.vector_norm(
+            screen_statistics.ndc_abs_gradient(record), ord=order, dim=1
+        )
+        screen_statistics.add(record, totals["gradient"], norms * seen)
+        screen_statistics.add(record, totals["absolute"], absolute * seen)
+        screen_statistics.add(record, totals["renders"], seen)
+    return totals
 
 
 def quantile(values: Tensor, share: float) -> Tensor:

@@ -18,6 +18,7 @@ from crossgrad_core.plugin import (
     Densifier,
     DensifyContext,
     Edit,
+    Parameters,
     Phase,
     PluginState,
     Rows,
@@ -41,6 +42,12 @@ class Growth:
     clone: Tensor
     split: Tensor
     strength: Tensor
+
+    def among(self, may_grow: Tensor | None) -> "Growth":
+        """Those that may grow [P]; None: all may."""
+        if may_grow is None:
+            return self
+        return replace(self, clone=self.clone & may_grow, split=self.split & may_grow)
 
     def limited(self, room: int) -> tuple["Growth", int]:
         """The strongest `room` of them, and how many were left out."""
@@ -132,10 +139,11 @@ class CloneSplit(Densifier):
     def _edit(self, context: DensifyContext, state: PluginState) -> Edit:
         largest = torch.exp(context.parameters["scales"].detach()).amax(dim=1)
         small = largest <= self.split_scale
-        growth, held_back = self.growth(context, state, small).limited(context.room)
+        growth = self.growth(context, state, small).among(context.may_grow)
+        growth, held_back = growth.limited(context.room)
         plan = Plan.of(growth)
         values = self.grown_values(context, state, plan) if bool(plan.fresh.any()) else {}
-        keep = ~self._pruned(context, plan, values)
+        keep = ~self.pruned(context, state, plan, values)
         counts = {
             "cloned": int(growth.clone.sum()),
             "split": int(growth.split.sum()),
@@ -149,8 +157,10 @@ class CloneSplit(Densifier):
         resets = context.schedule.resets(context.step)
         return self._with_reset(context, edit) if resets else edit
 
-    def _pruned(self, context: DensifyContext, plan: Plan, values: Mapping[str, Rows]) -> Tensor:
-        """[M] bool, new primitives that are too faint or too large."""
+    def pruned(
+        self, context: DensifyContext, state: PluginState, plan: Plan, values: Mapping[str, Rows]
+    ) -> Tensor:
+        """[M] bool, primitives of the plan that go: by default those too faint or too large."""
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.schedule.prunes_large(context.step):
@@ -159,15 +169,19 @@ class CloneSplit(Densifier):
         return pruned
 
     def _with_reset(self, context: DensifyContext, edit: Edit) -> Edit:
-        backbone = context.backbone
-        after = apply_to_parameters(edit, backbone.blocks(), context.parameters)
-        if edit.source is not None:
-            # The backbone will renew derived tensors, and the cap may depend on them.
-            phase = Phase(context.step, training=True, schedule=context.schedule)
-            after = backbone.prepare(after, context.scene, phase)
-        capped = backbone.capped_opacities(after, self.reset_opacity)
+        after = edited_parameters(context, edit)
+        capped = context.backbone.capped_opacities(after, self.reset_opacity)
         values = {**edit.values, "opacities": Rows(capped)}
         return replace(edit, values=values, counts={**edit.counts, "reset": capped.shape[0]})
+
+
+def edited_parameters(context: DensifyContext, edit: Edit) -> Parameters:
+    """The parameters as they will be after an edit, derived tensors included."""
+    after = apply_to_parameters(edit, context.backbone.blocks(), context.parameters)
+    if edit.source is None:
+        return after
+    phase = Phase(context.step, training=True, schedule=context.schedule)
+    return context.backbone.prepare(after, context.scene, phase)
 
 
 def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:

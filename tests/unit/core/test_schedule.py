@@ -123,7 +123,7 @@ def test_the_published_schedule_is_the_same_in_views():
 
 
 @pytest.mark.parametrize("views", [600, 2400, 12_000])
-@pytest.mark.parametrize("densifier", ["adc", "mcmc", "revising", "anchor", "octree"])
+@pytest.mark.parametrize("densifier", ["adc", "mcmc", "multiview", "revising", "anchor", "octree"])
 def test_one_view_and_two_have_the_same_events_after_as_many_views(views, densifier):
     window = build("densifiers", densifier, {}).window
     one = window(Schedule.for_run(views, counting=in_views("1")))

@@ -24,11 +24,27 @@ OPTIONS = {
     "mcmc": {"growth": 0.5, "noise": 1e20, "dead_opacity": 0.4},
     "dc4gs": {"split_scale": 1e-3, "split_threshold": 1e-6, "grad_threshold": 1e-6},
     "revising": {"growth_budget": 0.1, "error_threshold": 0.01, "views": 3},
+    "multiview": {"importance": 0, "grad_threshold": 1e-6, "abs_threshold": 1e-6},
+    "multiview running": {
+        "count": "running",
+        "share": 0.5,
+        "regimes": True,
+        "importance": 0,
+        "grad_threshold": 1e-6,
+        "abs_threshold": 1e-6,
+    },
+    "multiview-gate": {
+        "count": "running",
+        "share": 0.5,
+        "importance": 0,
+        "of": {"name": "anchor", "success_threshold": 0, "coarsest": 1},
+    },
 }
 #: Backbones that they need, with anchors whose neighbouring cells are free.
 BACKBONES = {
     "anchor": {"name": "scaffold", "voxel_size": 1e-5},
     "octree": {"name": "octree", "middle_cell": 1e-5},
+    "multiview-gate": {"name": "scaffold", "voxel_size": 1e-5},
 }
 
 
@@ -41,7 +57,7 @@ def test_a_checkpoint_changes_nothing(tmp_path, name, stop, edits_in):
         densify_from=1,
         densify_until=9,
         densify_every=2,
-        densifier=ComponentChoice(name=name, **OPTIONS[name]),
+        densifier=ComponentChoice(name=name.split()[0], **OPTIONS[name]),
         backbone=ComponentChoice(**BACKBONES.get(name, {"name": "vanilla"})),
     )
     setup = assemble(config, sample_scene(), "none")

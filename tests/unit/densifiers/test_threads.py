@@ -18,6 +18,8 @@ OPTIONS = {
     "anchor": {"success_threshold": 0, "coarsest": 1},
     "octree": {"success_threshold": 0},
     "revising": {"error_threshold": 0.01, "views": 3},
+    "multiview": {"count": "running", "share": 1, "importance": 0, "grad_threshold": 1e-9},
+    "multiview-gate": {"views": 3, "importance": 0},
 }
 
 

@@ -85,7 +85,8 @@ class AnchorDensifier(Densifier):
         judged = sums[VIEWS] > enough
         transparent = sums[OPACITY] < self.prune_opacity * sums[VIEWS]
         urge = Urge(screen_statistics.mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
-        new, held_back = self.grown(context, parameters, urge).limited(context.room)
+        allowed = urge.among(context.may_grow)
+        new, held_back = self.grown(context, parameters, allowed).limited(context.room)
         changed = self.changed(parameters, urge)
         edit = edit_of(parameters, changed, judged & transparent, new)
         if held_back > 0:

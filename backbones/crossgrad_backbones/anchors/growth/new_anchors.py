@@ -1,7 +1,7 @@
 """Anchors to be added, and what the present ones ask for."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,12 @@ class Urge:
 
     gradient: Tensor
     eligible: Tensor
+
+    def among(self, may_grow: Tensor | None) -> "Urge":
+        """That of the anchors that may grow [P]; None: all may."""
+        if may_grow is None:
+            return self
+        return replace(self, eligible=self.eligible & may_grow[:, None])
 
 
 @dataclass(frozen=True)

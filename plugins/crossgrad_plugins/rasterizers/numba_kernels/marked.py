@@ -1,4 +1,4 @@
-"""In how many of some marked pixels each Gaussian of a drawn view was blended.
+"""Counts, among marked pixels, of those in which each Gaussian of a drawn view was blended.
 
 A pass of its own over a finished render, for those who can only tell from it which pixels they ask
 about: it takes the tile lists of the forward pass and repeats its blending, without colours, in the

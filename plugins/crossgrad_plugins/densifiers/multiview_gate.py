@@ -1,0 +1,148 @@
+"""A gate in front of another densifier: only what several views ask for may grow (FastGS)."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any, cast
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    Densifier,
+    DensifyContext,
+    Edit,
+    Parameters,
+    PluginState,
+    Schedule,
+    Selection,
+    UserError,
+    build_component,
+    component_name,
+    plain_component,
+    set_for_nothing,
+)
+from crossgrad_plugins.densifiers.marked_counts import CountsMarkedPixels
+
+#: Names of what the gate remembers begin with this, those of the other densifier do not.
+OWN = "gate/"
+#: Hooks of a densifier that the gate answers for it.
+_ANSWERED = frozenset({"crossgrad_densify", "crossgrad_objections"})
+
+
+def densifier_of(value: object) -> Densifier:
+    """A densifier from itself, from its name, or from `{name: ..., option: ...}`."""
+    if not isinstance(value, Densifier):
+        choice = {"name": value} if isinstance(value, str) else value
+        if not isinstance(choice, Mapping) or "name" not in choice:
+            raise ValueError("must be a densifier's name, or a name with options")
+        options = {key: option for key, option in choice.items() if key != "name"}
+        value = build_component(Densifier, str(choice["name"]), options)
+    further = {each for each in dir(value) if each.startswith("crossgrad_")} - _ANSWERED
+    if further or not value.edits or isinstance(value, CountsMarkedPixels):
+        raise ValueError(
+            f"{component_name(value)} can only stand alone: it has further hooks, never edits, or "
+            "asks several views itself"
+        )
+    return value
+
+
+class MultiViewGate(CountsMarkedPixels):
+    """Lets another densifier grow only where several views ask for it.
+
+    A primitive may grow where its Gaussians are blended in more than `importance` erroneous pixels
+    of a view on average. How it grows, and what is pruned, is left to the other densifier:
+    `anchor` or `octree` for anchors, any that clones and splits for Gaussians.
+    """
+
+    of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (
+        Field(cast("Any", "adc"), description="the densifier behind the gate: adc, anchor, octree")
+    )
+
+    @property
+    @override
+    def needs(self) -> frozenset[str]:  # type: ignore[override]
+        """What the other one needs, and the count."""
+        return self.of.needs | {"count"}
+
+    @property
+    @override
+    def tensors(self) -> frozenset[str]:  # type: ignore[override]
+        """Those that the other one edits."""
+        return self.of.tensors
+
+    @property
+    @override
+    def resets(self) -> bool:  # type: ignore[override]
+        """Whether the other one resets opacities."""
+        return self.of.resets
+
+    @property
+    @override
+    def observes(self) -> bool:  # type: ignore[override]
+        """Whether any of both gathers statistics of views."""
+        return self.count == "running" or self.of.observes
+
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
+        idle = self.idle_counting(renders=False)
+        inner = set_for_nothing(self.of, replace(selection, densifier=self.of))
+        if inner:
+            idle["of"] = "; ".join(f"{name}: {why}" for name, why in inner.items())
+        return idle
+
+    @override
+    def window(self, schedule: Schedule) -> Schedule:
+        return self.of.window(schedule)
+
+    @override
+    def started(self, parameters: Parameters) -> Parameters:
+        return self.of.started(parameters)
+
+    @override
+    def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
+        own, inner = _parted(state)
+        own = self.counted(context, own) if context.schedule.collects(context.step) else own
+        may_grow = None
+        if context.schedule.densifies(context.step):
+            seen = self.importance_of(own)
+            may_grow = seen.above(self.importance).any(dim=1)
+            own = PluginState()
+        edit, inner = self.of.densify(replace(context, may_grow=may_grow), inner)
+        if may_grow is not None:
+            self._check(edit, may_grow)
+        return edit, _joined(own, inner)
+
+    def _check(self, edit: Edit, may_grow: Tensor) -> None:
+        """Refuses growth of what may not grow."""
+        if edit.source is None or edit.fresh is None:
+            return
+        if not bool(may_grow[edit.source[edit.fresh]].all()):
+            raise UserError(
+                f"densifier {component_name(self.of)} grows what it may not",
+                where="densifier multiview-gate",
+                expected="a densifier that looks at `context.may_grow`",
+                todo="name another one with --set densifier.of=NAME, or use it without the gate",
+            )
+
+
+def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
+    """The part of the gate and that of the other densifier."""
+    own, inner = (
+        {
+            part: {
+                name.removeprefix(OWN): value
+                for name, value in getattr(state, part).items()
+                if name.startswith(OWN) == mine
+            }
+            for part in ("values", "tensors", "per_primitive")
+        }
+        for mine in (True, False)
+    )
+    return PluginState(**own), PluginState(**inner)
+
+
+def _joined(own: PluginState, inner: PluginState) -> PluginState:
+    """One state of both parts."""
+    per_primitive = {OWN + name: rows for name, rows in own.per_primitive.items()}
+    return replace(inner, per_primitive={**inner.per_primitive, **per_primitive})

@@ -1,0 +1,750 @@
+"""Multi-view density control: counts by brute force, rules by hand, planted errors, whole runs."""
+
+import gc
+from dataclasses import replace
+from itertools import permutations
+from math import ceil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.brute_force import trace
+
+from crossgrad_backbones.mip import MipSplatting
+from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.contexts import DensifyContext
+from crossgrad_core.contract.gaussians import Screen
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.schedule import Counting, Phase, Schedule
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.topology import apply_to_moment, apply_to_parameters
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene, step_fields
+from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+from crossgrad_plugins.densifiers.clone_split import Plan
+from crossgrad_plugins.densifiers.marked_counts import (
+    ERROR,
+    MARKED,
+    VISITS,
+    Importance,
+    drawn_views,
+    erroneous,
+)
+from crossgrad_plugins.densifiers.multiview import MultiViewDensityControl, some_of
+from crossgrad_plugins.rasterizers.numba_kernels.arrays import TileLists
+
+TRAIN = sample_scene().train_views
+VIEWS = len(TRAIN)
+GRADIENTS = {"gradient": 1.0, "absolute": 1.0, "renders": 1.0}
+
+
+class Bright(Vanilla):
+    """Vanilla with every other primitive drawn by two Gaussians."""
+
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        number = len(gaussians)
+        origin = torch.cat([torch.arange(number), torch.arange(0, number, 2)])
+        return replace(gaussians.mapped(lambda tensor: tensor[origin]), origin=origin)
+
+
+class Shown:
+    """A photo of given pixels and mask."""
+
+    def __init__(self, image, mask=None):
+        self._image, self._mask = image, mask
+
+    def image(self):
+        return self._image
+
+    def mask(self):
+        return self._mask
+
+
+def parameters_of(backbone, seed=2):
+    params = backbone.create(sample_scene(), np.random.default_rng(0))
+    rng = np.random.default_rng(seed)
+    with torch.no_grad():
+        params["scales"] += torch.from_numpy(rng.normal(1.0, 0.5, (40, 3))).float()
+        params["opacities"][:] = torch.from_numpy(rng.normal(0.0, 2.0, 40)).float()
+    return backbone.prepare(params, sample_scene(), Phase(0, True, Schedule.for_run(30_000)))
+
+
+def context(*, backbone=None, params=None, step=600, scene=None, rasterizer="torch", **changes):
+    """A step of the published schedule; 600 is its second edit."""
+    backbone = backbone or Vanilla()
+    params = parameters_of(backbone) if params is None else params
+    fields = {**step_fields(step), "scene": scene or sample_scene()}
+    rasterizer = build("rasterizers", rasterizer, {})
+    phase = Phase(step, training=True, schedule=fields["schedule"])
+    return DensifyContext(
+        **{**fields, "views": (), **changes},
+        parameters=params,
+        backbone=backbone,
+        rasterizer=rasterizer,
+        render=renders_of(fields["scene"], phase, backbone, rasterizer, params),
+        means_lr=1e-4,
+        room=10**6,
+    )
+
+
+def recorded(ctx, index, scale=1.0):
+    """The record of a training view, as a step leaves it, with the count."""
+    with torch.no_grad():
+        drawn = ctx.render(index, scale, frozenset({"count"}))
+    record = view_record(drawn.view, drawn.gaussians.detached(), drawn.render.screen, index, scale)
+    return replace(
+        record, loss=float(drawn.loss), image=drawn.image, photo=drawn.photo, mask=drawn.mask
+    )
+
+
+# --- the erroneous pixels of a view
+
+
+def brute_erroneous(image, photo, mask, threshold):
+    error = np.abs(image.astype(float) - photo.astype(float) / 255).mean(-1)
+    kept = error if mask is None else error[mask]
+    if kept.size == 0 or kept.max() == kept.min():
+        return np.zeros(error.shape, bool), np.full(error.shape, np.inf)
+    share = (error - kept.min()) / (kept.max() - kept.min())
+    return (share > threshold) & (True if mask is None else mask), np.abs(share - threshold)
+
+
+@given(
+    seed=st.integers(0, 2**16),
+    size=st.tuples(st.integers(1, 12), st.integers(1, 12)),
+    threshold=st.sampled_from([0.0, 0.1, 0.5, 0.99]),
+    scale=st.sampled_from([1e-6, 0.3, 1.0, 1e4]),
+    masked=st.sampled_from([None, 0.0, 0.3, 1.0]),
+)
+def test_erroneous_pixels_are_relative_to_the_view(seed, size, threshold, scale, masked):
+    rng = np.random.default_rng(seed)
+    photo = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    image = (photo / 255 + scale * rng.normal(size=(*size, 3))).astype(np.float32)
+    mask = None if masked is None else rng.random(size) < masked
+    view = SimpleNamespace(
+        image=torch.from_numpy(image),
+        photo=torch.from_numpy(photo),
+        mask=None if mask is None else torch.from_numpy(mask),
+    )
+    expected, gap = brute_erroneous(image, photo, mask, threshold)
+    found = erroneous(view, threshold).numpy()
+    # Where the error is all but the threshold, rounding of float32 decides.
+    sure = gap > 1e-5 + 2e-6 / scale
+    assert np.array_equal(found[sure], expected[sure])
+
+
+def test_pixels_that_are_masked_out_are_never_looked_at():
+    image = torch.full((4, 5, 3), torch.nan)
+    mask = torch.zeros(4, 5, dtype=torch.bool)
+    mask[1, 1:4] = True
+    image[1, 1:4] = torch.tensor([0.0, 0.5, 1.0])[:, None]
+    view = SimpleNamespace(image=image, photo=torch.zeros(4, 5, 3, dtype=torch.uint8), mask=mask)
+    assert erroneous(view, 0.1).nonzero().tolist() == [[1, 2], [1, 3]]
+    assert not erroneous(replace_mask(view, torch.zeros_like(mask)), 0.1).any()
+
+
+def replace_mask(view, mask):
+    return SimpleNamespace(image=view.image, photo=view.photo, mask=mask)
+
+
+def test_where_all_pixels_err_alike_none_is_marked():
+    image = torch.full((3, 3, 3), 0.25)
+    view = SimpleNamespace(image=image, photo=torch.zeros(3, 3, 3, dtype=torch.uint8), mask=None)
+    assert not erroneous(view, 0.0).any()
+
+
+# --- which views are rendered
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 10, 100])
+def test_views_are_drawn_evenly_from_all_groups(number):
+    columns = [0] * 7 + [1] * 2 + [2] * 30
+    seen = set()
+    for seed in range(200):
+        drawn = drawn_views(columns, number, np.random.default_rng(seed))
+        assert len(set(drawn)) == len(drawn)
+        found = np.bincount([columns[view] for view in drawn], minlength=3)
+        wanted = [max(1, number // 3 + (group < number % 3)) for group in range(3)]
+        assert found.tolist() == [min(w, m) for w, m in zip(wanted, (7, 2, 30), strict=True)]
+        seen.update(drawn)
+    assert number > 2 or seen == set(range(39))
+
+
+# --- counts
+
+
+def brute_counts(ctx, index, threshold=0.1, mask=None):
+    """[P] erroneous pixels that a primitive is blended in, and how many of them are in doubt."""
+    view = ctx.scene.train_views[index]
+    phase = Phase(ctx.step, training=True, schedule=ctx.schedule)
+    gaussians = ctx.backbone.decode(ctx.parameters, view.camera, phase)
+    drawn = trace(gaussians, view.camera)
+    marked, gap = brute_erroneous(drawn.image, view.photo.image().numpy(), mask, threshold)
+    doubtful = (gap < 1e-4) | (drawn.pixel_gaps < 2e-4)
+    owners = range(len(gaussians)) if gaussians.origin is None else gaussians.origin.tolist()
+    counts, shown = np.zeros(40), np.zeros(40)
+    for i, owner in enumerate(owners):
+        counts[owner] += (drawn.blended[i] & marked & ~doubtful).sum()
+        shown[owner] += drawn.touched[i]
+    return counts, shown > 0, int(doubtful.sum())
+
+
+@pytest.mark.parametrize("rasterizer", ["torch", "numba"])
+@pytest.mark.parametrize("backbone", [Vanilla(), Bright()], ids=["one", "two per primitive"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_counts_are_those_of_brute_force(rasterizer, backbone, masked):
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[2:14, 3:20] = True
+    scene = sample_scene()
+    if masked:
+        views = (replace(v, photo=Shown(v.photo.image(), mask)) for v in scene.views)
+        scene = replace(scene, views=tuple(views))
+    ctx = context(backbone=backbone, rasterizer=rasterizer, scene=scene)
+    method = MultiViewDensityControl(views=VIEWS)
+    state = method.rendered(ctx)
+    assert state.values == {"drawn": [VIEWS]}
+    found = [brute_counts(ctx, i, mask=mask.numpy() if masked else None) for i in range(VIEWS)]
+    expected = np.sum([counts for counts, _, _ in found], axis=0)
+    doubts = sum(doubt for _, _, doubt in found)
+    assert doubts < 12 and (expected > 0).sum() > 20
+    doubts *= 2 if isinstance(backbone, Bright) else 1  # Both may be blended in such a pixel.
+    assert np.abs(state.per_primitive[MARKED][:, 0].numpy() - expected).max() <= doubts
+    shown = np.sum([shown for _, shown, _ in found], axis=0)
+    assert np.array_equal(state.per_primitive[VISITS][:, 0].numpy(), shown)
+    losses = [recorded(ctx, i).loss for i in range(VIEWS)]
+    error = np.sum([c * loss for (c, _, _), loss in zip(found, losses, strict=True)], axis=0)
+    assert state.per_primitive[ERROR][:, 0].numpy() == pytest.approx(error, abs=doubts, rel=1e-5)
+
+
+@pytest.mark.parametrize("regimes", [False, True])
+def test_the_running_count_is_that_of_the_views_that_were_rendered(regimes):
+    ctx = context(step=601)
+    method = MultiViewDensityControl(count="running", share=1.0, regimes=regimes)
+    state = PluginState()
+    for indices in ((0, 5), (3,), (7, 8, 1)):
+        records = tuple(recorded(ctx, index) for index in indices)
+        state = method.counted(replace(ctx, views=records), state)
+    found = {index: recorded(ctx, index) for index in (0, 5, 3, 7, 8, 1)}
+    names = ["far", "near"] if regimes else [""]
+    expected = np.zeros((40, len(names), 3))
+    for index, record in found.items():
+        counts = record.screen.count(erroneous(record, 0.1)).double().numpy()
+        column = names.index(TRAIN[index].regime) if regimes else 0
+        shown = record.screen.radii.numpy() > 0
+        expected[:, column] += np.stack([counts, counts * record.loss, shown], axis=-1)
+    for place, name in enumerate((MARKED, ERROR, VISITS)):
+        assert state.per_primitive[name].numpy() == pytest.approx(expected[..., place], rel=1e-6)
+    seen = method.importance_of(state)
+    visits = np.maximum(expected[..., 2], 1)
+    assert seen.marked.numpy() == pytest.approx(expected[..., 0] / visits, rel=1e-6)
+    assert seen.error.numpy() == pytest.approx(expected[..., 1] / visits, rel=1e-6)
+    assert seen.rank.numpy() == pytest.approx(expected[..., 1] / visits**0.75, rel=1e-6)
+
+
+def test_only_a_share_of_the_steps_counts_but_always_that_of_the_edit():
+    ctx = context(step=601, rng=np.random.default_rng(0))
+    record = recorded(ctx, 0)
+    method = MultiViewDensityControl(count="running", share=0.25)
+    state = PluginState()
+    for _ in range(400):
+        state = method.counted(replace(ctx, views=(record,)), state)
+    visits = float(state.per_primitive[VISITS].max())
+    assert 60 < visits < 140
+    at_edit = replace(ctx, step=600, views=(record,))
+    assert float(method.counted(at_edit, state).per_primitive[VISITS].max()) == visits + 1
+
+
+def test_pixels_are_those_of_the_full_photo_at_any_scale():
+    """A quarter of the pixels count four times each."""
+    ctx = context(rasterizer="numba")
+    record = recorded(ctx, 4, 0.5)
+    assert record.image.shape[:2] == (HEIGHT // 2, WIDTH // 2)
+    method = MultiViewDensityControl(count="running", share=1.0)
+    state = method.counted(replace(ctx, views=(record,)), PluginState())
+    counts = record.screen.count(erroneous(record, 0.1))
+    assert counts.sum() > 0
+    assert torch.equal(state.per_primitive[MARKED][:, 0], 4.0 * counts)
+
+
+def test_renders_are_as_large_as_those_of_the_step():
+    ctx = context(rasterizer="numba")
+    asked = []
+
+    def render(index, scale, outputs, background):
+        asked.append((scale, background))
+        return ctx.render(index, scale, outputs, background)
+
+    views = (replace(recorded(ctx, 4, 0.5), background=torch.full((3,), 0.7)),)
+    MultiViewDensityControl(views=3).rendered(replace(ctx, render=render, views=views))
+    assert [scale for scale, _ in asked] == [0.5] * 3
+    assert all(float(background.mean()) == pytest.approx(0.7) for _, background in asked)
+
+
+# --- what they say
+
+
+counts = st.integers(0, 40)
+
+
+@given(data=st.data(), rows=st.integers(1, 6), regimes=st.integers(1, 3))
+@settings(max_examples=60)
+def test_importance_against_its_formulas(data, rows, regimes):
+    shape = (rows, regimes)
+
+    def draw(values):
+        size = rows * regimes
+        found = data.draw(st.lists(values, min_size=size, max_size=size))
+        return np.array(found).reshape(shape)
+
+    marked, visits = draw(counts).astype(float), draw(st.integers(0, 9)).astype(float)
+    error = marked * draw(st.floats(0.01, 1.0))
+    views = st.lists(st.integers(1, 10), min_size=regimes, max_size=regimes)
+    drawn = data.draw(st.one_of(st.none(), views))
+    tensors = {name: torch.from_numpy(value) for name, value in
+               ((MARKED, marked), (ERROR, error), (VISITS, visits))}  # fmt: skip
+    values = {} if drawn is None else {"drawn": drawn}
+    seen = MultiViewDensityControl().importance_of(PluginState(values, per_primitive=tensors))
+    per = np.maximum(visits if drawn is None else np.array(drawn)[None], 1)
+    assert np.array_equal(seen.above(5.0).numpy(), np.floor(marked / per) > 5)
+    total = (error / per).sum(1)
+    span = total.max() - total.min()
+    expected = (total - total.min()) / span if span > 0 else np.zeros(rows)
+    assert seen.pruning_score.numpy() == pytest.approx(expected)
+
+
+def brute_places(rank, grows):
+    """The best place of each row among those that grow, by counting those before it."""
+    best = []
+    for i in range(len(rank)):
+        places = [
+            sum(
+                grows[j, r] and (rank[j, r] > rank[i, r] or (rank[j, r] == rank[i, r] and j < i))
+                for j in range(len(rank))
+            )
+            for r in range(rank.shape[1])
+            if grows[i, r]
+        ]
+        best.append(min(places, default=np.inf))
+    return -np.array(best, dtype=float)
+
+
+@given(seed=st.integers(0, 2**16), rows=st.integers(0, 12), regimes=st.integers(1, 3))
+def test_the_regimes_take_turns(seed, rows, regimes):
+    rng = np.random.default_rng(seed)
+    rank = rng.integers(0, 5, (rows, regimes)).astype(np.float32)
+    grows = rng.random((rows, regimes)) < 0.6
+    tensor = torch.from_numpy(rank)
+    found = Importance(tensor, tensor, tensor).strength(torch.from_numpy(grows))
+    assert found.tolist() == brute_places(rank, grows).tolist()
+
+
+def test_candidates_are_drawn_one_after_the_other_by_weight():
+    """The order of three of them, against the product of the shares of what is left."""
+    score = torch.tensor([0.0, 0.9, 0.5, 0.5])
+    weight = 1 / (1 - score[:3].double().numpy())
+    candidates = torch.tensor([True, True, True, False])
+    draws = 4_000
+    found = {}
+    rng = np.random.default_rng(0)
+    for _ in range(draws):
+        drawn = some_of(candidates, score, 0.5, rng)  # Two of three.
+        assert not drawn[3]
+        pair = tuple(drawn.nonzero().squeeze(1).tolist())
+        found[pair] = found.get(pair, 0) + 1
+    expected = dict.fromkeys([(0, 1), (0, 2), (1, 2)], 0.0)
+    for first, second in permutations(range(3), 2):
+        share = weight[first] / weight.sum()
+        share *= weight[second] / (weight.sum() - weight[first])
+        expected[tuple(sorted((first, second)))] += share
+    for pair, share in expected.items():
+        assert abs(found[pair] / draws - share) < 4 * np.sqrt(share * (1 - share) / draws)
+
+
+@given(number=st.integers(0, 30), share=st.floats(0.01, 1.0), seed=st.integers(0, 99))
+def test_a_share_of_the_candidates_goes_rounded_up(number, share, seed):
+    rng = np.random.default_rng(seed)
+    candidates = torch.zeros(40, dtype=torch.bool)
+    candidates[rng.permutation(40)[:number]] = True
+    score = torch.from_numpy(rng.random(40)).float()
+    drawn = some_of(candidates, score, share, rng)
+    assert int(drawn.sum()) == ceil(share * number)
+    assert not (drawn & ~candidates).any()
+
+
+def test_the_largest_error_always_goes_first():
+    score = torch.tensor([0.99, 1.0, 0.5, 0.0])
+    for seed in range(50):
+        drawn = some_of(torch.ones(4, dtype=torch.bool), score, 0.25, np.random.default_rng(seed))
+        assert drawn.tolist() == [False, True, False, False]
+
+
+# --- the edit
+
+
+def planted(marked, gradient, absolute, *, drawn=(10,), error=None):
+    """A state with sums of one regime."""
+    column = torch.tensor(marked, dtype=torch.float32)[:, None]
+    ones = torch.ones(len(marked))
+    return PluginState(
+        {"drawn": list(drawn)},
+        per_primitive={
+            "gradient": torch.tensor(gradient),
+            "absolute": torch.tensor(absolute),
+            "renders": ones,
+            MARKED: column,
+            ERROR: column if error is None else torch.tensor(error)[:, None],
+            VISITS: ones[:, None],
+        },
+    )
+
+
+class Planted(MultiViewDensityControl):
+    """Takes the statistics as they are in the state."""
+
+    def observed(self, context, state):
+        return state
+
+
+def few(scales, opacities):
+    n = len(scales)
+    return {
+        "means": torch.arange(3.0 * n).reshape(n, 3).requires_grad_(),
+        "scales": torch.tensor(scales).log()[:, None].repeat(1, 3).requires_grad_(),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1).requires_grad_(),
+        "opacities": torch.logit(torch.tensor(opacities)).requires_grad_(),
+        "f_dc": torch.zeros(n, 1, 3).requires_grad_(),
+        "f_rest": torch.zeros(n, 15, 3).requires_grad_(),
+    }
+
+
+FLOATS = st.sampled_from([0.0, 1e-4, 1.9e-4, 2e-4, 1e-3, 1.2e-3, 5e-3])
+
+
+@given(data=st.data(), rows=st.integers(1, 8))
+@settings(max_examples=60, deadline=None)
+def test_what_grows_against_the_published_rule(data, rows):
+    lists = lambda values: data.draw(st.lists(values, min_size=rows, max_size=rows))  # noqa: E731
+    scales = lists(st.sampled_from([1e-4, 9.9e-4, 1.1e-3, 0.05]))
+    marked, g, ga = lists(st.integers(40, 80)), lists(FLOATS), lists(FLOATS)
+    params = few(scales, [0.5] * rows)
+    edit, _ = Planted().densify(context(params=params), planted(marked, g, ga))
+    expected = set()
+    for i in range(rows):
+        important = marked[i] // 10 > 5
+        small = scales[i] <= 0.001
+        threshold = 2e-4 if small else 1.2e-3
+        # As float32 has them.
+        if important and np.float32(g[i] if small else ga[i]) >= np.float32(threshold):
+            expected.add(i)
+    grown = {
+        i for i in range(rows) if edit.source is not None and edit.source.tolist().count(i) > 1
+    }
+    assert grown == expected
+
+
+def test_where_room_is_short_the_largest_error_per_visit_goes_first():
+    state = planted([90, 80, 99, 100], [1.0] * 4, [1.0] * 4, error=[5.0, 9.0, 7.0, 1.0])
+    params = few([1e-4] * 4, [0.5] * 4)
+    edit, _ = Planted().densify(replace(context(params=params), room=2), state)
+    assert edit.source.tolist() == [0, 1, 2, 3, 1, 2]
+    assert edit.counts["held_back"] == 2
+
+
+def test_half_of_the_usual_candidates_goes_and_the_rest_is_capped():
+    params = few([1e-4] * 7, [0.001, 0.002, 0.003, 0.004, 0.9, 0.79, 0.81])
+    state = planted([0] * 7, [0.0] * 7, [0.0] * 7, error=[0.0, 1.0, 0.9999, 0.0, 0.0, 0.0, 0.0])
+    edit, _ = Planted().densify(context(params=params), state)
+    assert edit.source.tolist() == [0, 3, 4, 5, 6]  # The two with a large share in the error go.
+    assert edit.counts["pruned"] == 2 and edit.counts["capped"] == 2
+    new = apply_to_parameters(edit, Vanilla().blocks(), params)
+    opacities = torch.sigmoid(new["opacities"].detach())
+    assert opacities.tolist() == pytest.approx([0.001, 0.004, 0.8, 0.79, 0.8], rel=1e-4)
+    moments = apply_to_moment(edit, "opacities", torch.ones(7))
+    assert moments.tolist() == [1, 1, 0, 1, 0]  # What is not capped keeps its moments.
+
+
+def test_the_cap_counts_what_the_filter_of_the_backbone_leaves():
+    backbone = MipSplatting()
+    params = parameters_of(backbone)
+    with torch.no_grad():
+        params["opacities"][:] = 4.0
+    state = planted([0] * 40, [0.0] * 40, [0.0] * 40)
+    edit, _ = Planted().densify(context(backbone=backbone, params=params), state)
+    new = backbone.prepare(
+        apply_to_parameters(edit, backbone.blocks(), params),
+        sample_scene(),
+        Phase(600, True, Schedule.for_run(30_000)),
+    )
+    phase = Phase(600, True, Schedule.for_run(30_000))
+    drawn = backbone.decode(new, TRAIN[0].camera, phase).opacities
+    assert float(drawn.detach().max()) <= 0.8 + 1e-5
+
+
+def test_no_cap_and_full_pruning_are_those_of_adc():
+    params = few([1e-4] * 4, [0.001, 0.002, 0.9, 0.5])
+    state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
+    edit, _ = Planted(cap_opacity=1, prune_share=1).densify(context(params=params), state)
+    assert edit.source.tolist() == [2, 3] and not edit.values
+
+
+def test_opacities_are_reset_as_published_and_a_reset_wins_over_the_cap():
+    params = few([1e-4] * 4, [0.5, 0.6, 0.9, 0.95])
+    state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
+    edit, _ = Planted().densify(context(params=params, step=3000), state)
+    new = apply_to_parameters(edit, Vanilla().blocks(), params)
+    assert torch.sigmoid(new["opacities"]).max().item() == pytest.approx(0.01)
+    assert "capped" not in edit.counts
+
+
+@pytest.mark.parametrize(("total", "every"), [(30_000, 500), (12_000, 200), (3_000, 100)])
+def test_edits_are_as_far_apart_as_published(total, every):
+    schedule = Schedule.for_run(total)
+    window = MultiViewDensityControl().window(schedule)
+    assert (window.densify_from, window.densify_every) == (500, every)
+    assert window.densify_until == total // 2
+    larger = MultiViewDensityControl(interval=1 / 300).window(Schedule.for_run(30_000))
+    assert larger.densify_every == 100
+
+
+@pytest.mark.parametrize("total", [98, 240, 700])
+def test_short_runs_have_edits_where_they_are_asked_for(total):
+    counting = Counting("views", ViewPlan((1,)), 12, fewest_edits=6)
+    window = MultiViewDensityControl().window(Schedule.for_run(total, counting=counting))
+    assert window.edits() >= 6
+    without = replace(counting, fewest_edits=0)
+    assert MultiViewDensityControl().window(Schedule.for_run(total, counting=without)).edits() == 0
+
+
+# --- late prunings
+
+
+def late(step, state, schedule=None, **options):
+    ctx = context(step=step, rasterizer="numba")
+    ctx = ctx if schedule is None else replace(ctx, schedule=schedule)
+    return MultiViewDensityControl(**options).densify(ctx, state)
+
+
+def test_late_prunings_come_once_at_their_shares_of_the_run():
+    state, times = EMPTY_STATE, []
+    for step in (15_000, 17_999, 18_000, 18_001, 20_999, 21_000, 24_000, 26_999, 27_000, 30_000):
+        edit, state = late(step, state)
+        if edit.source is not None:
+            times.append(step)
+    assert times == [18_000, 21_000, 24_000, 27_000]
+    assert state.values == {"late": 4}
+
+
+def test_late_prunings_remove_what_is_faint_or_errs_the_most():
+    ctx = context(step=18_000, rasterizer="numba")
+    edit, _ = MultiViewDensityControl(views=VIEWS).densify(ctx, EMPTY_STATE)
+    seen = MultiViewDensityControl(views=VIEWS)
+    score = seen.importance_of(seen.rendered(ctx)).pruning_score
+    opacities = torch.sigmoid(ctx.parameters["opacities"].detach())
+    expected = ((opacities >= 0.1) & (score <= 0.9)).nonzero().squeeze(1)
+    assert edit.source.tolist() == expected.tolist()
+    assert 0 < edit.counts["pruned"] == 40 - len(expected)
+    assert float(score[opacities >= 0.1].max()) > 0.9
+
+
+def test_late_prunings_may_be_left_out_and_are_in_runs_without_density_control():
+    assert late(18_000, EMPTY_STATE, late_prunings=())[0].is_empty
+    short = Schedule.for_run(600)
+    assert not short.grows
+    assert late(590, EMPTY_STATE, short)[0].is_empty
+
+
+def test_a_run_that_becomes_shorter_prunes_once_for_all_that_it_passed():
+    longer = Schedule.for_run(30_000)
+    _, state = late(17_000, EMPTY_STATE, longer)
+    shorter = replace(longer, length=20_000, total=20_000)
+    edit, state = late(17_001, state, shorter)
+    assert edit.source is not None and state.values == {"late": 3}
+    edit, state = late(17_002, state, replace(longer, length=90_000))
+    assert edit.is_empty and state.values == {"late": 3}
+
+
+def test_options_that_do_nothing_are_named():
+    idle = lambda **options: set(MultiViewDensityControl(**options).idle_options(None))  # noqa: E731
+    assert idle() == {"share"}
+    assert idle(count="running") == set()
+    assert idle(count="running", late_prunings=()) == {"views", "late_opacity", "late_score"}
+
+
+# --- planted errors
+
+
+def with_photos(params, backbone, wrong):
+    """The scene whose photos are the renders themselves, but for the pixels of `wrong`."""
+    scene = sample_scene()
+    ctx = context(backbone=backbone, params=params, rasterizer="numba")
+    views = list(scene.views)
+    for place, index in enumerate(scene.train):
+        with torch.no_grad():
+            image = ctx.render(place).image
+        photo = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+        off = wrong(views[index])
+        photo[off] = 255 - photo[off]
+        views[index] = replace(views[index], photo=Shown(photo))
+    return replace(scene, views=tuple(views))
+
+
+def grown_by(method, ctx, state):
+    """What grows where every gradient is large."""
+    ones = {name: torch.ones(40) for name in ("gradient", "absolute", "renders")}
+    state = PluginState(state.values, per_primitive={**ones, **state.per_primitive})
+    edit, _ = method.densify(ctx, state)
+    source = [] if edit.source is None else edit.source.tolist()
+    return {i for i in range(40) if source.count(i) > 1}
+
+
+def counted(method, ctx):
+    """The counts of all training views, by either way."""
+    if method.count == "render":
+        return method.rendered(ctx)
+    records = tuple(recorded(ctx, index) for index in range(VIEWS))
+    return method.counted(replace(ctx, views=records), PluginState())
+
+
+@pytest.mark.parametrize("count", ["render", "running"])
+def test_what_errs_grows_and_what_is_right_does_not(count):
+    """Photos that are wrong where one Gaussian is blended: it grows, what never meets it not."""
+    backbone = Vanilla()
+    params = backbone.create(sample_scene(), np.random.default_rng(0))
+    with torch.no_grad():
+        params["means"] *= 3.0
+        params["scales"] -= 4.0
+        params["opacities"][:] = 2.0
+    phase = Phase(600, True, Schedule.for_run(30_000))
+    blended = {
+        view.name: trace(backbone.decode(params, view.camera, phase), view.camera).blended
+        for view in sample_scene().views
+    }
+    chosen = 7
+
+    def wrong(view):
+        off = blended[view.name][chosen].copy()
+        off[0, 0] = True  # In a view without errors the roundings would be the largest ones.
+        return torch.from_numpy(off)
+
+    scene = with_photos(params, backbone, wrong)
+    ctx = context(params=params, scene=scene, rasterizer="numba")
+    method = Planted(count=count, share=1.0, views=VIEWS, importance=0)
+    grown = grown_by(method, ctx, counted(method, ctx))
+    meets = {
+        i for i in range(40) if any((blended[v.name][i] & wrong(v).numpy()).any() for v in TRAIN)
+    }
+    assert chosen in grown and grown <= meets
+    assert len(meets) < 30
+
+
+@pytest.mark.parametrize("count", ["render", "running"])
+def test_the_errors_of_one_regime_are_not_averaged_away(count):
+    """Near photos are wrong, far ones in one pixel: the mean of all says less than near ones."""
+    params = parameters_of(backbone := Vanilla())
+
+    def wrong(view):
+        off = torch.full((HEIGHT, WIDTH), view.regime == "near")
+        off[0, 0] = True
+        return off
+
+    scene = with_photos(params, backbone, wrong)
+    ctx = context(params=params, scene=scene, rasterizer="numba")
+    marked = {}
+    for regimes in (False, True):
+        method = Planted(count=count, share=1.0, views=VIEWS, regimes=regimes)
+        marked[regimes] = method.importance_of(counted(method, ctx)).marked
+    mean, far, near = marked[False][:, 0], *marked[True].unbind(1)
+    assert float(far.max()) <= 1.0 < float(mean.max()) < float(near.max())
+    between = float(((mean + near) / 2).max())
+    grown = {}
+    for regimes in (False, True):
+        method = Planted(count=count, share=1.0, views=VIEWS, regimes=regimes, importance=between)
+        grown[regimes] = grown_by(method, ctx, counted(method, ctx))
+    assert not grown[False] and grown[True]
+
+
+# --- runs
+
+
+def run_of(views=1, backbone="vanilla", rasterizer="numba", steps=9, **options):
+    config = RunConfig(
+        steps=60, events="steps", densify_from=1, densify_until=30, densify_every=3,
+        sampler=ComponentChoice(name="random"), views_per_step=views,
+        backbone=ComponentChoice(name=backbone), rasterizer=ComponentChoice(name=rasterizer),
+        densifier=ComponentChoice(name="multiview", **options), exposure={"name": "gain"},
+    )  # fmt: skip
+    state = first_state(setup := assemble(config, sample_scene(), "none"))
+    return setup, state, [timed_step(setup, state) for _ in range(steps)]
+
+
+EAGER = {"importance": 0, "grad_threshold": 1e-9, "abs_threshold": 1e-9}
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+@pytest.mark.parametrize("count", ["render", "running"])
+@pytest.mark.parametrize("backbone", ["vanilla", "mip", "pixel", "analytic", "distance"])
+def test_runs_grow_for_any_k_and_every_backbone_of_gaussians(views, count, backbone):
+    _, state, records = run_of(views, backbone, count=count, regimes=views > 1, **EAGER)
+    edits = [r.counts.get("cloned", 0) + r.counts.get("split", 0) > 0 for r in records]
+    assert edits == [step % 3 == 0 for step in range(1, 10)]
+    assert all(tensor.isfinite().all() for tensor in state.parameters.values())
+
+
+def test_renders_are_counted_and_the_running_variant_needs_none():
+    for count, more in (("render", 10 * 3), ("running", 0)):
+        _, state, _ = run_of(count=count, views=1, **EAGER)
+        assert state.counters.views == 9 + min(more, VIEWS * 3)
+
+
+def test_nothing_of_a_view_outlives_its_step():
+    """The count keeps a view's tile lists alive: those of one step at most."""
+    setup, state, _ = run_of(2, count="running", share=1.0, steps=4, **EAGER)
+    gc.collect()
+    before = sum(type(each) is TileLists for each in gc.get_objects())
+    for _ in range(6):
+        timed_step(setup, state)
+    gc.collect()
+    after = sum(type(each) is TileLists for each in gc.get_objects())
+    assert after <= before
+    held = state.states["densifier"].per_primitive
+    primitives = state.primitives(setup)
+    assert sum(tensor.nbytes for tensor in held.values()) <= 6 * 4 * primitives
+
+
+def test_a_rasterizer_without_the_count_is_refused():
+    selection = assemble(
+        RunConfig(steps=10, densifier=ComponentChoice(name="multiview")), sample_scene(), "none"
+    ).selection
+    from crossgrad_core.contract.objections import objections_to
+
+    class Plain(type(selection.rasterizer)):
+        provides = frozenset({"abs_gradient"})
+
+    reasons = objections_to(replace(selection, rasterizer=Plain()))
+    assert any("needs the screen statistics count" in reason for reason in reasons)
+
+
+def test_screens_without_a_count_are_the_rasterizer_s_fault():
+    ctx = context()
+    record = replace(recorded(ctx, 0), screen=Screen(torch.ones(40, dtype=torch.int32)))
+    method = MultiViewDensityControl(count="running", share=1.0)
+    with pytest.raises(RuntimeError, match="gave none"):
+        method.counted(replace(ctx, views=(record,)), PluginState())
+
+
+def test_a_plan_takes_its_scores_from_the_parents():
+    """Pruning looks at children, too; they have their parent's share in the error."""
+    plan = Plan(torch.tensor([0, 1, 1]), torch.tensor([False, True, True]), torch.zeros(3).bool())
+    params = few([1e-4, 1e-4], [0.5, 0.001])
+    state = planted([0, 0], [0.0, 0.0], [0.0, 0.0], error=[0.0, 1.0])
+    gone = Planted(prune_share=1.0).pruned(context(params=params), state, plan, {})
+    assert gone.tolist() == [False, True, True]
