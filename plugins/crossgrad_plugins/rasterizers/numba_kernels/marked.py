@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import (
     LANES,
-    as_negative,
     bits,
     broadcast,
     count_bits,
@@ -64,7 +63,7 @@ _AHEAD = 8
 
 @device
 def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left: int) -> np.uint64:
-    """Writes the transmittances of a tile: 1 in marked pixels, -1 (finished) in all others.
+    """Writes the transmittances of a tile: 1 in marked pixels, -1 in all others.
 
     Returns:
         The segments that hold a marked pixel, as bits.
@@ -115,9 +114,9 @@ def _count(
         alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
         before = load(state, segment * LANES)
         after = before - alpha * before
-        blended = after >= load(constants, STOPPED)
-        store(state, segment * LANES, where(blended, after, as_negative(before)))
-        pixels += count_bits(bits(touched & blended))
+        # It only falls: a pixel that has stopped, or is not marked, is never blended again.
+        store(state, segment * LANES, after)
+        pixels += count_bits(bits(touched & (after >= load(constants, STOPPED))))
     return pixels
 
 
