@@ -188,8 +188,11 @@ class RunConfig(BaseModel):
             "them, or of all and an extra one that trains nothing. Default: all.",
         )
     )
-    rate_factor: Annotated[float, Flag("F", TRAINING)] = Field(
-        1.0, gt=0, description="Multiplies all learning rates of the backbone. Default: 1."
+    rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
+        None,
+        gt=0,
+        description="Multiplies all learning rates of the backbone. Default: 1 from 30,000 steps "
+        "on and with --preset inria, more in shorter runs.",
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",

@@ -38,10 +38,11 @@ from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
+from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.schedules import counting_of, growth_note, schedule_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.steady import notes_on
+from crossgrad_core.training.steady import notes_on as at_the_end
 from crossgrad_core.wording import listed, plural
 
 _LOG = logging.getLogger(__name__)
@@ -173,7 +174,13 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     )
     # The length of a run within a budget is not known yet.
     growth = growth_note(setup) if config.seconds is None else ()
-    added = (*_linear_note(setup), *idle_note(setup), *notes_on(config), *growth)
+    added = (
+        *_linear_note(setup),
+        *idle_note(setup),
+        *at_the_end(config),
+        *of_rates(config, setup.schedule),
+        *growth,
+    )
     return replace(setup, notes=(*setup.notes, *added))
 
 

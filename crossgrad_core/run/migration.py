@@ -54,8 +54,9 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if version == _FIRST and "reading" in rest:
         rest["reading"] = _reading(rest["reading"], rest.get("scene"))
     if "revisions" in rest:
-        # What a run wrote: it goes on, and is repeated, in steps and with the columns that it had.
+        # What a run wrote goes on, and is repeated, in its units, at its rates, with its columns.
         rest.setdefault("events", "steps")
+        rest.setdefault("rate_factor", 1.0)
         rest.setdefault("metrics", [{"name": name} for name in METRICS_OF_0_1.split("+")])
     return rest
 

@@ -1,5 +1,6 @@
 """Controls of learning rates and of density statistics: what they change, and nothing else."""
 
+from dataclasses import replace
 from math import prod, sqrt
 
 import numpy as np
@@ -38,7 +39,7 @@ def trained(number, *plugins, **settings):
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 @pytest.mark.parametrize("step", [1, 20, 40])
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
-    plain = assembled(backbone={"name": backbone})
+    plain = assembled(backbone={"name": backbone}, rate_factor=1.0)
     doubled = assembled(backbone={"name": backbone}, rate_factor=2.0)
     rates = {
         name: block.lr.at(step / 40) for block in plain.trained_blocks for name in block.tensors
@@ -47,6 +48,40 @@ def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
     assert rates_at(doubled, step) == {name: 2.0 * rate for name, rate in rates.items()}
     assert means_rate_at(doubled, step) == 2.0 * means_rate_at(plain, step)
     assert rule_at(doubled, step) == Rule()
+
+
+@pytest.mark.parametrize(
+    ("settings", "factor"),
+    [
+        ({"steps": 3_750}, 2.0),
+        ({"steps": 30_000}, 1.0),
+        ({"steps": 100_000}, 1.0),
+        ({"steps": 5}, 4.5),
+        ({"steps": 3_750, "views": 2}, 2.0),
+        ({"max_views": 7_500, "views": 2, "steps": None}, 2.0),
+        ({"steps": 3_750, "rate_factor": 0.5}, 0.5),
+        ({"steps": 3_750, "preset": "inria"}, 1.0),
+        ({"steps": 3_750, "schedule": "absolute"}, 1.0),
+        ({"steps": 9, "schedule": "absolute", "reference": 3_750, "views": 1}, 2.0),
+        ({"steps": 9, "schedule": "absolute", "reference": 7_500, "views": 2}, 2.0),
+    ],
+)
+def test_a_shorter_run_has_larger_rates(settings, factor):
+    setup = assembled(**settings)
+    (published,) = (block.lr for block in setup.blocks if block.name == "opacities")
+    assert rates_at(setup, 1)["opacities"] == pytest.approx(factor * published.at(0), rel=1e-9)
+    told = [note for note in setup.notes if "learning rates" in note]
+    assert len(told) == (factor != 1.0 and "rate_factor" not in settings)
+    assert all(note.endswith(f" times {factor:.3g}") for note in told)
+
+
+def test_where_the_clock_decides_the_rates_follow_its_plan():
+    setup = assembled(steps=None, seconds=60.0)
+    (note,) = (note for note in setup.notes if "learning rates" in note)
+    assert note.endswith(" times (30,000 / steps)^(1/3), at most 4.5")
+    shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
+    published, planned = (rates_at(each, 1)["opacities"] for each in (setup, shorter))
+    assert planned == pytest.approx(2.0 * published)
 
 
 def test_a_first_step_goes_as_much_farther():

@@ -63,6 +63,11 @@ def test_the_configuration_of_a_run_of_0_1_repeats_it(old, scene, tmp_path):
     assert written == {**again.summary["config"]}
 
 
+def test_a_run_of_0_1_keeps_its_units_and_rates(old):
+    kept = read_config(old)
+    assert (kept["events"], kept["rate_factor"]) == ("steps", 1.0)
+
+
 def test_a_stopped_run_of_0_1_goes_on(old):
     config = old / "config.yaml"
     config.write_text(config.read_text().replace("steps: 20", "steps: 24"))
