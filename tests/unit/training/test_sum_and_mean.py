@@ -29,6 +29,8 @@ PAIRS = [
     ("pixel", "pixel"),
     ("vanilla", "absgrad"),
     ("distance", "none"),
+    ("pixel", "multiview"),
+    ("vanilla", "multiview-gate"),
 ]
 
 
