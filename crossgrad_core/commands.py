@@ -7,7 +7,7 @@ models and components) in the modules that do the work. What is listed here keep
 a minor version; see docs/plugins.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -31,21 +31,21 @@ from crossgrad_core.system.writability import check_file, check_folder
 from crossgrad_core.wording import did_you_mean, listed, plural, sentences, singular
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from crossgrad_core.config import ComponentChoice, RunConfig
-    from crossgrad_core.contract.blocks import Block
-    from crossgrad_core.contract.gradients import SeparateGradients
     from crossgrad_core.contract.scene import Scene
+    from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
     from crossgrad_core.run.assemble import assemble
+    from crossgrad_core.run.opening import opened as open_run
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered
+    from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.frozen import view_gradients
     from crossgrad_core.training.model import model_of
     from crossgrad_core.training.setup import Setup
+    from crossgrad_core.training.start import first_state as begin
     from crossgrad_core.training.state import TrainState
 
 __all__ = [
@@ -135,12 +135,16 @@ _LATE: Final = {
     "TrainState": "training.state",
     "TrainingFailedError": "training.failure",
     "assemble": "run.assemble",
+    "begin": "training.start:first_state",
     "find_runs": "run.results.reading",
+    "gathered": "gradients.separate:DenseGradients",
     "layered": "run.settings",
     "model_of": "training.model",
+    "open_run": "run.opening:opened",
     "panels_of": "run.results.panel_layout",
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
+    "read_settings": "system.yaml_values:read_mapping",
     "view_gradients": "training.frozen",
 }
 
@@ -160,22 +164,6 @@ def names(slot: str) -> list[str]:
         KeyError: There is no such slot.
     """
     return list(entries(slot))
-
-
-def read_settings(path: Path, what: str, todo: str) -> dict[str, Any]:
-    """The mapping in a YAML file, read as configuration files are.
-
-    Args:
-        path: The file.
-        what: What cannot be read, should it be so, such as `the grid`.
-        todo: What to do about it.
-
-    Raises:
-        UserError: The file is missing, not YAML, or holds something else than a mapping.
-    """
-    from crossgrad_core.system.yaml_values import read_mapping
-
-    return read_mapping(path, what, todo)
 
 
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
@@ -339,13 +327,6 @@ def affordable_steps(setup: "Setup", seconds: float) -> int:
         raise TrainingFailedError(str(error)) from error
 
 
-def begin(setup: "Setup") -> "TrainState":
-    """The state before the first step."""
-    from crossgrad_core.training.start import first_state
-
-    return first_state(setup)
-
-
 def take_steps(setup: "Setup", state: "TrainState") -> None:
     """Trains to the end of the schedule without a folder: nothing is evaluated or saved.
 
@@ -359,39 +340,6 @@ def take_steps(setup: "Setup", state: "TrainState") -> None:
     from crossgrad_core.training.stopper import Stopper
 
     train(setup, state, _NoFolder(), Stopper())
-
-
-def open_run(
-    folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
-) -> "tuple[Setup, TrainState]":
-    """A finished or stopped run and its newest state, to look at; it may be training meanwhile.
-
-    Args:
-        folder: The run's folder.
-        settings: Only `device` and `threads` may differ from the run's own.
-        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
-
-    Raises:
-        UserError: It is no run, it has no checkpoint, a setting would change the training, or the
-            scene is another one.
-    """
-    from crossgrad_core.run.opening import opened
-
-    return opened(folder, settings, -1, accept_scene=accept_scene)
-
-
-def gathered(
-    per_view: "Sequence[Mapping[str, Tensor | None]]", blocks: "tuple[Block, ...]"
-) -> "SeparateGradients":
-    """The gradients of K views as operators get them: Gramians, overlaps, weighted sums.
-
-    Args:
-        per_view: Of each view, tensor name -> gradient or None; they stay as they are.
-        blocks: The blocks that the tensors belong to.
-    """
-    from crossgrad_core.gradients.separate import DenseGradients
-
-    return DenseGradients(per_view, blocks)
 
 
 class _NoFolder:

@@ -57,9 +57,8 @@ from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.poses import footprint_of, radial_distances
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
-from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scales import octave
 from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule

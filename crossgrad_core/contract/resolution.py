@@ -1,14 +1,26 @@
 """The resolution slot: at which scale the views of a step are rendered and compared."""
 
 from abc import abstractmethod
+from math import log2
 from typing import ClassVar
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import ScaleContext, Scaled
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 
 STATE = "resolution"
+
+
+def octave(scale: float) -> int:
+    """The power of two nearest to a scale: 0 at full size, -1 at half of it.
+
+    Reducing a photo takes detail away, and the loss falls with it. Losses of one octave compare;
+    a running loss begins anew where the octave changes.
+    """
+    return round(log2(scale))
 
 
 class Resolution(Component):
@@ -20,6 +32,24 @@ class Resolution(Component):
     """
 
     slot: ClassVar[str] = "resolutions"
+
+    def fitted_to(self, scene: Scene) -> "Resolution":
+        """This resolution with what it measures of the scene; by default as it is.
+
+        It is written to config.yaml, so that a run which goes on asks that one.
+        """
+        return self
+
+    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+        """What to note about the scales of a run with this schedule; asked anew as it changes."""
+        return ()
+
+    def pixels(self, schedule: Schedule, step: int) -> float:
+        """Pixels that all steps up to and including this one render, in photos of full size.
+
+        Budgets of seconds plan with them. By default every view has its full size.
+        """
+        return schedule.pace.views(step)
 
     @abstractmethod
     def scales(

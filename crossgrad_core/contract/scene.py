@@ -165,12 +165,12 @@ class Scene:
     point_sizes: NDArray[np.float64] | None = None
     point_opacities: NDArray[np.float64] | None = None
 
-    @property
+    @cached_property
     def train_views(self) -> tuple[View, ...]:
         """The training views, in the order that samplers index."""
         return tuple(self.views[i] for i in self.train)
 
-    @property
+    @cached_property
     def test_views(self) -> tuple[View, ...]:
         """The held-out views."""
         return tuple(self.views[i] for i in self.test)

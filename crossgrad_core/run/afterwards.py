@@ -57,7 +57,7 @@ class How:
         """The run's setup and its newest state."""
         given = {"device": self.device, "threads": self.threads}
         machine = {name: value for name, value in given.items() if value is not None}
-        return opened(folder, machine, -1, accept_scene=self.accept_scene)
+        return opened(folder, machine, accept_scene=self.accept_scene)
 
 
 #: On the run's own device, with all threads and its own scene.

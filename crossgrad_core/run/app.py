@@ -46,7 +46,7 @@ from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
 from crossgrad_core.training.photo_parameters import known_starts
-from crossgrad_core.training.schedules import growth_note, schedule_of
+from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, warm_up
 from crossgrad_core.training.state import TrainState
@@ -204,12 +204,12 @@ def with_defaults(config: RunConfig) -> RunConfig:
 
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
-    steps, note = steps_for(setup, seconds)
+    steps, note, share = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
     config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
-    setup = replace(setup, config=config, schedule=schedule)
-    return replace(setup, notes=(*setup.notes, note, *growth_note(setup)))
+    setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
+    return replace(setup, notes=(*setup.notes, note, *notes_on_length(setup)))
 
 
 @contextmanager

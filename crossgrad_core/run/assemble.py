@@ -40,7 +40,8 @@ from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.schedules import counting_of, growth_note, schedule_of
+from crossgrad_core.training.scaled_photos import ScaledPhotos
+from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on as at_the_end
 from crossgrad_core.wording import listed, plural
@@ -171,15 +172,17 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         schedule=schedule_of(config, selection.densifier, steps, counting),
         device=choose_device(config.device),
         notes=tuple(notes),
+        # At half the size photos take a quarter of the memory.
+        scaled_photos=ScaledPhotos(config.reading.cache_mib // 4),
     )
     # The length of a run within a budget is not known yet.
-    growth = growth_note(setup) if config.seconds is None else ()
+    timed = notes_on_length(setup) if config.seconds is None else ()
     added = (
         *_linear_note(setup),
         *idle_note(setup),
         *at_the_end(config),
         *of_rates(config, setup.schedule),
-        *growth,
+        *timed,
     )
     return replace(setup, notes=(*setup.notes, *added))
 
@@ -272,7 +275,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         loss=_built(Loss, config.loss),
         exposure=fitted.exposure,
         start=_built(Start, config.start),
-        resolution=_built(Resolution, config.resolution),
+        resolution=_built(Resolution, config.resolution).fitted_to(scene),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
         names=names,

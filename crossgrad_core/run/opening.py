@@ -96,18 +96,13 @@ def require_checkpoint(folder: Path) -> None:
 
 
 def opened(
-    folder: Path,
-    settings: Mapping[str, Any],
-    verbosity: int = 0,
-    *,
-    accept_scene: bool = False,
+    folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
 ) -> tuple[Setup, TrainState]:
-    """A run's setup and its newest state, to look at; the run may be training meanwhile.
+    """A finished or stopped run and its newest state, to look at; it may be training meanwhile.
 
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
-        verbosity: -1 quiet, 0 normal, 1 verbose.
         accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
 
     Raises:
@@ -116,7 +111,7 @@ def opened(
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
-    return _from(folder, settings, verbosity, check)
+    return _from(folder, settings, -1, check)
 
 
 def continued(

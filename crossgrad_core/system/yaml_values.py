@@ -109,15 +109,15 @@ def read_yaml(text: str) -> object:
 
 
 def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
-    """The settings in a YAML file; none where it is empty.
+    """The mapping in a YAML file, read as configuration files are; none where it is empty.
 
     Args:
         path: The file.
-        what: What cannot be read, should it be so, such as `the configuration file`.
+        what: What cannot be read, should it be so, such as `the grid`.
         todo: What to do about it.
 
     Raises:
-        UserError: The file is missing, not YAML, or holds something else than settings.
+        UserError: The file is missing, not YAML, or holds something else than a mapping.
     """
     try:
         settings = read_yaml(path.read_bytes()[: MOST_BYTES + 1].decode("utf-8-sig"))

@@ -1,11 +1,13 @@
 """Contract checks of resolutions."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from crossgrad_core.contract.contexts import Draw, ScaleContext, StepRecord
 from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
@@ -92,10 +94,20 @@ def old_states_stay_untouched(make: Make[Resolution]) -> None:
         require(same_state(old, kept), "scales changes the state that it was given")
 
 
+def pixels_add_up(make: Make[Resolution]) -> None:
+    """Steps of one view render some pixels, and no more than the view has in full size."""
+    resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
+    for before, after in pairwise((0, *_STEPS)):
+        pixels = resolution.pixels(schedule, after) - resolution.pixels(schedule, before)
+        told = f"pixels() grows by {pixels} from step {before} to step {after}, each of one view"
+        require(0.0 < pixels <= after - before + 1e-6 * after, told)
+
+
 RESOLUTION_CHECKS: tuple[Check[Resolution], ...] = (
     *COMPONENT_CHECKS,
     every_view_has_a_scale,
     same_seed_same_scales,
     resumes_exactly,
     old_states_stay_untouched,
+    pixels_add_up,
 )

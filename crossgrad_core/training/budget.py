@@ -9,7 +9,7 @@ from typing import Protocol
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.training.clock import ClockKind
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.schedules import growth_note, schedule_of
+from crossgrad_core.training.schedules import growth_note, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import TrainState
@@ -28,34 +28,48 @@ COUNTED_EDITS = 5
 LOOK_SHARE = 0.02
 #: A length that is off by a smaller share of what is left stays.
 TOLERANCE = 0.02
+#: A step that no run reaches.
+_NEVER = 10**9
 #: Share of the newest stretch in the smoothed cost of a step. Views differ, and other programs
 #: come and go.
 SMOOTHING = 0.25
 
 
-def steps_for(setup: Setup, seconds: float) -> tuple[int, str]:
+def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     """How many steps fit into `seconds` of training by the run's clock, and on what evidence.
 
     Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
+
+    Returns:
+        The steps, a note, and the run's `pixel_share`.
     """
     _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
-    state = first_state(probed)
-    timed_step(probed, state)
-    kind, start, steps, taken = setup.config.clock, state.clock.copy(), 0, 0.0
-    while steps < PROBE_STEPS or taken < PROBE_SHARE * seconds:
-        timed_step(probed, state)
-        steps += 1
+    state, pace, share = first_state(probed), probed.schedule.pace, setup.pixel_share
+    steps, each = _probed(probed, state, seconds)
+    note = f"{steps} probed steps took {each * pace.at(1) * 1000:.1f} ms each"
+    pixels = setup.selection.resolution.pixels(probed.schedule, 1) / pace.at(1)
+    if pixels < 1.0:
+        first, state.step = each, _NEVER - _NEVER // 100
+        steps, each = _probed(probed, state, seconds)
+        note += f", {steps} at full size {each * pace.at(_NEVER) * 1000:.1f} ms"
+        share = min(1.0, max(0.0, (1.0 - first / each) / (1.0 - pixels)))
+    measured = replace(setup, pixel_share=share)
+    total = _fitting(lambda steps: _cost(measured, steps), seconds / each)
+    unit = " of CPU time" if setup.config.clock == "cpu" else ""
+    text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
+    return total, f"{text}the length follows the clock as the run goes", share
+
+
+def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
+    """Steps that were taken on from a state, and the training seconds of a view in them."""
+    timed_step(setup, state)
+    kind, start, first, taken = setup.config.clock, state.clock.copy(), state.step, 0.0
+    while state.step - first < PROBE_STEPS or taken < PROBE_SHARE * seconds:
+        timed_step(setup, state)
         taken = state.clock.trained(kind) - start.trained(kind)
-    # The probe's first step is the one before those that count.
-    views = _views(probed.schedule, 1, steps + 1)
-    total = _fitting(lambda steps: _cost(setup, steps), seconds * views / taken)
-    unit = " of CPU time" if kind == "cpu" else ""
-    note = (
-        f"{total} steps planned for {seconds:g} s{unit}: {steps} probed steps took "
-        f"{taken / steps * 1000:.1f} ms each; the length follows the clock as the run goes"
-    )
-    return total, note
+    pace = setup.schedule.pace
+    return state.step - first, taken / (pace.views(state.step) - pace.views(first))
 
 
 class Length(Protocol):
@@ -120,7 +134,7 @@ class Timed:
         """The setup with the length that now fits; its configuration says so."""
         # Of a view, as a step may have another number of them later.
         seconds = state.clock.trained(self._kind) - self._clock
-        newest = seconds / _views(setup.schedule, self._step, state.step)
+        newest = seconds / _work(setup, setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
         self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
@@ -145,8 +159,9 @@ def seconds_ahead(setup: Setup, step: int, each: float) -> float:
         each: Seconds that a step takes now.
     """
     schedule = setup.schedule
-    views = _views(schedule, step, schedule.total) / schedule.pace.at(step)
-    return views * each * _growth(setup, schedule, step)
+    now = _work(setup, schedule, max(0, step - 1), max(1, step))
+    steps = _work(setup, schedule, step, schedule.total) / now
+    return steps * each * _growth(setup, schedule, step)
 
 
 def lengthened(setup: Setup, step: int, total: int) -> Setup:
@@ -167,9 +182,9 @@ def caught_up(setup: Setup, step: int) -> Setup:
 
 def _with_notes(setup: Setup, instead_of: Setup) -> Setup:
     """The setup with the notes on its length in place of those that were true before."""
-    gone = {*growth_note(instead_of), *_length_note(instead_of)}
+    gone = {*notes_on_length(instead_of), *_length_note(instead_of)}
     kept = (note for note in setup.notes if note not in gone)
-    return replace(setup, notes=(*kept, *growth_note(setup), *_length_note(setup)))
+    return replace(setup, notes=(*kept, *notes_on_length(setup), *_length_note(setup)))
 
 
 def _length_note(setup: Setup) -> tuple[str, ...]:
@@ -194,15 +209,14 @@ def _told(before: Setup, after: Setup) -> Setup:
 
 def _without_edits(schedule: Schedule) -> Schedule:
     """A schedule whose steps cost what most do: statistics, all SH bands and levels, no edits."""
-    never = 10**9
     return replace(
         schedule,
-        total=never,
+        total=_NEVER,
         sh_interval=1,
         coarse_until=0,
         densify_from=0,
-        densify_until=never,
-        densify_every=never,
+        densify_until=_NEVER,
+        densify_every=_NEVER,
         reset_every=None,
     )
 
@@ -212,21 +226,24 @@ def _schedule_of(setup: Setup, steps: int) -> Schedule:
     return schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
 
 
-def _views(schedule: Schedule, after: int, until: int) -> int:
-    """Views drawn by the steps after one and up to another one."""
-    return schedule.pace.views(until) - schedule.pace.views(after)
+def _work(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
+    """Expected cost of the steps after one and up to another one, in views of full size."""
+    resolution = setup.selection.resolution
+    views = schedule.pace.views(until) - schedule.pace.views(after)
+    pixels = resolution.pixels(schedule, until) - resolution.pixels(schedule, after)
+    return views + setup.pixel_share * (pixels - views)
 
 
 def _cost(setup: Setup, steps: int) -> float:
-    """Expected cost of a run of so many steps, in units of a view at its start."""
+    """Expected cost of a run of so many steps, in units of a view of full size at its start."""
     schedule = _schedule_of(setup, steps)
-    return _views(schedule, 0, steps) * _growth(setup, schedule, 0)
+    return _work(setup, schedule, 0, steps) * _growth(setup, schedule, 0)
 
 
 def _cost_ahead(setup: Setup, step: int, left: int) -> float:
-    """Expected cost of the `left` steps after `step`, in units of a view now."""
+    """Expected cost of the `left` steps after `step`, in units of a view of full size now."""
     schedule = setup.schedule.lengthened(_schedule_of(setup, step + left), step)
-    return _views(schedule, step, step + left) * _growth(setup, schedule, step)
+    return _work(setup, schedule, step, step + left) * _growth(setup, schedule, step)
 
 
 def _growth(setup: Setup, schedule: Schedule, step: int) -> float:
@@ -241,10 +258,12 @@ def _fitting(cost: Callable[[int], float], affordable: float) -> int:
     """The most steps that cost no more than `affordable`, at least 1.
 
     Args:
-        cost: Expected cost of so many steps, in views; at least one view for each of them.
-        affordable: Views.
+        cost: Expected cost of so many steps, in views of full size; it grows with them.
+        affordable: Such views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
+    while cost(too_many) <= affordable and too_many < _NEVER:  # Views of less than full size.
+        too_many *= 2
     while too_many - fits > 1:
         steps = (fits + too_many) // 2
         if cost(steps) <= affordable:

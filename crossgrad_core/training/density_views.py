@@ -7,7 +7,7 @@ from crossgrad_core.contract.contexts import Draw, ViewRecord
 from crossgrad_core.training.regrouping import groups_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import observe_view
+from crossgrad_core.training.views import observe_view, scales_of
 
 #: Name of the stream that all random numbers of further views come from.
 STREAM = "density"
@@ -28,8 +28,9 @@ def observed_views(
     if setup.config.density_views != "extra" or not wanted:
         return tuple(records)
     # Whatever is drawn for the further view, its background and what plugins draw included.
-    state = replace(state, rngs=dict.fromkeys(state.rngs, state.rngs[STREAM]))
+    streams, states = dict.fromkeys(state.rngs, state.rngs[STREAM]), dict(state.states)
+    state = replace(state, rngs=streams, states=states)
     index = int(state.rngs[STREAM].integers(len(setup.train_views)))
     groups = groups_of(setup, state)
     draw = Draw((index,), None if groups is None else (groups[index],))
-    return (*records, observe_view(setup, state, draw, records[0].scale))
+    return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))

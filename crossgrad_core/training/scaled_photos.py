@@ -1,61 +1,72 @@
 """Photos in a smaller size, by an area filter, in a bounded amount of memory."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.scene import View
-from crossgrad_core.scene.photos import PhotoCache
+from crossgrad_core.contract.scene import Camera, View
 
 #: Photo [H, W, 3] uint8 and mask [H, W] bool, None where every pixel counts.
 Pair = tuple[Tensor, Tensor | None]
-#: A pixel counts where at least this share of what it covers does.
-_COUNTS = 0.5
-
-
-@dataclass(frozen=True)
-class ScaledPhoto:
-    """A view's photo in another size.
-
-    Attributes:
-        view: The view.
-        width: Pixels.
-        height: Pixels.
-        full: Gives the photo and the mask as trained.
-    """
-
-    view: View
-    width: int
-    height: int
-    full: Callable[[View], Pair] = field(compare=False)
-
-    def decode(self) -> Pair:
-        """The photo and the mask in this size."""
-        return reduced(*self.full(self.view), self.width, self.height)
+#: Width and height, pixels.
+_Size = tuple[int, int]
 
 
 class ScaledPhotos:
-    """Reduced photos that were asked for; those of more memory than `mib` are made again.
+    """Reduced photos: of each view the size that was asked for last, and what it was made from.
+
+    That is the photo, halved as often as it stays larger than what was asked for: where the size
+    changes step by step, most of the work is done once.
 
     Args:
-        mib: Memory in MiB; the latest photo is kept in any case.
+        mib: Memory in MiB; what does not fit is made again.
     """
 
     def __init__(self, mib: int) -> None:
-        self._cache: PhotoCache[ScaledPhoto] = PhotoCache(mib)
+        self._room = mib * 2**20
+        self._kept: dict[str, dict[_Size, Pair]] = {}
 
-    def get(self, photo: ScaledPhoto) -> Pair:
-        """The photo and mask in that size; shared, so never to be written to."""
-        return self._cache.get(photo)
+    def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
+        """The photo and mask of a view in the size of a camera; shared, so never to be written to.
+
+        Args:
+            view: The view.
+            camera: At most as large as the view's own.
+            full: Gives the photo and the mask as trained.
+        """
+        sizes, before = _sizes(view.camera, camera), self._kept.pop(view.name, {})
+        self._room += _bytes(before)
+        made = {size: before[size] for size in sizes if size in before}
+        smallest = next(reversed(made), None)
+        pair = full(view) if smallest is None else made[smallest]
+        for size in sizes[0 if smallest is None else sizes.index(smallest) + 1 :]:
+            pair = made[size] = reduced(*pair, *size)
+        if made and _bytes(made) <= self._room:
+            self._kept[view.name] = made
+            self._room -= _bytes(made)
+        return pair
+
+
+def _sizes(full: Camera, wanted: Camera) -> list[_Size]:
+    """The sizes from the full one, left out, down to the wanted one."""
+    width, height = full.width, full.height
+    while width > 2 * wanted.width and height > 2 * wanted.height:
+        width, height = (width + 1) // 2, (height + 1) // 2
+    sizes = dict.fromkeys([(width, height), (wanted.width, wanted.height)])
+    return [size for size in sizes if size != (full.width, full.height)]
+
+
+def _bytes(made: dict[_Size, Pair]) -> int:
+    return sum(tensor.nbytes for pair in made.values() for tensor in pair if tensor is not None)
 
 
 def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair:
     """Image and mask averaged by area: each new pixel is the mean of what it covers.
 
     Pixels that do not count are left out of the means; a new pixel counts where at least half of
-    what it covers does. Every step is exact or elementwise, so that no bit depends on threads.
+    what it covers does. One thread does it in a fixed order, so that no bit depends on threads.
 
     Args:
         image: [H, W, 3] uint8.
@@ -63,33 +74,11 @@ def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair
         width: At most W.
         height: At most H.
     """
-    kept = torch.ones(image.shape[:2], dtype=torch.float64, device=image.device)
-    if mask is not None:
-        kept = mask.to(torch.float64)
-    cover = _areas(kept, width, height)
-    # One channel after the other: a large photo in float64 takes much memory.
-    sums = [_areas(image[..., channel] * kept, width, height) for channel in range(image.shape[2])]
-    means = torch.stack(sums, dim=-1) / torch.where(cover > 0, cover, 1.0)[..., None]
-    small = means.round().clamp(0, 255).to(torch.uint8)
-    if mask is None:
-        return small, None
-    whole = (image.shape[0] / height) * (image.shape[1] / width)
-    counts = cover >= _COUNTS * whole
-    return small, None if bool(counts.all()) else counts
+    from crossgrad_core.training.numba_kernels.areas import reduce_by_area
 
-
-def _areas(values: Tensor, width: int, height: int) -> Tensor:
-    """[height, width] sums of [H, W] over the area that each new pixel covers."""
-    rows = _covered(values, height)
-    return _covered(rows.T, width).T.contiguous()
-
-
-def _covered(values: Tensor, count: int) -> Tensor:
-    """[count, ...] sums of [N, ...] float64 over `count` equal stretches of the first dimension."""
-    length = values.shape[0]
-    total = torch.cat([torch.zeros_like(values[:1]), values.cumsum(dim=0)])
-    edges = torch.arange(count + 1, dtype=torch.float64, device=values.device) * (length / count)
-    whole = edges.floor().clamp(max=length - 1).to(torch.int64)
-    part = (edges - whole)[:, None]
-    at_edges = total[whole] + part * values[whole]
-    return at_edges[1:] - at_edges[:-1]
+    kept = np.empty((0, 0), np.bool_) if mask is None else mask.cpu().contiguous().numpy()
+    rows = image.cpu().contiguous().numpy().reshape(image.shape[0], -1)
+    small, counts = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.bool_)
+    reduce_by_area(rows, kept, small, counts)
+    found = torch.from_numpy(small).to(image.device)
+    return found, None if counts.all() else torch.from_numpy(counts).to(image.device)

@@ -49,6 +49,11 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
     return {name: getattr(config, name) for name in names if getattr(config, name) is not None}
 
 
+def notes_on_length(setup: Setup) -> tuple[str, ...]:
+    """What is noted about a run of this length."""
+    return (*growth_note(setup), *setup.selection.resolution.remarks(setup.schedule))
+
+
 def growth_note(setup: Setup) -> tuple[str, ...]:
     """Says that density control is left out, where the run is too short for it."""
     schedule = setup.schedule

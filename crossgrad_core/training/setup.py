@@ -38,6 +38,8 @@ class Setup:
         schedule: The schedule.
         device: Where tensors live.
         notes: What was chosen or left out, and why.
+        scaled_photos: Where photos of smaller sizes are kept.
+        pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
 
     config: RunConfig
@@ -49,6 +51,8 @@ class Setup:
     schedule: Schedule
     device: torch.device
     notes: tuple[str, ...]
+    scaled_photos: ScaledPhotos
+    pixel_share: float = 0.6
 
     @property
     def backbone(self) -> Backbone:
@@ -119,12 +123,6 @@ class Setup:
     def per_photo(self) -> Mapping[str, PerPhoto]:
         """The parameters that every training photo has a value of."""
         return self.exposure.per_photo(self.scene)
-
-    @cached_property
-    def scaled_photos(self) -> ScaledPhotos:
-        """Where photos of smaller sizes are kept."""
-        # At half the size they take a quarter of the memory.
-        return ScaledPhotos(max(1, self.config.reading.cache_mib // 4))
 
     @cached_property
     def weighs(self) -> bool:

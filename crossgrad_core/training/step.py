@@ -15,8 +15,6 @@ from crossgrad_core.contract.contexts import (
     Draw,
     SampleContext,
     Sampled,
-    ScaleContext,
-    Scaled,
     StepRecord,
 )
 from crossgrad_core.contract.topology import Edit
@@ -42,6 +40,7 @@ from crossgrad_core.training.views import (
     context_fields,
     joined,
     render_views,
+    scales_of,
 )
 from crossgrad_core.wording import listed
 
@@ -55,7 +54,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     regroup_if_due(setup, state)
     state.step += 1
     draw = _sample(setup, state)
-    scales = _scales(setup, state, draw)
+    scales = scales_of(setup, state, draw)
     rendered = render_views(setup, state, draw, scales)
     rendered = replace(rendered, observed=observed_views(setup, state, rendered.records))
     context = _aggregate_context(setup, state, draw, rendered)
@@ -103,22 +102,6 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
         expected=f"{listed(map(str, sorted(counts)))} views",
         found=f"{len(answer.draw.views)} views",
         todo="choose another --sampler, or let the plugin's `counts` name every number",
-    )
-
-
-def _scales(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
-    context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
-    answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
-    state.commit(answer.states)
-    scales = answer.scales
-    if len(scales) == len(draw.views) and all(0.0 < scale <= 1.0 for scale in scales):
-        return scales
-    raise UserError(
-        "the resolution does not give each view a scale",
-        where=f"resolution {setup.selection.names['resolution']}, step {state.step}",
-        expected=f"{len(draw.views)} numbers above 0 and at most 1",
-        found=repr(scales),
-        todo="choose another --resolution, or repair the plugin",
     )
 
 

@@ -15,17 +15,20 @@ from crossgrad_core.contract.contexts import (
     Draw,
     PixelContext,
     RegularizeContext,
+    ScaleContext,
+    Scaled,
     ViewRecord,
 )
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
+from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import Leaves, leaves_of
-from crossgrad_core.training.scaled_photos import ScaledPhoto
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -60,6 +63,23 @@ class _Drawn:
     gaussians: Gaussians
     loss: Tensor
     leaves: Leaves
+
+
+def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
+    """The scales at which the views of `draw` are rendered."""
+    context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
+    answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
+    state.commit(answer.states)
+    scales = answer.scales
+    if len(scales) == len(draw.views) and all(0.0 < scale <= 1.0 for scale in scales):
+        return scales
+    raise UserError(
+        "the resolution does not give each view a scale",
+        where=f"resolution {setup.selection.names['resolution']}, step {state.step}",
+        expected=f"{len(draw.views)} numbers above 0 and at most 1",
+        found=repr(scales),
+        todo="choose another --resolution, or repair the plugin",
+    )
 
 
 def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float]) -> Rendered:
@@ -187,12 +207,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> Targ
     """Camera and photo of a training view at a scale in (0, 1]."""
     view = setup.train_views[index]
     camera = camera_at(view.camera, scale)
-    if camera is view.camera:
-        photo, mask = photo_of(setup, state, view)
-    else:
-        full = partial(photo_of, setup, state)
-        small = ScaledPhoto(view, camera.width, camera.height, full)
-        photo, mask = setup.scaled_photos.get(small)
+    photo, mask = setup.scaled_photos.get(view, camera, partial(photo_of, setup, state))
     return Target(camera, scale, photo, mask)
 
 

@@ -40,7 +40,7 @@ def test_runs_as_they_are_written(tmp_path, capsys):
 
 def test_a_run_within_seconds_keeps_its_length_when_it_is_resumed(tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene", views=9)
-    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (12, "twelve steps"))
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (12, "twelve steps", 0.6))
     each_step_takes(monkeypatch, 0.125)
     given = {"scene": str(scene), "out": str(tmp_path / "run"), "threads": 1, "seconds": 1.5}
     assert app.run({**given, "stop_after": 6}, verbosity=-1) == 0

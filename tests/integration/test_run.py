@@ -134,7 +134,7 @@ def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scen
 
 def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_path, monkeypatch):
     # Whatever the probe of this machine says, the first plan is wrong.
-    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps"))
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps", 0.6))
     each_step_takes(monkeypatch, 0.025)
     run(scene, tmp_path / "timed", steps=None, seconds=1.5, **GROWTH)
     stored = read_config(tmp_path / "timed")
@@ -148,7 +148,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
 
 def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkeypatch, capsys):
     # The plan is too short for density control (it would end in step 14), the run is not.
-    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps"))
+    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps", 0.6))
     each_step_takes(monkeypatch, 0.05)
     times = {"events": "steps", "densify_from": 13, "densify_every": 1}
     settings = {**times, "steps": None, "seconds": 3.0}

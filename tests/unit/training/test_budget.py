@@ -10,6 +10,9 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import budget
 from crossgrad_core.training.budget import (
     Planned,
     Timed,
@@ -18,6 +21,8 @@ from crossgrad_core.training.budget import (
     _without_edits,
     caught_up,
     lengthened,
+    seconds_ahead,
+    steps_for,
 )
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.schedules import growth_note
@@ -46,13 +51,17 @@ class Run:
     schedule: Schedule
     hook: Hook = field(default_factory=Hook)
     notes: tuple[str, ...] = ("a note on the scene",)
+    pixel_share: float = 0.6
 
 
-def setup(densifier="adc", steps=1000, mode="scaled"):
+def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
     return Run(
         RunConfig(steps=steps, schedule=mode),
         build("densifiers", densifier, {}),
-        SimpleNamespace(names={"densifier": densifier}),
+        SimpleNamespace(
+            names={"densifier": densifier},
+            resolution=build("resolutions", resolution, {}).fitted_to(sample_scene()),
+        ),
         Schedule.for_run(steps, mode),
     )
 
@@ -95,9 +104,10 @@ def test_without_density_control_every_step_costs_the_same():
     assert _fitting(partial(_cost, setup("none")), 18_000.0) == 18_000
 
 
-def timed(seconds, planned, cost):
+def timed(seconds, planned, cost, **of_setup):
     """A run whose step s takes cost(s, schedule) seconds, and its clock at the end."""
-    run, state = setup(steps=planned), SimpleNamespace(step=0, rewinds=0, clock=Clock())
+    run = setup(steps=planned, **of_setup)
+    state = SimpleNamespace(step=0, rewinds=0, clock=Clock())
     length = Timed(seconds)
     while state.step < run.schedule.total:
         state.step += 1
@@ -201,3 +211,97 @@ def test_the_user_is_told_of_no_step_behind_the_end():
     run = noted(setup(steps=550, mode="absolute"))
     Planned(((20, 700),)).revised(run, SimpleNamespace(step=20))
     assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
+
+
+#: Scales that grow, as far as a budget sees them: photos large enough for all of them.
+COURSES = {"all": {"photos": 9, "scales": [0.25] * 16 + [0.3 + 0.04 * n for n in range(16)]}}
+GROWING = {
+    "octaves": build("resolutions", "octaves", {}),
+    "spectral": build("resolutions", "spectral", {"courses": COURSES}),
+}
+
+
+def with_pixels(resolution, base=0.01, each=0.03):
+    """What a step takes of which so much goes with its pixels."""
+
+    def cost(step, schedule):
+        pixels = [resolution.pixels(schedule, taken) for taken in (step - 1, step)]
+        return base + each * (pixels[1] - pixels[0])
+
+    return cost
+
+
+@pytest.mark.parametrize("name", GROWING)
+def test_the_length_of_a_run_whose_photos_grow_is_planned_with_that(name):
+    run, seconds, cost = setup("none"), 60.0, with_pixels(GROWING[name])
+    run.selection.resolution = GROWING[name]
+    run = replace(run, pixel_share=0.75)
+    planned = _fitting(partial(_cost, run), seconds / 0.04)
+    assert planned > 1.2 * seconds / 0.04
+    run = replace(run, schedule=Schedule.for_run(planned))
+    state, length = SimpleNamespace(step=0, rewinds=0, clock=Clock()), Timed(seconds)
+    while state.step < run.schedule.total:
+        state.step += 1
+        state.clock.train += cost(state.step, run.schedule)
+        if state.step < run.schedule.total and length.due(state):
+            run = length.revised(run, state)
+    assert state.clock.train == pytest.approx(seconds, rel=0.01)
+    # The clock has next to nothing to correct: no rate or scale was chosen for another length.
+    assert abs(run.schedule.total - planned) < 0.03 * planned
+    assert len(run.config.revisions) <= 2
+
+
+def test_a_step_ahead_costs_more_where_photos_grow():
+    run = replace(setup("none"), pixel_share=1.0, schedule=Schedule.for_run(100))
+    run.selection.resolution = GROWING["octaves"]
+    # 20 steps of 1/16, 20 of 1/4, 60 of all pixels.
+    assert seconds_ahead(run, 10, 1.0) == pytest.approx(10 + 20 * 4 + 60 * 16)
+    assert seconds_ahead(run, 50, 1.0) == pytest.approx(50)
+
+
+@pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
+@pytest.mark.parametrize("name", ["full", "octaves", "spectral"])
+def test_the_probe_tells_what_goes_with_the_pixels(monkeypatch, name, views):
+    settings = {"seconds": 10.0, "resolution": {"name": name}, "views_per_step": views}
+    run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
+    resolution = GROWING.get(name, run.selection.resolution)
+    run = replace(run, selection=replace(run.selection, resolution=resolution))
+    rates = []
+
+    def step(setup, state):
+        state.step += 1
+        now = with_pixels(resolution)(state.step, setup.schedule)
+        views = setup.schedule.pace.at(state.step)
+        state.clock.train += 0.01 * (views - 1) + now
+        rates.append(now)
+
+    monkeypatch.setattr(budget, "timed_step", step)
+    total, note, share = steps_for(run, 10.0)
+    assert (" at full size " in note) == (name != "full")
+    assert share == pytest.approx(0.6 if name == "full" else 0.75)
+    assert len(rates) == 13 + 13 * (name != "full")
+    if views == "1" and name != "full":
+        assert "12 probed steps took 11.9 ms each, 12 at full size 40.0 ms" in note
+        assert total > 10.0 / 0.04
+
+
+def test_photos_that_were_reduced_stay_when_the_length_changes():
+    run = assemble(RunConfig(steps=400), sample_scene(), "none")
+    run = replace(run, config=run.config.model_copy(update={"revisions": ((3, 500),)}))
+    assert caught_up(run, 4).scaled_photos is run.scaled_photos
+
+
+def test_the_note_on_scales_is_that_of_the_length_that_holds():
+    settings = {"steps": 1000, "resolution": {"name": "octaves"}, "densifier": {"name": "none"}}
+    run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
+    told = [note for note in run.notes if note.startswith("resolution")]
+    assert told == [octaves_note(200, 400)]
+    config = run.config.model_copy(update={"revisions": ((3, 500), (9, 600))})
+    longer = caught_up(replace(run, config=config), 20)
+    told = [note for note in longer.notes if note.startswith("resolution")]
+    assert told == [octaves_note(120, 240)]
+
+
+def octaves_note(quarter, half):
+    scales = f"1/4 to step {quarter}, 1/2 from step {quarter + 1}, full size from step {half + 1}"
+    return f"resolution: {scales}; no side is below 96 pixels"

@@ -14,7 +14,9 @@ from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
 from crossgrad_core.training.clock import Clock
 
 RUN = make_dataclass(
-    "Run", ["config", "densifier", "selection", "schedule", "hook", "notes"], frozen=True
+    "Run",
+    ["config", "densifier", "selection", "schedule", "hook", "notes", "pixel_share"],
+    frozen=True,
 )
 
 
@@ -28,10 +30,13 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
     run = RUN(
         config=RunConfig(steps=steps),
         densifier=build("densifiers", densifier, {}),
-        selection=SimpleNamespace(names={"densifier": densifier}),
+        selection=SimpleNamespace(
+            names={"densifier": densifier}, resolution=build("resolutions", "full", {})
+        ),
         schedule=Schedule.for_run(steps),
         hook=hook,
         notes=(),
+        pixel_share=0.6,
     )
     length = Forecast(Planned(revisions))
     state = SimpleNamespace(step=first, clock=Clock(train=100.0 * bool(first) + wait))

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.screen_statistics import ndc_gradient, pixels, radii
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.records import view_record
-from crossgrad_core.training.scaled_photos import ScaledPhoto, ScaledPhotos, reduced
+from crossgrad_core.training.scaled_photos import ScaledPhotos, _bytes, reduced
 from crossgrad_core.training.views import camera_at
 
 RNG = np.random.default_rng(0)
@@ -54,23 +56,92 @@ def test_a_mask_that_leaves_nothing_out_is_none():
     assert reduced(IMAGE, torch.ones(23, 37, dtype=torch.bool), 9, 9)[1] is None
 
 
-def test_memory_is_bounded_and_the_same_size_is_made_once():
-    views = sample_scene().train_views
-    made = []
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(1, 24),
+    width=st.integers(1, 24),
+    shares=st.tuples(st.floats(0.01, 1.0), st.floats(0.01, 1.0)),
+    kept=st.sampled_from([None, 0.0, 0.02, 0.5, 1.0]),
+    seed=st.integers(0, 99),
+)
+def test_random_photos_are_averaged_as_a_brute_force_does(height, width, shares, kept, seed):
+    rng = np.random.default_rng(seed)
+    image = torch.from_numpy(rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
+    mask = None if kept is None else torch.from_numpy(rng.random((height, width)) < kept)
+    size = max(1, round(width * shares[0])), max(1, round(height * shares[1]))
+    small, counts = reduced(image, mask, *size)
+    means, cover = brute_force(image, mask, *size)
+    assert np.abs(small.numpy() - means).max() <= 0.5 + 1e-9
+    sure = np.abs(cover - 0.5) > 1e-9
+    found = np.ones_like(sure) if counts is None else counts.numpy()
+    assert (found == (cover >= 0.5))[sure].all()
 
-    def full(view):
-        made.append(view.name)
+
+def test_a_photo_that_lies_otherwise_in_memory_is_the_same():
+    turned = IMAGE.transpose(0, 1).contiguous().transpose(0, 1)
+    assert torch.equal(reduced(turned, MASK, 9, 8)[0], reduced(IMAGE, MASK, 9, 8)[0])
+
+
+class Counted:
+    """Full photos, and how often they were asked for."""
+
+    def __init__(self):
+        self.times = 0
+
+    def __call__(self, view):
+        self.times += 1
         return view.photo.image(), None
 
-    photos = ScaledPhotos(1)
-    first = photos.get(ScaledPhoto(views[0], 12, 8, full))
-    assert photos.get(ScaledPhoto(views[0], 12, 8, full))[0] is first[0]
-    assert photos.get(ScaledPhoto(views[0], 6, 4, full))[0].shape == (4, 6, 3)
-    assert made == [views[0].name] * 2
-    small = ScaledPhotos(0)
-    for view in views:
-        small.get(ScaledPhoto(view, 12, 8, full))
-    assert small._cache.used == 12 * 8 * 3
+
+def resized(view, width, height):
+    return view.camera.resized(width, height)
+
+
+VIEWS = sample_scene().train_views  # 24 x 16 pixels
+
+
+def test_the_size_that_was_asked_for_last_is_made_once():
+    view, full, photos = VIEWS[0], Counted(), ScaledPhotos(1)
+    first = photos.get(view, resized(view, 20, 13), full)
+    assert photos.get(view, resized(view, 20, 13), full)[0] is first[0]
+    assert first[0].shape == (13, 20, 3) and full.times == 1
+    # A half of it is on the way to what is smaller still, and serves again there.
+    small = photos.get(view, resized(view, 11, 7), full)
+    smaller = photos.get(view, resized(view, 7, 5), full)
+    assert full.times == 2
+    half = reduced(view.photo.image(), None, 12, 8)
+    assert torch.equal(small[0], reduced(*half, 11, 7)[0])
+    assert torch.equal(smaller[0], reduced(*half, 7, 5)[0])
+
+
+def test_full_size_is_the_photo_itself_and_nothing_is_kept_beside_it():
+    view, full, photos = VIEWS[0], Counted(), ScaledPhotos(1)
+    photos.get(view, resized(view, 8, 6), full)
+    assert photos._kept and photos._room < 2**20
+    assert torch.equal(photos.get(view, view.camera, full)[0], view.photo.image())
+    assert not photos._kept and photos._room == 2**20
+
+
+def test_memory_is_bounded_and_what_does_not_fit_is_made_again():
+    full, photos = Counted(), ScaledPhotos(1)
+    photos._room = room = 2 * 20 * 13 * 3
+    for _ in range(2):
+        for view in VIEWS[:3]:
+            assert photos.get(view, resized(view, 20, 13), full)[0].shape == (13, 20, 3)
+            assert sum(_bytes(made) for made in photos._kept.values()) <= room
+    assert full.times == 3 + 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 24)), max_size=12), st.integers(0, 3))
+def test_what_was_asked_for_before_changes_no_pixel(asked, room):
+    photos = ScaledPhotos(room)
+    photos._room = room * 1000
+    for index, width in asked:
+        view, camera = VIEWS[index], resized(VIEWS[index], width, max(1, width * 2 // 3))
+        found = photos.get(view, camera, Counted())
+        alone = ScaledPhotos(0).get(view, camera, Counted())
+        assert torch.equal(found[0], alone[0]) and found[0].shape[:2] == (camera.height, width)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])

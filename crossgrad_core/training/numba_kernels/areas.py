@@ -1,0 +1,62 @@
+"""Means over the areas that the pixels of a smaller image cover (Numba, CPU)."""
+
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.jit import kernel
+
+#: A pixel counts where at least this share of what it covers does.
+_COUNTS = 0.5
+
+
+@kernel
+def reduce_by_area(
+    image: NDArray[np.uint8],
+    kept: NDArray[np.bool_],
+    small: NDArray[np.uint8],
+    counts: NDArray[np.bool_],
+) -> None:
+    """Writes the mean of what each new pixel covers; the order of all sums is fixed.
+
+    Args:
+        image: [H, 3 W], contiguous.
+        kept: [H, W], pixels that count; [0, 0] where all do.
+        small: [h, w, 3], h <= H and w <= W: the means, 0 where nothing counts.
+        counts: [h, w], new pixels that count.
+    """
+    masked = kept.size > 0
+    rows, columns = counts.shape
+    height, width = image.shape[0], image.shape[1] // 3
+    tall, wide = height / rows, width / columns
+    total, cover = np.empty(3 * width), np.empty(width)
+    for row in range(rows):
+        top, bottom = row * tall, min((row + 1) * tall, float(height))
+        total[:] = 0.0
+        cover[:] = 0.0 if masked else bottom - top
+        for y in range(int(top), ceil(bottom)):
+            part = min(bottom, y + 1.0) - max(top, float(y))
+            if masked:
+                for x in range(width):
+                    area = part * kept[y, x]
+                    cover[x] += area
+                    for channel in range(3 * x, 3 * x + 3):
+                        total[channel] += area * image[y, channel]
+            else:
+                for channel in range(3 * width):
+                    total[channel] += part * image[y, channel]
+        for column in range(columns):
+            left, right = column * wide, min((column + 1) * wide, float(width))
+            red, green, blue, area = 0.0, 0.0, 0.0, 0.0
+            for x in range(int(left), ceil(right)):
+                part = min(right, x + 1.0) - max(left, float(x))
+                area += part * cover[x]
+                red += part * total[3 * x]
+                green += part * total[3 * x + 1]
+                blue += part * total[3 * x + 2]
+            mean = 1.0 / area if area > 0.0 else 0.0
+            small[row, column, 0] = np.uint8(np.rint(red * mean))
+            small[row, column, 1] = np.uint8(np.rint(green * mean))
+            small[row, column, 2] = np.uint8(np.rint(blue * mean))
+            counts[row, column] = area >= _COUNTS * tall * wide

@@ -1,0 +1,47 @@
+"""A quarter of the photos' size, then half of it, then all of it."""
+
+from collections.abc import Mapping
+from typing import Self
+
+from pydantic import model_validator
+from typing_extensions import override
+
+from crossgrad_core.plugin import Field, Schedule
+from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
+from crossgrad_plugins.resolutions.course import Course
+
+
+class Octaves(CoarseToFine):
+    """Photos at 1/4 of their size at first, at 1/2 then, and in full size for the rest of the run.
+
+    Ours.
+    """
+
+    quarter_until: float = Field(
+        0.2, ge=0, lt=1, description="share of the run that has 1/4 of the size; 0: none"
+    )
+    half_until: float = Field(
+        0.4, ge=0, lt=1, description="share of the run after which photos have their full size"
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.half_until < self.quarter_until:
+            raise ValueError("half_until must not be less than quarter_until")
+        return self
+
+    @override
+    def window(self, schedule: Schedule) -> float:
+        return schedule.counted(schedule.total)
+
+    @override
+    def parts(self) -> Mapping[str, Part]:
+        stages = ((0.0, self.quarter_until, 0.25), (self.quarter_until, self.half_until, 0.5))
+        there = [(end, scale) for start, end, scale in stages if start < end]
+        return {"all": Part(Course(*map(tuple, zip(*there, strict=True))))}
+
+    @override
+    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+        return tuple(
+            f"{text}; no side is below {self.smallest} pixels" for text in super().remarks(schedule)
+        )

@@ -1,0 +1,145 @@
+"""Scales that follow the spectrum of the photos (DashGaussian)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from typing_extensions import override
+
+from crossgrad_core.plugin import Field, Scene, Schedule, View
+from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
+from crossgrad_plugins.resolutions.course import Course, window_of
+from crossgrad_plugins.resolutions.spectrum import GRID, Floats, kept_shares
+
+#: Spectra are those of so many photos, at most, of all regimes together.
+MOST_PHOTOS = 32
+#: Regimes have courses of their own where what a scale keeps of their spectra differs by more.
+ALIKE = 0.05
+#: Name of the course of all photos.
+ALL = "all"
+
+
+class Scales(BaseModel):
+    """The scales of some photos, as config.yaml has them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    photos: int = Field(ge=1, description="training photos")
+    scales: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(
+        description="in equally long parts of the window, full size after them"
+    )
+
+
+class Spectral(CoarseToFine):
+    """Photos that stay small for as long as a small size keeps much of their spectrum.
+
+    X(F_r) is the sum of the amplitudes of the frequencies that photos of 1 / r of the size have.
+    A run begins with the r at which X(F_r) = X(F) / ratio, and leaves an r for a finer one after
+    X(F_r) / X(F) of the window; between the levels of r the number of pixels grows linearly.
+
+    Source: DashGaussian (arXiv 2503.18402).
+    """
+
+    ratio: float = Field(
+        4.0, gt=1, description="the first scale keeps 1 / ratio of the spectrum, or more"
+    )
+    coarsest: float = Field(4.0, ge=1, description="the first scale is 1 / coarsest or more")
+    levels: int = Field(
+        32, ge=1, le=GRID, description="levels of the spectrum, and parts of the window"
+    )
+    until: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="share of the run after which photos have their full size; none: the end of "
+        "density control, half of the run where there is none",
+    )
+    per_regime: Literal["auto", "always", "never"] = Field(
+        "auto", description="whether each regime has scales of its own; auto: where spectra differ"
+    )
+    courses: Mapping[str, Scales] | None = Field(
+        None, description="the scales by regime; none: measured, and written down"
+    )
+
+    @override
+    def fitted_to(self, scene: Scene) -> "Spectral":
+        if self.courses is not None:
+            return self
+        groups = self._groups(scene)
+        courses = {
+            name: Scales(photos=len(group.views), scales=self._scales(group))
+            for name, group in groups.items()
+        }
+        return self.model_copy(update={"courses": courses})
+
+    @override
+    def window(self, schedule: Schedule) -> float:
+        return window_of(schedule, self.until)
+
+    @override
+    def parts(self) -> Mapping[str, Part]:
+        known = self.courses or {}
+        return {name: Part(_course(each.scales), each.photos) for name, each in known.items()}
+
+    def _groups(self, scene: Scene) -> Mapping[str, "_Group"]:
+        """The photos that have a course in common."""
+        views = scene.train_views
+        regimes = sorted({view.regime for view in views}) if self.per_regime != "never" else []
+        if len(regimes) > 1:
+            most = max(1, MOST_PHOTOS // len(regimes))
+            apart = {
+                regime: _Group.of([v for v in views if v.regime == regime], most)
+                for regime in regimes
+            }
+            kept = [group.kept for group in apart.values()]
+            if self.per_regime == "always" or np.ptp(kept, axis=0).max() > ALIKE:
+                return apart
+        return {ALL: _Group.of(views, MOST_PHOTOS)}
+
+    def _scales(self, group: "_Group") -> tuple[float, ...]:
+        """The scales of some photos in equal parts of the window; none where all is needed."""
+        scales = np.arange(GRID + 1) / GRID
+        least = min(1.0, max(1.0 / self.coarsest, self.smallest / group.shorter))
+        first = int(np.argmax((scales >= least) & (group.kept >= 1.0 / self.ratio)))
+        if first == GRID:
+            return ()
+        levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
+        ends, pixels = group.kept[levels], scales[levels] ** 2
+        parts = np.arange(self.levels) / self.levels
+        ahead = np.searchsorted(ends, parts, side="right")  # The level that is left next.
+        behind = np.maximum(ahead - 1, 0)
+        # Before the first level is left there is nothing to go on from.
+        share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
+        found = pixels[behind] + share * (pixels[ahead] - pixels[behind])
+        return tuple(np.sqrt(found).round(4).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Photos that have a course in common.
+
+    Attributes:
+        views: Theirs.
+        kept: [GRID + 1] share of their spectrum that the scales 0, 1 / GRID .. 1 keep.
+        shorter: Pixels of the shorter side; the median.
+    """
+
+    views: Sequence[View]
+    kept: Floats
+    shorter: float
+
+    @classmethod
+    def of(cls, views: Sequence[View], most: int) -> "_Group":
+        """The group of some views, by the spectra of at most so many, spread over them."""
+        chosen = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
+        shorter = [min(view.camera.width, view.camera.height) for view in views]
+        kept = kept_shares([views[each] for each in chosen])
+        return cls(views, kept, float(np.median(shorter)))
+
+
+@lru_cache
+def _course(scales: tuple[float, ...]) -> Course:
+    return Course.of_parts(scales)
