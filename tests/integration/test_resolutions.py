@@ -164,17 +164,20 @@ def test_a_further_view_has_the_scale_of_its_own_regime_and_changes_none(views):
     for density_views in ("all", "extra"):
         setup, seen = watched(assembled(**asked, density_views=density_views))
         state = first_state(setup)
+        reached = []
         for _ in range(12):
             timed_step(setup, state)
+            reached.append(state.states["resolution"].values)
         assert {len(step) for step in seen} == {views + (density_views == "extra")}
         for step in seen:
             for regime, scale, shape in step:
                 assert scale == scales[regime]
                 assert shape == (round(16 * scale), round(24 * scale), 3)
-        streams.append((state.rngs["resolution"].bit_generator.state, seen))
+        streams.append((state.rngs["resolution"].bit_generator.state, seen, reached))
     # The regimes of the step's own views are as they were without the further one.
     assert streams[0][0] == streams[1][0]
     assert [step[:views] for step in streams[1][1]] == streams[0][1]
+    assert streams[0][2] == streams[1][2]
 
 
 def test_what_looks_at_a_view_between_steps_sees_it_in_full_size():
