@@ -152,7 +152,18 @@ def export(
     camera: str | None = None,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """As `exported`, and prints what is in the file."""
+    """Writes the trained scene to a file that viewers open, and prints what is in it.
+
+    Args:
+        folder: The run's folder.
+        file_format: See `exported`.
+        out: See `exported`.
+        camera: See `exported`.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `exported`.
+    """
     path, content = exported(folder, file_format=file_format, out=out, camera=camera, how=how)
     for line in described(content, path):
         print(line)  # noqa: T201

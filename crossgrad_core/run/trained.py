@@ -31,7 +31,13 @@ class Run:
 
     What is read from the folder (`metrics`, `summary`) is read anew each time, so that a run that
     is training can be watched. The scene and the newest checkpoint are loaded when they are first
-    needed, and kept. The arguments are those of `open`.
+    needed, and kept.
+
+    Args:
+        folder: The run's folder.
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
     """
 
     def __init__(
