@@ -50,11 +50,17 @@ class ScaledPhotos:
 
 
 def _sizes(full: Camera, wanted: Camera) -> list[_Size]:
-    """The sizes from the full one, left out, down to the wanted one."""
-    width, height = full.width, full.height
-    while width > 2 * wanted.width and height > 2 * wanted.height:
-        width, height = (width + 1) // 2, (height + 1) // 2
-    sizes = dict.fromkeys([(width, height), (wanted.width, wanted.height)])
+    """The sizes from the full one, left out, down to the wanted one.
+
+    At most one lies between them: the smallest of the halved sizes that is not below what is
+    wanted. A halved size that is itself wanted is made from the photo too, so that it is the same
+    whatever it was made for.
+    """
+    halved, size = (full.width, full.height), (full.width, full.height)
+    wanted_size = (wanted.width, wanted.height)
+    while size[0] >= wanted.width and size[1] >= wanted.height and halved != wanted_size:
+        halved, size = size, ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    sizes = dict.fromkeys([halved, wanted_size])
     return [size for size in sizes if size != (full.width, full.height)]
 
 
