@@ -12,6 +12,7 @@ from crossgrad_plugins.compare.statistics.verdict import Verdict
 _TITLES = {cost.name: cost.title for cost in COSTS}
 #: Of many arms, so many are named in one sentence.
 _MOST_NAMED = 6
+_ONE_PAIR = "one pair says nothing about noise: run more seeds"
 _NONE_BEATEN = "but it is surely better than no other arm"
 
 
@@ -73,7 +74,7 @@ def needed_text(contrast: Contrast) -> str:
     """How many pairs would settle it."""
     found = contrast.estimate
     if found is None or found.pairs == 1:
-        return "one pair says nothing about noise: run more seeds"
+        return _ONE_PAIR
     margin = _margin(contrast)
     if found.needed is None:
         return f"the noise is far above the margin of {margin}"
@@ -168,6 +169,8 @@ def _why(contrasts: Sequence[Contrast]) -> str:
         return f"within {_margin(first)}"
     needed = [c.estimate.needed for c in contrasts if c.estimate and c.estimate.needed]
     pairs = max(c.estimate.pairs for c in contrasts if c.estimate)
+    if pairs == 1:
+        return _ONE_PAIR
     if not needed or max(needed) <= pairs:
         return f"differences too close to the margin of {_margin(first)} for {pairs} pairs"
     return f"n \u2265 {max(needed)} pairs needed to tell {_margin(first)}, there are {pairs}"

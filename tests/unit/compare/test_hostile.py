@@ -104,6 +104,14 @@ def test_one_seed_is_inconclusive_and_says_so(tmp_path):
     assert "one pair says nothing about noise" in text
 
 
+def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
+    for views in (1, 2, 3):
+        RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
+    text = headlines(tmp_path)
+    assert "not told apart from views=2, views=1" in text
+    assert "one pair says nothing about noise" in text and "1 pairs" not in text
+
+
 def test_three_seeds_say_how_many_would_do(tmp_path):
     for views, offsets in ((1, (0.0, 0.1, -0.1)), (2, (0.1, -0.1, 0.1))):
         for seed, offset in enumerate(offsets):
