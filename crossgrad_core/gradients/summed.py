@@ -10,8 +10,8 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Gradients
+from crossgrad_core.gradients.finite import finite_and_present
 from crossgrad_core.gradients.plain import plain_sums
-from crossgrad_core.gradients.squares import column_gramians
 
 
 class SummedGradients(Gradients):
@@ -103,13 +103,10 @@ class SummedGradients(Gradients):
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """[B] whether each block's gradient is finite, and [B] whether it is also not zero."""
-        columns = [[_contiguous(view.get(name))] for b in self._blocks for name in b.tensors]
-        squares = column_gramians(columns, 1)[:, 0, 0]
-        places = np.repeat(np.arange(len(self._blocks)), [len(b.tensors) for b in self._blocks])
-        norms = np.zeros(len(self._blocks))
-        np.add.at(norms, places, squares)
-        finite = np.isfinite(norms)
-        return finite, finite & (norms > 0)
+        looks = [[finite_and_present(view.get(name)) for name in b.tensors] for b in self._blocks]
+        finite = np.array([all(each for each, _ in block) for block in looks], np.bool_)
+        present = np.array([any(each for _, each in block) for block in looks], np.bool_)
+        return finite, finite & present
 
     def _fold(self, divisor: int) -> None:
         """Adds the view that waits, and divides."""

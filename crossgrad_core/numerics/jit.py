@@ -65,6 +65,11 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     return compiled(function, fastmath=_FLAGS)
 
 
+def part(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a function of its own that only such kernels call."""
+    return compiled(function, fastmath=_FLAGS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
 def device(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function that such kernels call; becomes part of the caller."""
     return inlined(function, fastmath=_FLAGS)

@@ -1,17 +1,10 @@
 """Looks at the state: a run keeps, evaluates and goes back to states that were looked at."""
 
-import torch
-from torch import Tensor
-
 from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-
-
-def is_finite(tensor: Tensor) -> bool:
-    """Whether no element is NaN or infinite."""
-    return bool(torch.isfinite(tensor.detach()).all())
 
 
 def are_parameters_finite(state: TrainState) -> bool:

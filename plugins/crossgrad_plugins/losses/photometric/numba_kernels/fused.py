@@ -22,7 +22,7 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import kernel, parallel_kernel
+from crossgrad_core.numerics.jit import parallel_kernel, part
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     CHANNELS,
     DIFFERENCE,
@@ -50,7 +50,7 @@ _Flags: TypeAlias = NDArray[np.bool_]  # 1-D
 _Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
 
 
-@kernel
+@part
 def _tile(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,

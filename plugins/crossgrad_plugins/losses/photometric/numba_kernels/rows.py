@@ -5,7 +5,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jit import part
 from crossgrad_core.numerics.simd import LANES, load, splat, store, where
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     CENTRE_DIFFERENCE,
@@ -28,7 +28,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _WHITE = np.float32(255)
 
 
-@kernel
+@part
 def set_centres(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, box: _Box, width: int,
@@ -58,7 +58,7 @@ def set_centres(
 # Loops over views from 0 on, because an index that may be negative keeps LLVM from vectorising.
 
 
-@kernel
+@part
 def fill(array: _Floats, start: int, count: int, value: np.float32) -> None:
     """Sets `count` elements from `start` on."""
     view = array[start : start + count]
@@ -66,7 +66,7 @@ def fill(array: _Floats, start: int, count: int, value: np.float32) -> None:
         view[j] = value
 
 
-@kernel
+@part
 def copy(destination: _Floats, start: int, source: _Floats, source_start: int, count: int) -> None:
     """Copies `count` elements."""
     view, values = destination[start : start + count], source[source_start : source_start + count]
@@ -74,7 +74,7 @@ def copy(destination: _Floats, start: int, source: _Floats, source_start: int, c
         view[j] = values[j]
 
 
-@kernel
+@part
 def _copy_8bit(
     destination: _Floats, start: int, source: _Bytes, source_start: int, count: int
 ) -> None:
@@ -83,7 +83,7 @@ def _copy_8bit(
         view[j] = np.float32(values[j]) / _WHITE
 
 
-@kernel
+@part
 def _copy_mask(
     destination: _Floats, start: int, mask: _Flags, mask_start: int, pixels: int
 ) -> None:
@@ -94,7 +94,7 @@ def _copy_mask(
         view[3 * pixel], view[3 * pixel + 1], view[3 * pixel + 2] = keep, keep, keep
 
 
-@kernel
+@part
 def load_row(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, row: int, box: _Box, height: int, width: int,

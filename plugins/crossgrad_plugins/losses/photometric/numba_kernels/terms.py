@@ -5,7 +5,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import kernel, sum_kernel
+from crossgrad_core.numerics.jit import part, sum_kernel
 from crossgrad_core.numerics.simd import LANES, fma, fnma, load, splat, store, where
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     BACK,
@@ -38,7 +38,7 @@ _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 
 
-@kernel
+@part
 def ssim_row(scratch: _Floats, row: int, columns: int) -> None:
     """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts."""
     for j in range(0, CHANNELS * (columns + 4 * RADIUS), LANES):
@@ -86,7 +86,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int) -> None:
         )
 
 
-@kernel
+@part
 def clear_row(scratch: _Floats, row: int, columns: int) -> None:
     """Sets a, b, c of a row outside the image to 0."""
     slot = (row & (SLOTS - 1)) * STRIDE
@@ -94,7 +94,7 @@ def clear_row(scratch: _Floats, row: int, columns: int) -> None:
         fill(scratch, ring + slot, CHANNELS * (columns + 2 * RADIUS), _ZERO)
 
 
-@kernel
+@part
 def gradient_row(
     scratch: _Floats, row: int, columns: int, l1_weight: np.float32, ssim_weight: np.float32
 ) -> None:

@@ -1,0 +1,40 @@
+"""Whether tensors are finite and whether anything is in them."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crossgrad_core.gradients.finite import finite_and_present, is_finite
+
+#: Bits of float32: zeros of both signs, subnormal, largest, infinite and NaN ones among them.
+BITS = st.one_of(
+    st.sampled_from([0, 1 << 31, 1, 0x7F7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0xFF800001]),
+    st.integers(0, 2**32 - 1),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(BITS, max_size=40), st.sampled_from([torch.float32, torch.float64]))
+def test_any_bits_are_judged_as_torch_does(bits, dtype):
+    values = torch.from_numpy(np.array(bits, np.uint32).view(np.float32)).to(dtype)
+    finite, present = finite_and_present(values)
+    assert finite == bool(torch.isfinite(values).all())
+    assert present == bool((values != 0).any())
+    assert is_finite(values) == finite
+
+
+@pytest.mark.parametrize("place", [0, 77, -1])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_one_bad_element_among_many_is_found(place, value):
+    values = torch.zeros(1 << 18)
+    assert finite_and_present(values) == (True, False)
+    values[place] = value
+    assert finite_and_present(values) == (False, True)
+    assert finite_and_present(values.view(512, 512).T) == (False, True)
+
+
+def test_what_is_missing_is_finite_and_absent():
+    assert finite_and_present(None) == (True, False)
+    assert finite_and_present(torch.zeros(0, 3, requires_grad=True)) == (True, False)
