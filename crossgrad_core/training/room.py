@@ -5,6 +5,7 @@ from math import exp, log
 from typing import cast
 
 from crossgrad_core.config import AUTO
+from crossgrad_core.contract.schedule import REFERENCE
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.setup import Setup
@@ -15,7 +16,7 @@ from crossgrad_core.training.views import Rendered
 #: Under this name a run with a curve, or with a budget by itself, keeps the number at its start.
 STATE = "budget"
 #: The budget of runs of so many views, and the power of the length with which that of longer ones
-#: grows: 100,000 at 10,000. Source: measured by metal-gauss.
+#: grows at first: to 100,000 at 10,000 views. Source: measured by metal-gauss.
 SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
 
 
@@ -38,16 +39,21 @@ def _most(setup: Setup, state: TrainState) -> int:
     start = cast("int", state.states.setdefault(STATE, first).values["start"])
     given = config.max_gaussians or sys.maxsize
     budget = usual_budget(start, schedule.length) if given == AUTO else given
-    if config.growth == "free":
+    if config.growth == "free" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
     return min(budget, curve(events - schedule.edits(state.step), events, start, budget))
 
 
 def usual_budget(start: int, length: int) -> int:
-    """The budget of a run that began with `start` primitives and has `length` views."""
+    """The budget of a run that began with `start` primitives and has `length` views.
+
+    It has no bound any more at the published length, whose rules know none.
+    """
+    if length >= REFERENCE:
+        return sys.maxsize
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
-    return round(max(SHORT_BUDGET, start) * stretch)
+    return round(max(SHORT_BUDGET, start) * stretch / (1.0 - length / REFERENCE))
 
 
 def curve(event: int, events: int, start: int, budget: int) -> int:

@@ -1,5 +1,6 @@
 """The budget of density control, and the curve that leads to it, for whatever grows."""
 
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from math import floor
@@ -124,13 +125,15 @@ def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
 
 
 def test_budgets_by_length():
-    assert [usual_budget(5_000, length) for length in (1, 300, 1_000)] == [30_000] * 3
-    assert usual_budget(5_000, 10_000) == 100_000
-    assert usual_budget(90_000, 1_000) == 90_000
-    assert usual_budget(90_000, 10_000) == 300_000
+    assert [usual_budget(5_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
+    assert usual_budget(5_000, 10_000) == 150_000
+    assert usual_budget(90_000, 1_000) == 93_103
+    assert usual_budget(90_000, 10_000) == 450_000
+    assert usual_budget(5_000, 29_999) > 10**9
     lengths = range(1_000, 30_001, 500)
     budgets = [usual_budget(0, length) for length in lengths]
     assert budgets == sorted(set(budgets))
+    assert budgets[-1] == sys.maxsize
 
 
 @pytest.mark.parametrize("longer", [700, 3_000, 5_000])
