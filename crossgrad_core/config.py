@@ -249,6 +249,7 @@ class RunConfig(BaseModel):
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None, ge=1, description="Steps between evaluations."
     )
+    eval_from: int = Field(0, ge=0, description="no evaluation before this step")
     save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None, ge=1, description="Steps between checkpoints."
     )

@@ -175,7 +175,8 @@ def saves_after(setup: Setup, step: int) -> bool:
 def evaluates_after(setup: Setup, step: int) -> bool:
     """Whether the held-out views are evaluated after this step of a run that goes on."""
     every = setup.config.eval_every or max(1, _planned(setup) // 10)
-    return step % every == 0 and 0 < step < setup.schedule.total
+    first = max(1, setup.config.eval_from)
+    return step % every == 0 and first <= step < setup.schedule.total
 
 
 def _record(setup: Setup, state: TrainState, sink: Sink) -> None:

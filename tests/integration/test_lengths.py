@@ -61,6 +61,14 @@ def trained(**settings):
     return setup, state, seen
 
 
+def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
+    often = run(scene, tmp_path / "often", steps=9, eval_every=2)
+    late = run(scene, tmp_path / "late", steps=9, eval_every=2, eval_from=5)
+    assert [row["step"] for row in often] == ["2", "4", "6", "8", "9"]
+    assert [row["step"] for row in late] == ["6", "8", "9"]
+    assert [row["psnr"] for row in late] == [row["psnr"] for row in often[2:]]
+
+
 @pytest.mark.parametrize(
     ("views", "length", "steps", "drawn"),
     [(1, 13, 13, 13), (2, 13, 6, 12), ("1..2@0.5", 13, 8, 12), (3, 12, 4, 12)],
