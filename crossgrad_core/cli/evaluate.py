@@ -15,11 +15,20 @@ Ply = Annotated[
         help="Evaluate the Gaussians of this PLY instead, drawn on black as viewers draw them.",
     ),
 ]
+On = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="SCENE",
+        help="Evaluate on another capture of the place, in the same coordinates: on those of its "
+        "views that the run was not trained on.",
+    ),
+]
 
 
 def evaluate(
     run: RunFolder,
     ply: Ply = None,
+    on: On = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
@@ -29,4 +38,4 @@ def evaluate(
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
-    afterwards.evaluate(run, how, ply)
+    afterwards.evaluate(run, how, ply, on)

@@ -18,12 +18,18 @@ class Split(StrEnum):
     ALL = "all"
 
 
-def render(
+def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: RunFolder,
     split: Annotated[Split, typer.Option(help="Which views are drawn.")] = Split.TEST,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
+    ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENE", help="Draw the views of another capture of the place, as eval does."
+        ),
     ] = None,
     device: Device = None,
     threads: Threads = None,
@@ -34,4 +40,4 @@ def render(
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
-    afterwards.render(run, split=split.value, out=out, how=how)
+    afterwards.render(run, split=split.value, out=out, how=how, on=on)

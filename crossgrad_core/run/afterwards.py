@@ -13,9 +13,18 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.registry.entries import build, find
-from crossgrad_core.run.export import Exported, described, drawer, export_scene, renderer
+from crossgrad_core.run.elsewhere import Elsewhere, elsewhere
+from crossgrad_core.run.export import (
+    Exported,
+    described,
+    drawer,
+    export_scene,
+    plain_renderer,
+    renderer,
+)
 from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.lock import RunInUseError, locked
+from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import flat_names
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
@@ -64,18 +73,68 @@ class How:
 AS_IT_IS = How()
 
 
-def evaluate(folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None) -> None:
-    """Evaluates the held-out views of a run again, or those of a file; prints the table.
+def evaluate(
+    folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None, on: Path | None = None
+) -> None:
+    """Evaluates the held-out views of a run again, or others; prints the table.
+
+    Args:
+        folder: The run's folder.
+        how: How the run is opened.
+        ply: A file that is drawn instead of the run's model.
+        on: Another capture of the place, whose views are drawn instead of the held-out ones.
 
     Raises:
-        UserError: See `evaluated` and `evaluated_file`.
+        UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
     """
-    if ply is None:
+    if ply is not None and on is not None:
+        raise UserError(
+            "a file is evaluated on the run's own held-out views",
+            where="--on",
+            todo="leave out --on, or --ply",
+        )
+    if ply is not None:
+        result, gaussians = evaluated_file(folder, ply, how)
+        told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
+        print("\n".join([*metric_lines(result), told]))  # noqa: T201
+    elif on is not None:
+        result, there = evaluated_on(folder, on, how)
+        print("\n".join([*metric_lines(result), *_told_of(there)]))  # noqa: T201
+    else:
         print(final_table(*evaluated(folder, how)))  # noqa: T201
-        return
-    result, gaussians = evaluated_file(folder, ply, how)
-    told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
-    print("\n".join([*metric_lines(result), told]))  # noqa: T201
+
+
+def evaluated_on(
+    folder: Path, on: Path, how: Opens = AS_IT_IS
+) -> tuple[EvaluationResult, Elsewhere]:
+    """Evaluates a run on another capture of its place; writes per_view_on_<name>.csv.
+
+    Views that the run was trained on are left out. Renders have no exposure: nothing is known of
+    those of other photos.
+
+    Args:
+        folder: The run's folder.
+        on: The other scene, in the coordinates of the run's.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `elsewhere`; or it is no run, or it has no checkpoint.
+    """
+    require_checkpoint(folder)
+    with _writing_if_possible(folder, "evaluating") as writes:
+        setup, state = how.open(folder)
+        there = elsewhere(setup, on)
+        draw, points = plain_renderer(setup, state), there.points
+        result = measured(there.views, draw, setup.metrics, points=points)
+        if writes:
+            write_per_view(folder, result, f"per_view_on_{there.name}.csv")
+        return result, there
+
+
+def _told_of(there: Elsewhere) -> list[str]:
+    if not there.trained:
+        return []
+    return [f"left out: {there.trained} of its views that the run was trained on"]
 
 
 def evaluated_file(folder: Path, ply: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, int]:
@@ -119,18 +178,35 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         return result, totals(setup, state)
 
 
-def render(folder: Path, *, split: str, out: Path | None, how: Opens = AS_IT_IS) -> None:
-    """Draws photo | render | error of the views of a run.
+def render(
+    folder: Path,
+    *,
+    split: str,
+    out: Path | None,
+    how: Opens = AS_IT_IS,
+    on: Path | None = None,
+) -> None:
+    """Draws photo | render | error of the views of a run, or of another capture of its place.
+
+    Args:
+        folder: The run's folder.
+        split: Which of its views: test, train or all.
+        out: Where the pictures go; by default into the run's folder.
+        how: How the run is opened.
+        on: The other capture, whose views are drawn instead; see `evaluated_on`.
 
     Raises:
         UserError: It is no run, it has no checkpoint, the split is empty, or it is training and no
-            other folder is named.
+            other folder is named; see also `elsewhere`.
     """
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
         setup, state = how.open(folder)
-        scene = setup.scene
+        scene, draw = setup.scene, renderer(setup, state)
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+        if on is not None:
+            there, draw = elsewhere(setup, on), plain_renderer(setup, state)
+            views, out = there.views, out or folder_of(folder, state.step) / f"on_{there.name}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -140,7 +216,7 @@ def render(folder: Path, *, split: str, out: Path | None, how: Opens = AS_IT_IS)
         writer = PanelWriter.of(folder, state.step, views, len(views))
         if out is not None:
             writer = replace(writer, folder=out)
-        measured(views, renderer(setup, state), setup.metrics, on_view=writer.write)
+        measured(views, draw, setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
 

@@ -153,6 +153,12 @@ def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
     return lambda view: exposed(setup, state, view, through(view.camera))
 
 
+def plain_renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
+    """Renders a view that is none of the scene's: nothing is known of its exposure."""
+    through = camera_renderer(setup, state)
+    return lambda view: through(view.camera)
+
+
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
     """Renders what any camera sees with the parameters to be shown, before any exposure."""
     background, parameters = eval_background(setup), shown(state)

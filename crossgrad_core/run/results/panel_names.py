@@ -33,10 +33,14 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
-    """At most `count` views: every regime in turn, evenly spread over each regime's views."""
+    """`count` views, or all: every regime in turn, evenly spread over each regime's views."""
     regimes = sorted({view.regime for view in views})
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
-    share = [count // len(groups) + (i < count % len(groups)) for i in range(len(groups))]
+    share = [0] * len(groups)
+    for _ in range(min(count, len(views))):
+        # The first of those that have the fewest so far, and one more.
+        unused = [i for i, group in enumerate(groups) if share[i] < len(group)]
+        share[min(unused, key=share.__getitem__)] += 1
     chosen = {
         view.name
         for group, wanted in zip(groups, share, strict=True)

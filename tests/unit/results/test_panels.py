@@ -46,6 +46,8 @@ def test_views_are_spread_over_regimes_and_within_them(make_view):
     ]
     assert [view.name for view in chosen_views(views, 1)] == ["far/05"]
     assert len(chosen_views(views, 100)) == 12
+    # What a small regime has no views for goes to the others.
+    assert len(chosen_views(views[:-4], 7)) == 7 and len(chosen_views(views[5:], 7)) == 7
     assert chosen_views(views, 0) == ()
     assert chosen_views([], 4) == ()
 

@@ -1,0 +1,106 @@
+"""The views of another capture of the same place, as a run sees them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from crossgrad_core.config import AUTO, ComponentChoice
+from crossgrad_core.contract.scene import Camera, Scene, Similarity, View, centers_of
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import read_scene
+from crossgrad_core.training.setup import Setup
+
+#: A pose nearer than this to a training view's is that view: local units (extents), and radians.
+SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
+#: Of the other capture's points at least this share lies in the box of the run's points and
+#: cameras, made so much larger.
+LEAST_SHARED, MARGIN = 0.1, 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class Elsewhere:
+    """Another capture in the local frame of a run.
+
+    Attributes:
+        name: Its name.
+        views: Those of its views that the run was not trained on.
+        points: [P, 3] its SfM points.
+        trained: How many of its views the run was trained on.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    points: NDArray[np.float64]
+    trained: int
+
+
+def elsewhere(setup: Setup, path: Path) -> Elsewhere:
+    """The views of another scene in the same input coordinates, in the size of the run's photos.
+
+    Raises:
+        UserError: It cannot be read, lies elsewhere, or the run was trained on all of its views.
+    """
+    reading = {"split": "none", "masks": None, "init": "random"}  # It need not have any.
+    config = setup.config.model_copy(
+        update={
+            "reading": setup.config.reading.model_copy(update=reading),
+            "reader": ComponentChoice(name=AUTO),
+        }
+    )
+    other, _ = read_scene(config, path)
+    frame = setup.scene.similarity
+    points = frame.to_local(other.similarity.to_input(other.points))
+    moved = [replace(view, camera=_moved(view.camera, other, frame)) for view in other.views]
+    _check_place(setup.scene, points, centers_of(moved), path)
+    views = tuple(view for view in moved if not _is_trained(view, setup.train_views))
+    if not views:
+        raise UserError(
+            "the run was trained on all views of this scene",
+            where=f"--on {path}",
+            todo="name another capture of the place; leave --on out for the held-out views",
+        )
+    return Elsewhere(other.name, views, points, len(moved) - len(views))
+
+
+def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
+    """The camera of another scene's local frame in the frame of `similarity`."""
+    rotation = camera.world_to_camera[:3, :3]
+    center = other.similarity.to_input(camera.center.numpy()[None])
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ torch.from_numpy(similarity.to_local(center)[0])
+    return replace(camera, world_to_camera=pose)
+
+
+def _is_trained(view: View, trained: Sequence[View]) -> bool:
+    return any(_same_pose(view.camera, each.camera) for each in trained)
+
+
+def _same_pose(one: Camera, other: Camera) -> bool:
+    if float(torch.linalg.vector_norm(one.center - other.center)) > SAME_PLACE:
+        return False
+    turned = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
+    return math.acos(min(1.0, (float(turned.trace()) - 1.0) / 2.0)) <= SAME_DIRECTION
+
+
+def _check_place(
+    scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
+) -> None:
+    """Refuses a capture in other coordinates: what it shows is not where the run's scene is."""
+    own = np.concatenate([scene.points, centers_of(scene.views)])
+    middle, half = (own.max(axis=0) + own.min(axis=0)) / 2, np.ptp(own, axis=0) / 2
+    what = points if len(points) else centers
+    share = float(np.mean(np.all(np.abs(what - middle) <= MARGIN * half, axis=1)))
+    if share < LEAST_SHARED:
+        raise UserError(
+            "this scene lies elsewhere",
+            where=f"--on {path}",
+            expected="a capture of the same place, in the coordinates of the run's scene",
+            found=f"{share:.0%} of its points lie within the run's",
+            todo="align the two models first, or find the poses of all photos in one go",
+        )

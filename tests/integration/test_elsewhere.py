@@ -1,0 +1,92 @@
+"""A run on the views of another capture of its place."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.run import afterwards, app
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+
+PLACE = {"scale": 7.0, "offset": (40.0, -20.0, 3.0)}
+
+
+def without(scene, folder, gone):
+    """The scene without some of its photos, whose cameras have another extent."""
+    guard_pycolmap()
+    import pycolmap
+
+    shutil.copytree(scene, folder)
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for image in list(model.images.values()):
+        if gone(image.name):
+            model.deregister_frame(image.frame_id)
+            (folder / "images" / image.name).unlink()
+    model.write_binary(folder / "sparse" / "0")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "place"
+    return write_tiny_scene(folder, views=9, folders=("street", "aerial"), **PLACE)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A run that has seen the far photos alone."""
+    root = tmp_path_factory.mktemp("run")
+    far = without(scene, root / "far", lambda name: name.startswith("street"))
+    settings = {"scene": str(far), "out": str(root / "run"), "steps": 20, "threads": 1}
+    assert app.run(settings, verbosity=-1) == 0
+    return root / "run"
+
+
+def per_view(path):
+    with path.open() as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures(
+    trained, scene, capsys
+):
+    result, there = afterwards.evaluated_on(trained, scene)
+    assert there.trained == 7 and len(result.views) == 11
+    assert set(result.regimes) == {"street", "aerial"}
+    rows, own = per_view(trained / "per_view_on_place.csv"), per_view(trained / "per_view.csv")
+    assert len(rows) == 11 and set(own) == {name for name in rows if "aerial" in name}
+    for name, row in own.items():
+        # Their cameras took two local frames to get here: a rounded pixel may differ.
+        assert float(rows[name]["psnr"]) == pytest.approx(float(row["psnr"]), abs=0.02)
+    afterwards.evaluate(trained, on=scene)
+    printed = capsys.readouterr().out
+    assert "street" in printed and "left out: 7 of its views" in printed
+
+
+def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
+    afterwards.render(trained, split="test", out=None, on=scene)
+    (folder,) = (trained / "renders").glob("*/on_place")
+    assert len(list(folder.glob("*.png"))) == 11
+    afterwards.render(trained, split="test", out=tmp_path / "own", on=scene)
+    assert len(list((tmp_path / "own").iterdir())) == 11
+
+
+def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
+    before = sorted(trained.rglob("*"))
+    # Without a second photo there are no points left: none are needed.
+    only = without(scene, tmp_path / "only", lambda name: name != "aerial/0001.png")
+    with pytest.raises(UserError, match="trained on all views"):
+        afterwards.evaluate(trained, on=only)
+    away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
+    far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
+    with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
+        afterwards.evaluate(trained, on=far_away)
+    with pytest.raises(UserError, match="own held-out views"):
+        afterwards.evaluate(trained, on=scene, ply=trained / "point_cloud.ply")
+    with pytest.raises(UserError):
+        afterwards.evaluate(trained, on=tmp_path / "nothing")
+    assert sorted(trained.rglob("*")) == before
+    assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
