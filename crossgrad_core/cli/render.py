@@ -31,6 +31,17 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             metavar="SCENE", help="Draw the views of another capture of the place, as eval does."
         ),
     ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|ladder",
+            help="Draw a film instead: along the cameras of a file, or from the farthest photos "
+            "down to the nearest.",
+        ),
+    ] = None,
+    frames: Annotated[
+        int, typer.Option(metavar="N", min=2, help="Frames of a ladder. Default: 120.")
+    ] = 120,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
@@ -40,4 +51,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
+    if path is not None:
+        afterwards.fly(run, path, frames=frames, out=out, how=how)
+        return
     afterwards.render(run, split=split.value, out=out, how=how, on=on)

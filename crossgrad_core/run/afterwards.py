@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+import torch
+
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
@@ -16,13 +18,16 @@ from crossgrad_core.registry.entries import build, find
 from crossgrad_core.run.elsewhere import Elsewhere, elsewhere
 from crossgrad_core.run.export import (
     Exported,
+    camera_renderer,
     described,
     drawer,
     export_scene,
     plain_renderer,
     renderer,
 )
+from crossgrad_core.run.flight import flight
 from crossgrad_core.run.opening import opened, require_checkpoint
+from crossgrad_core.run.results.film import write_film, write_frames
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import flat_names
@@ -218,6 +223,31 @@ def render(
             writer = replace(writer, folder=out)
         measured(views, draw, setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
+
+
+def fly(folder: Path, path: str, *, frames: int, out: Path | None, how: Opens = AS_IT_IS) -> None:
+    """Draws what cameras along a path see, as pictures and as a film.
+
+    Args:
+        folder: The run's folder.
+        path: See `flight`.
+        frames: See `flight`.
+        out: Where the pictures go; by default into the run's folder.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `flight`; or it is no run, it has no checkpoint, or it is training and no
+            other folder is named.
+    """
+    with _writing(folder, out, "rendering"):
+        check_folder(out or folder)
+        setup, state = how.open(folder)
+        along, draw = flight(setup.scene, path, frames), camera_renderer(setup, state)
+        out = out or folder_of(folder, state.step) / f"path_{along.name}"
+        with torch.no_grad():
+            files = write_frames(map(draw, along.cameras), out)
+        film = write_film(files, out.with_name(f"{out.name}_film"), along.fps)
+        print(f"{len(files)} frames in {out}" + (f", film {film}" if film else ""))  # noqa: T201
 
 
 def export(

@@ -74,6 +74,13 @@ def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
     assert len(list((tmp_path / "own").iterdir())) == 11
 
 
+def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
+    afterwards.fly(trained, "ladder", frames=3, out=tmp_path / "ladder")
+    assert len(list((tmp_path / "ladder").glob("*.png"))) == 3
+    assert len(list(tmp_path.glob("ladder_film.*"))) == 1
+    assert "3 frames" in capsys.readouterr().out
+
+
 def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
     before = sorted(trained.rglob("*"))
     # Without a second photo there are no points left: none are needed.

@@ -1,0 +1,92 @@
+"""Frames as files, and as a film."""
+
+import io
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from torch import Tensor
+
+from crossgrad_core.contract.images import eight_bit
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import write_atomically
+
+#: A program that writes films; where there is none, Pillow writes an animated picture.
+ENCODER: Final = "ffmpeg"
+_QUALITY: Final = 85
+#: Bytes of all frames of an animated picture, which are in memory at once.
+_LARGEST: Final = 1 << 29
+
+
+def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
+    """Writes `00000.png` and so on; answers with the files in their order.
+
+    Args:
+        images: Each [H, W, 3] float, need not be clamped.
+        folder: Made if need be.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for number, image in enumerate(images):
+        picture = io.BytesIO()
+        Image.fromarray(eight_bit(image).cpu().numpy()).save(picture, format="png")
+        files.append(folder / f"{number:05d}.png")
+        write_atomically(files[-1], picture.getvalue())
+    return files
+
+
+def write_film(frames: list[Path], path: Path, fps: float) -> Path | None:
+    """Writes the frames as `path`.mp4 where ffmpeg is installed, else as `path`.webp.
+
+    Frames that are too many for an animated picture remain frames.
+
+    Args:
+        frames: PNG files named by their numbers, in one folder.
+        path: Without a suffix.
+        fps: Frames per second.
+
+    Raises:
+        UserError: ffmpeg failed, or the disk is full.
+    """
+    encoder = shutil.which(ENCODER)
+    if encoder is None:
+        return _animated(frames, path.with_suffix(".webp"), fps)
+    target = path.with_suffix(".mp4")
+    # Players want even sides and this pixel format.
+    shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+    source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
+    command = [encoder, "-y", "-loglevel", "error", *source, *shape, str(target)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    if ended.returncode != 0:
+        raise UserError(
+            "the film could not be written",
+            where=target,
+            found=ended.stderr.strip()[-300:],
+            todo=f"the frames are in {frames[0].parent}",
+        )
+    return target
+
+
+def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
+    from PIL import Image
+
+    with Image.open(frames[0]) as image:
+        size = 3 * image.width * image.height
+    if size * len(frames) > _LARGEST:
+        return None
+    images = []
+    for frame in frames:  # Pillow wants them all at once.
+        with Image.open(frame) as image:
+            images.append(image.copy())
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0,
+        quality=_QUALITY,
+    )  # fmt: skip
+    return path
