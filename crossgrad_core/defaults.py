@@ -12,6 +12,8 @@ OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"
 START: Final = "sfm"
+#: The start that has points for a scene without any: a hint.
+START_ALONE: Final = "triangulated"
 RESOLUTION: Final = "full"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"

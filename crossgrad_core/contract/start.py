@@ -33,9 +33,13 @@ class Start(Component):
     """Adds points where a scene has too few to begin with; asked once and again, it answers alike.
 
     Only runs that start from the scene's own points (`--init points`) ask it.
+
+    Attributes:
+        alone: Whether it has points for a scene without any; it then raises where it finds none.
     """
 
     slot: ClassVar[str] = "starts"
+    alone: ClassVar[bool] = False
 
     @abstractmethod
     def more_points(self, scene: Scene) -> MorePoints | None:

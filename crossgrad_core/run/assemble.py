@@ -28,7 +28,7 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
-from crossgrad_core.defaults import CHAIN, EXPORTER, METRICS, READER
+from crossgrad_core.defaults import CHAIN, EXPORTER, METRICS, READER, START_ALONE
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
@@ -64,17 +64,22 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     """The scene and the name of the reader that read it.
 
     Raises:
-        UserError: No reader accepts the folder, or the one that does cannot read it.
+        UserError: No reader accepts the folder, or several do, or one cannot read it.
     """
     _LOG.info("reading scene %s", path)
-    names = [config.reader.name] if config.reader.name != AUTO else list(entries("readers"))
-    for name in names:
-        reader = build(Reader, name, config.reader.options)
-        if config.reader.name != AUTO or reader.accepts(path):
-            return reader.read(path, config.reading), name
-    # No reader recognises it: the default one explains what it misses.
-    reader = build(Reader, READER, {})
-    return reader.read(path, config.reading), READER
+    name = config.reader.name
+    if name == AUTO:
+        able = [each for each in entries("readers") if build(Reader, each, {}).accepts(path)]
+        if len(able) > 1:
+            raise UserError(
+                "the scene can be read in several ways",
+                where=path,
+                found=f"files of the readers {listed(able)}",
+                todo=f"choose one, such as --reader {able[0]}",
+            )
+        # No reader recognises it: the default one explains what it misses.
+        name = able[0] if able else READER
+    return build(Reader, name, config.reader.options).read(path, config.reading), name
 
 
 def check_names(config: RunConfig) -> None:
@@ -225,7 +230,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    _require_points(config, scene)
+    start = _built(Start, config.start)
+    _require_points(config, scene, start)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
     sampler = _built(Sampler, config.sampler)
@@ -274,7 +280,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         rasterizer=rasterizer,
         loss=_built(Loss, config.loss),
         exposure=fitted.exposure,
-        start=_built(Start, config.start),
+        start=start,
         resolution=_built(Resolution, config.resolution).fitted_to(scene),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
@@ -287,12 +293,13 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     return selection, notes
 
 
-def _require_points(config: RunConfig, scene: Scene) -> None:
-    if scene.points.shape[0] == 0 and config.reading.init == "points":
+def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
+    if not len(scene.points) and config.reading.init == "points" and not start.alone:
         raise UserError(
             "the scene has no SfM points to start from",
-            where=scene.name,
-            todo="use --init random, or --init FILE.ply",
+            where=config.scene or scene.name,
+            todo=f"find some in the photos (--start {START_ALONE}), or start from random ones "
+            "(--init random) or from those of a file (--init FILE.ply)",
         )
 
 

@@ -35,7 +35,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         UserError: The input cannot be trained on; says what is wrong, where, and what to do.
     """
     check_views(raw)
-    points, point_notes = check_points(raw, options)
+    points, point_notes = check_points(raw)
     photos = choose_photos(raw, options)
     label = _labels(raw, photos, points)
     split = split_views(sorted(photos.sources), options, raw.root, raw.split, label)
@@ -46,11 +46,11 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     poses = np.stack([used[i].world_to_camera for i in train])
     frame = make_frame(camera_centers(poses), points.xyz)
     kept = replace(raw, views=tuple(used))
-    points, far_notes = check_distances(kept, options, points, frame)
+    points, far_notes = check_distances(kept, points, frame)
     local = frame.points(points.xyz)
     cameras = [_localize(view, photos, frame) for view in used]
     seen = [points.rows(view.seen) for view in used]
-    by_folder = label_by_folder([view.name for view in used])
+    by_folder = label_by_folder([view.place or view.name for view in used])
     if split.regimes is not None:
         regimes = tuple(split.regimes[view.name] for view in used)
     else:
@@ -85,7 +85,7 @@ def _labels(raw: RawScene, photos: ChosenPhotos, points: CheckedPoints) -> Label
     names = [view.name for view in views]
 
     def label(train: Sequence[str]) -> Mapping[str, str]:
-        if by_folder := label_by_folder(names):
+        if by_folder := label_by_folder([view.place or view.name for view in views]):
             return dict(zip(names, by_folder, strict=True))
         poses = np.stack([view.world_to_camera for view in views])
         frame = make_frame(camera_centers(poses), points.xyz)

@@ -67,7 +67,8 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         UserError: No view has a photo, a photo is damaged or does not fit its camera, or the mask
             folder that was asked for is not there.
     """
-    folders = find_photo_folders(raw.images)
+    # Beside the scene's own folder lies what is not the scene's.
+    folders = find_photo_folders(raw.images)[: 1 if raw.images == raw.root else None]
     names = sorted(view.name for view in raw.views)
     full = _read_full(folders[0], names)
     found, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
@@ -205,8 +206,10 @@ def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
 
 def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> dict[str, Path]:
     folder = find_mask_folder(options.masks, raw.root)
-    if folder is None:
-        return {}
+    found = frozenset(names)
+    named = {view.name: view.mask for view in raw.views if view.mask and view.name in found}
+    if folder is None or (named and options.masks is None):
+        return named
     pairs = ((name, find_mask(folder, name)) for name in names)
     masks = {name: path for name, path in pairs if path is not None}
     check_masks(folder, options.masks, len(masks), names)

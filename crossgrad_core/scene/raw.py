@@ -18,12 +18,16 @@ class RawView:
         calibration: Camera model, before undistortion and resizing.
         world_to_camera: [4, 4] float64, rigid, input frame to camera frame (OpenCV axes).
         seen: [S] int64 rows of the scene's points that the view observed; may be empty.
+        mask: Its mask where the input names it; an option for the mask folder comes first.
+        place: Path whose folders tell the regime; None for the name's own folders.
     """
 
     name: str
     calibration: Calibration
     world_to_camera: NDArray[np.float64]
     seen: NDArray[np.int64]
+    mask: Path | None = None
+    place: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,11 @@ import os
 import unicodedata
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.frame import Frame, camera_centers
 from crossgrad_core.scene.raw import RawScene, RawView
@@ -77,27 +76,22 @@ def check_views(raw: RawScene) -> None:
         _check_view(raw, view)
 
 
-def check_points(raw: RawScene, options: SceneOptions) -> tuple[CheckedPoints, list[str]]:
-    """Leaves out points that are not finite, and says so.
-
-    Raises:
-        UserError: No point is left and training is to start from the points.
-    """
+def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
+    """Leaves out points that are not finite, and says so."""
     finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
     broken = int((~finite).sum())
     notes = [f"points: {count(broken, 'point')} left out: not finite"] if broken else []
-    _require_points(finite, raw.root, options)
     new_row = np.where(finite, np.cumsum(finite) - 1, -1)
     return CheckedPoints(raw.points[finite], raw.point_colors[finite], new_row), notes
 
 
 def check_distances(
-    raw: RawScene, options: SceneOptions, points: CheckedPoints, frame: Frame
+    raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
     """Leaves out points too far from the training cameras for single precision, and says so.
 
     Raises:
-        UserError: A camera is too far away, or no point is left to start from.
+        UserError: A camera is too far away.
     """
     poses = np.stack([view.world_to_camera for view in raw.views])
     centers = np.abs(frame.similarity.to_local(camera_centers(poses))).max(1)
@@ -113,21 +107,10 @@ def check_distances(
     far = int((~near).sum())
     if not far:
         return points, []
-    _require_points(near, raw.root, options)
     return points.selected(near), [
         f"points: {count(far, 'point')} left out: farther than {FARTHEST_LOCAL:g} times the extent "
         "of the training cameras"
     ]
-
-
-def _require_points(usable: NDArray[np.bool_], root: Path, options: SceneOptions) -> None:
-    if not usable.any() and options.init == "points":
-        raise UserError(
-            "the scene has no SfM points to start from",
-            where=root,
-            todo="start from random ones (--init random), or from those of a file (--init "
-            "FILE.ply)",
-        )
 
 
 def _check_name(raw: RawScene, name: str) -> None:

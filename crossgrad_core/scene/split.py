@@ -53,7 +53,7 @@ def split_views(
         names: Names of all usable views.
         options: Says how.
         root: Folder with `train_list.txt` and `test_list.txt`, if any.
-        given: Training and test names that the input itself prescribes.
+        given: Training and test names that the input itself prescribes; lists come first.
         label: Tells the regimes; by default there are none.
 
     Raises:
@@ -62,9 +62,9 @@ def split_views(
     if options.split == "none":
         return Split(tuple(sorted(names)), (), (f"split: all {len(names)} views are trained on",))
     if options.split == "auto":
-        listed = given or _read_lists(root, names)
-        if listed:
-            return _split_by_lists(names, listed, root, "by lists" if not given else "as given")
+        for listed, how in ((_read_lists(root, names), "by lists"), (given, "as given")):
+            if listed is not None:
+                return _split_by_lists(names, listed, root, how)
     every = _split_every(names, options.test_every)
     return every if options.split == "every" else _by_regime(every, names, options, label)
 

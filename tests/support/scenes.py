@@ -119,7 +119,7 @@ def _look_at(center: Array, target: Array) -> Array:
 
 
 def _make_camera(
-    camera_id: int, model: str, size: tuple[int, int], focal: float
+    camera_id: int, model: str, size: tuple[int, int], focal: float, centered: bool = False
 ) -> "pycolmap.Camera":
     """A pycolmap camera with an off-centre principal point and, where it has any, distortion."""
     guard_pycolmap()
@@ -127,7 +127,7 @@ def _make_camera(
 
     camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, *size)
     params = np.array(camera.params)
-    params[list(camera.principal_point_idxs())] += [1.5, -1.0]
+    params[list(camera.principal_point_idxs())] += [0.0, 0.0] if centered else [1.5, -1.0]
     first_extra = list(camera.extra_params_idxs())[:1]
     params[first_extra] = _DISTORTION.get(model, -0.08)
     camera.params = params.tolist()
@@ -135,13 +135,18 @@ def _make_camera(
 
 
 def _make_shots(
-    count: int, size: tuple[int, int], folders: Sequence[str], model: str, mixed: bool
+    count: int,
+    size: tuple[int, int],
+    folders: Sequence[str],
+    model: str,
+    mixed: bool,
+    centered: bool = False,
 ) -> tuple[list["pycolmap.Camera"], list[_Shot]]:
     width, height = size
-    cameras = [_make_camera(1, model, size, 1.2 * width)]
+    cameras = [_make_camera(1, model, size, 1.2 * width, centered)]
     if mixed:
         other = (width * 3 // 4, height * 5 // 4)
-        cameras.append(_make_camera(2, model, other, 1.5 * width))
+        cameras.append(_make_camera(2, model, other, 1.5 * width, centered))
     shots = []
     for rank in range(len(folders)):
         # Folders are rings around the scene, each 3 times farther away than the one before.
@@ -241,6 +246,7 @@ def write_tiny_scene(
     folders: Sequence[str] = ("",),
     model: str = "PINHOLE",
     mixed: bool = False,
+    centered: bool = False,
     text: bool = False,
     suffix: str = ".png",
     scale: float = 1.0,
@@ -261,6 +267,7 @@ def write_tiny_scene(
             `("street", "aerial")` is a near and a far regime with the same file names.
         model: COLMAP camera model; models with distortion get some.
         mixed: Every other photo is of a second camera with another size and focal length.
+        centered: The principal point is the middle of the photo.
         text: Write cameras.txt, images.txt, points3D.txt rather than the binary files.
         suffix: `.png`, `.jpg` (quality 95) or another that Pillow knows.
         scale: Multiplies every length of the scene.
@@ -275,7 +282,7 @@ def write_tiny_scene(
 
     rng = np.random.default_rng(seed)
     world = _make_world(rng)
-    cameras, shots = _make_shots(views, (width, height), folders, model, mixed)
+    cameras, shots = _make_shots(views, (width, height), folders, model, mixed, centered)
     cloud = _make_points(world, shots, points, rng)
     seen = [_observe(world, shot, cloud[0]) for shot in shots]
     for shot in shots:

@@ -115,7 +115,7 @@ def _no_model(scene: Path) -> UserError:
         found=", ".join(below[:8]) or "an empty folder",
         todo="name the folder that holds sparse/, or estimate the poses with pycolmap, which is "
         "installed with crossgrad: extract_features, match_exhaustive, incremental_mapping "
-        "(docs/photos.md has the lines)",
+        "(docs/photos.md has the lines); docs/readers.md lists the other formats of poses",
     )
 
 

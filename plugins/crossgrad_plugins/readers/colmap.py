@@ -45,24 +45,37 @@ class ColmapReader(Reader):
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        check_scene_folder(path)
-        folder, notes = choose_model(path, self.model)
-        model = read_model(folder)
-        form = "binary" if (folder / "cameras.bin").is_file() else "text"
-        notes.append(
-            f"COLMAP: {count(len(model.images), 'posed image')}, "
-            f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
-            f"{folder.relative_to(path)} ({form})"
-        )
-        raw = RawScene(
-            root=path,
-            images=path / self.images,
-            views=_make_views(model, folder),
-            points=model.points,
-            point_colors=model.colors,
-            notes=tuple(notes),
-        )
-        return build_scene(raw, options)
+        return build_scene(read_raw(path, self.images, self.model), options)
+
+
+def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
+    """A COLMAP scene as it is in its files.
+
+    Args:
+        path: The scene's folder.
+        images: Folder of the photos within it.
+        wanted: Folder of the model within it; None for the one with most images.
+
+    Raises:
+        UserError: There is no model, or a file of it cannot be read.
+    """
+    check_scene_folder(path)
+    folder, notes = choose_model(path, wanted)
+    model = read_model(folder)
+    form = "binary" if (folder / "cameras.bin").is_file() else "text"
+    notes.append(
+        f"COLMAP: {count(len(model.images), 'posed image')}, "
+        f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
+        f"{folder.relative_to(path)} ({form})"
+    )
+    return RawScene(
+        root=path,
+        images=path / images,
+        views=_make_views(model, folder),
+        points=model.points,
+        point_colors=model.colors,
+        notes=tuple(notes),
+    )
 
 
 def _make_views(model: ColmapModel, folder: Path) -> tuple[RawView, ...]:

@@ -121,6 +121,11 @@ REGRESSIONS: Mapping[str, Mapping[str, Change]] = {
             3, "sparse/1/images.txt", b"0000.png", b"\x1b[2J.png"
         ),
     },
+    "nerfstudio-scene": {
+        "points of a name that is too long": _replaced(
+            0, "transforms.json", b"cloud.ply", b"[" * 2000
+        ),
+    },
     "photo-headers": {
         "a JPEG of too many pixels": _large(0, -1, struct.pack(">HH", 1100, 1000), 3000),
         "a BMP of too many pixels": _large(14, 18, struct.pack("<ii", 2000, 1000), 0),

@@ -543,13 +543,12 @@ class TestModels:
         refuses(path, "no posed image", "registered")
 
     @pytest.mark.parametrize("missing", [False, True])
-    def test_zero_points_need_another_start(self, make, missing):
+    def test_a_scene_may_have_no_points(self, make, missing):
         path = make()
         (model(path) / "points3D.bin").write_bytes(struct.pack("<Q", 0))
         if missing:
             (model(path) / "points3D.bin").unlink()
-        refuses(path, "no SfM points", "--init random")
-        scene = read(path, init="random")
+        scene = read(path)
         assert scene.points.shape == (0, 3)
         assert all(len(view.seen) == 0 for view in scene.views)
         assert "regimes by footprint: all 8 views (7 train, 1 test)" in notes(scene)

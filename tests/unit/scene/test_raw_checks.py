@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import camera_centers, make_frame
@@ -74,7 +73,7 @@ def test_cameras_beyond_single_precision_are_refused(size, params, words):
 def test_points_that_are_not_finite_are_left_out(value):
     points = POINTS.copy()
     points[1, 2] = value
-    checked, notes = check_points(raw(points=points), SceneOptions())
+    checked, notes = check_points(raw(points=points))
     assert len(checked.xyz) == 3
     assert "1 point left out" in notes[0]
 
@@ -82,20 +81,20 @@ def test_points_that_are_not_finite_are_left_out(value):
 def test_points_too_far_for_single_precision_are_left_out():
     points = POINTS.copy()
     points[1] = 1e25
-    scene, options = raw(points=points), SceneOptions()
-    checked, _ = check_points(scene, options)
+    scene = raw(points=points)
+    checked, _ = check_points(scene)
     frame = make_frame(camera_centers(np.stack([v.world_to_camera for v in scene.views])), POINTS)
-    kept, notes = check_distances(scene, options, checked, frame)
+    kept, notes = check_distances(scene, checked, frame)
     np.testing.assert_array_equal(kept.xyz, POINTS[[0, 2, 3]])
     assert kept.rows(np.array([0, 1, 3])).tolist() == [0, 2]
     assert "1 point left out" in notes[0]
 
 
 def test_a_camera_too_far_for_single_precision_is_refused():
-    scene, options = raw(shifts=((0, 0, 0), (1e25, 0, 0))), SceneOptions()
-    checked, _ = check_points(scene, options)
+    scene = raw(shifts=((0, 0, 0), (1e25, 0, 0)))
+    checked, _ = check_points(scene)
     frame = make_frame(np.array([[0.0, 0, 0], [1.0, 0, 0]]), POINTS)
-    refused(lambda: check_distances(scene, options, checked, frame), "too far", "b.jpg")
+    refused(lambda: check_distances(scene, checked, frame), "too far", "b.jpg")
 
 
 def test_cameras_whose_distance_has_no_inverse_stand_in_one_place():

@@ -138,6 +138,9 @@ def test_one_list_leaves_the_rest_to_the_other(tmp_path):
 def test_a_split_of_the_input_itself_is_kept(tmp_path):
     given = (frozenset({"00.jpg"}), frozenset({"01.jpg"}))
     assert split(NAMES, tmp_path, given=given).test == ("01.jpg",)
+    # Lists of the user come first.
+    (tmp_path / "test_list.txt").write_text("02.jpg\n")
+    assert split(NAMES, tmp_path, given=given).test == ("02.jpg",)
 
 
 def test_names_in_both_lists_are_refused(tmp_path):

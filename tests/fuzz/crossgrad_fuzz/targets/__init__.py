@@ -7,6 +7,7 @@ from crossgrad_fuzz.targets import (
     lists,
     photos,
     ply,
+    readers,
     records,
     scenes,
     settings,
@@ -15,6 +16,9 @@ from crossgrad_fuzz.targets import (
 
 TARGETS: dict[str, Target] = {
     target.name: target
-    for module in (ply, colmap, scenes, photos, settings, checkpoints, lists, tables, records)
+    for module in (
+        *(ply, colmap, scenes, readers, photos, settings, checkpoints, lists, tables),
+        *(records,),
+    )
     for target in module.TARGETS
 }

@@ -104,12 +104,11 @@ def _raw_seeds() -> Sequence[Case]:
 
 def _parse_raw(folder: Path) -> None:
     raw = _raw(folder)
-    options = SceneOptions(init="points" if len(raw.points) % 2 else "random")
     check_views(raw)
-    points, _ = check_points(raw, options)
+    points, _ = check_points(raw)
     poses = np.stack([view.world_to_camera for view in raw.views])
     made = make_frame(camera_centers(poses), points.xyz)
-    points, _ = check_distances(raw, options, points, made)
+    points, _ = check_distances(raw, points, made)
     _check_scene(made.points(points.xyz), len(raw.views))
     assert np.isfinite(made.similarity.scale)
     for view in raw.views:

@@ -1,0 +1,182 @@
+"""JSON files of scenes: of bounded size and depth, with typed fields whose errors name them."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.plugin import UserError, size_text
+
+#: Bytes of a file; Python's values take some ten times as many.
+LARGEST: Final = 512 << 20
+_FAR: Final = 1e30
+_AGAIN = "mend the file, or export it again"
+_LONGEST: Final = 80
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """A JSON object; each getter raises a `UserError` that names file and field.
+
+    Attributes:
+        value: Its members.
+        file: Where it stands.
+        place: Its own place in the file, such as `frames[3]`; empty at the top.
+    """
+
+    value: Mapping[str, object]
+    file: Path
+    place: str = ""
+
+    @property
+    def here(self) -> str:
+        """Names the object in an error."""
+        return f"{self.file}: {self.place}"
+
+    def where(self, key: str) -> str:
+        """Names a field in an error."""
+        return f"{self.file}: {self.place}{'.' if self.place else ''}{key}"
+
+    def __contains__(self, key: str) -> bool:
+        return self.value.get(key) is not None
+
+    def wrong(self, key: str, expected: str, found: str | None = None) -> NoReturn:
+        """Refuses a field.
+
+        Raises:
+            UserError: Always.
+        """
+        here = repr(self.value[key])[:_LONGEST] if key in self.value else "no such field"
+        raise UserError(
+            "a field of the scene cannot be read",
+            where=self.where(key),
+            expected=expected,
+            found=here if found is None else found,
+            todo=_AGAIN,
+        )
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number."""
+        if key not in self and default is not None:
+            return default
+        number = _number(self.value.get(key))
+        if number is None:
+            self.wrong(key, f"a finite number of at most {_FAR:g}")
+        return number
+
+    def whole(self, key: str) -> int:
+        """A whole number above zero."""
+        number = self.number(key)
+        if number != int(number) or number < 1:
+            self.wrong(key, "a whole number above zero")
+        return int(number)
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text that is not empty."""
+        value = self.value.get(key, default)
+        if not isinstance(value, str) or not value:
+            self.wrong(key, "a text")
+        return value
+
+    def numbers(self, key: str, *shape: int) -> NDArray[np.float64]:
+        """Finite numbers in lists of that shape."""
+        flat = list(_flat(self.value.get(key), shape))
+        numbers = [number for number in map(_number, flat) if number is not None]
+        if len(numbers) != len(flat) or len(flat) != math.prod(shape):
+            size = " x ".join(map(str, shape))
+            self.wrong(key, f"a list of {size} finite numbers")
+        return np.array(numbers, dtype=np.float64).reshape(shape)
+
+    def texts(self, key: str) -> list[str]:
+        """A list of texts."""
+        value = self.value.get(key)
+        if not isinstance(value, list):
+            self.wrong(key, "a list of texts")
+        texts = [each for each in value if isinstance(each, str)]
+        if len(texts) != len(value):
+            self.wrong(key, "a list of texts")
+        return texts
+
+    def members(self, key: str) -> dict[str, "Fields"]:
+        """Objects by their names in an object."""
+        value = self.value.get(key)
+        if not isinstance(value, dict):
+            self.wrong(key, "an object")
+        return {name: self._child(each, f"{key}.{name}") for name, each in value.items()}
+
+    def items(self, key: str) -> list["Fields"]:
+        """The objects of a list."""
+        value = self.value.get(key)
+        if not isinstance(value, list):
+            self.wrong(key, "a list of objects")
+        return [self._child(each, f"{key}[{i}]") for i, each in enumerate(value)]
+
+    def _child(self, value: object, name: str) -> "Fields":
+        place = f"{self.place}{'.' if self.place else ''}{name}"
+        if not isinstance(value, dict):
+            raise UserError(
+                "a field of the scene cannot be read",
+                where=f"{self.file}: {place}",
+                expected="an object",
+                found=repr(value)[:_LONGEST],
+                todo=_AGAIN,
+            )
+        return Fields(value, self.file, place)
+
+
+def read_json(path: Path) -> object:
+    """The value in a JSON file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        UserError: The file is missing, too large, too deep, or not JSON.
+    """
+    try:
+        size = path.stat().st_size
+        if size > LARGEST:
+            raise _unreadable(path, f"a file of {size_text(size)}", f"{size_text(LARGEST)} at most")
+        value: object = json.loads(path.read_bytes().decode("utf-8-sig"))
+    except RecursionError as error:
+        raise _unreadable(path, "lists or objects within each other without an end") from error
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, str(error)) from error
+    return value
+
+
+def read_object(path: Path) -> Fields:
+    """The object in a JSON file.
+
+    Raises:
+        UserError: See `read_json`; or the file holds something else.
+    """
+    value = read_json(path)
+    if not isinstance(value, dict):
+        raise _unreadable(path, repr(value)[:_LONGEST], "an object")
+    return Fields(value, path)
+
+
+def _unreadable(path: Path, found: str, expected: str = "JSON") -> UserError:
+    return UserError(
+        "the file cannot be read", where=path, expected=expected, found=found, todo=_AGAIN
+    )
+
+
+def _number(value: object) -> float | None:
+    """A number that is finite and can be worked with, else None; truth values are none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    # Compared before it becomes a float: whole numbers in JSON have any number of digits.
+    return float(value) if -_FAR <= value <= _FAR else None
+
+
+def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
+    """What stands in lists of that shape; nothing where a list has another length."""
+    if not shape:
+        yield value
+    elif isinstance(value, list) and len(value) == shape[0]:
+        for each in value:
+            yield from _flat(each, shape[1:])

@@ -1,0 +1,77 @@
+"""Lenses of other programs in the terms of COLMAP's camera models, which are undistorted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from crossgrad_core.plugin import UserError
+from crossgrad_core.scene.calibration import Calibration
+
+_UNDISTORT = "undistort the photos with the program that posed them and export them as pinhole ones"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Size, focal lengths and principal point, in pixels; pixel centres at +0.5.
+
+    Attributes:
+        width: Of the photos.
+        height: Likewise.
+        fx: Focal length.
+        fy: Likewise.
+        cx: Principal point from the left border.
+        cy: From the top border.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def params(self) -> tuple[float, float, float, float]:
+        """In COLMAP's order."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    def brown(self, radial: Sequence[float], tangential: Sequence[float]) -> Calibration:
+        """Brown's model in OpenCV's terms: k1, k2, k3 and p1, p2.
+
+        The simplest of COLMAP's models that holds it: a pinhole where all are zero.
+        """
+        k1, k2, k3 = radial
+        params = (*self.params, k1, k2, *tangential)
+        if k3:
+            return self._as("FULL_OPENCV", (*params, k3, 0.0, 0.0, 0.0))
+        if any(params[4:]):
+            return self._as("OPENCV", params)
+        return self._as("PINHOLE", self.params)
+
+    def fisheye(self, radial: Sequence[float]) -> Calibration:
+        """OpenCV's equidistant fisheye: k1 to k4."""
+        return self._as("OPENCV_FISHEYE", (*self.params, *radial))
+
+    def _as(self, model: str, params: tuple[float, ...]) -> Calibration:
+        return Calibration(model, self.width, self.height, params)
+
+
+def refuse_lens(kind: str, where: object) -> UserError:
+    """The error for cameras that have no pinhole to be undistorted to, or none that is known."""
+    return UserError(
+        f"photos of {kind} cannot be undistorted",
+        where=where,
+        expected="a perspective camera, with Brown's distortion or a fisheye's",
+        found=kind,
+        todo=f"{_UNDISTORT}; cut 360-degree photos into perspective ones first",
+    )
+
+
+def refuse_term(term: str, value: float, where: object) -> UserError:
+    """The error for a term of a lens that COLMAP's models lack."""
+    return UserError(
+        f"the lens has a term that cannot be undistorted: {term}",
+        where=where,
+        expected=f"{term} = 0",
+        found=f"{value:g}",
+        todo=f"calibrate again without {term}, or {_UNDISTORT}",
+    )

@@ -1,0 +1,201 @@
+"""Files of the family of `transforms.json`: frames with a pose in OpenGL's axes, and their lenses.
+
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html (fields, axes; pixel centres at
++0.5, as the principal points of COLMAP are taken over), https://github.com/NVlabs/instant-ngp,
+`docs/nerf_dataset_tips.md` (`camera_angle_x`, `rolling_shutter`).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.raw import RawView
+from crossgrad_plugins.readers._inside import Inside, place_of, shared_folder
+from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
+from crossgrad_plugins.readers._poses import SAME, Frame3D, from_opengl, rotation_of
+
+_RADIAL: Final = ("k1", "k2", "k3", "k4")
+_TANGENTIAL: Final = ("p1", "p2")
+_PERSPECTIVE: Final = frozenset(
+    {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+)
+_FISHEYE: Final = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A frame of a file: its photo and where it was taken.
+
+    Attributes:
+        photo: Plain name of the photo below the scene.
+        calibration: Its lens.
+        pose: [4, 4] world to camera.
+        mask: Its mask file, if the frame names one.
+    """
+
+    photo: str
+    calibration: Calibration
+    pose: NDArray[np.float64]
+    mask: Path | None = None
+
+
+def photo_name(inside: Inside, fields: Fields, key: str, base: str) -> str:
+    """The photo that a frame names; a name without a suffix is that of a PNG file, as in NeRF's.
+
+    Raises:
+        UserError: There is no name, or it leads out of the scene.
+    """
+    name = inside.name(fields.text(key), fields.where(key), base)
+    bare = not PurePosixPath(name).suffix
+    if not _is_file(inside, name) and (bare or _is_file(inside, f"{name}.png")):
+        name += ".png"
+    inside.file(name, fields.where(key))
+    return name
+
+
+def read_frame(
+    inside: Inside, frame: Fields, whole: Fields, base: str = "", world: Frame3D = SAME
+) -> Posed:
+    """A frame with `file_path` and `transform_matrix`.
+
+    Args:
+        inside: The scene.
+        frame: The frame.
+        whole: The file, with the fields that all frames share; a frame's own come first.
+        base: Folder of the file below the scene.
+        world: From the file's frame of the world to the scene's.
+
+    Raises:
+        UserError: A field is missing or not what it should be.
+    """
+    photo = photo_name(inside, frame, "file_path", base)
+    mask = None
+    if "mask_path" in frame:
+        name = inside.name(frame.text("mask_path"), frame.where("mask_path"), base)
+        mask = _existing(inside.file(name, frame.where("mask_path")), frame)
+    matrix = transform_of(frame, "transform_matrix")
+    rotation = rotation_of(matrix[:, :3])
+    if rotation is None:
+        frame.wrong("transform_matrix", "an orthonormal, right-handed rotation, and a shift")
+    calibration = read_lens(inside, frame, whole, photo)
+    return Posed(photo, calibration, from_opengl(rotation, matrix[:, 3], world), mask)
+
+
+def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
+    """[3, 4] the first rows of a matrix, which may have its last one or not."""
+    rows = fields.value.get(key)
+    count = 4 if isinstance(rows, list) and len(rows) == 4 else 3  # noqa: PLR2004 - homogeneous
+    return fields.numbers(key, count, 4)[:3]
+
+
+def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
+    """The lens of a frame; the photo's own size where the file does not tell it.
+
+    Raises:
+        UserError: A field is missing or wrong, or the lens cannot be undistorted.
+    """
+
+    def holder(key: str) -> Fields:
+        return frame if key in frame else whole
+
+    def number(key: str, default: float | None = None) -> float:
+        return holder(key).number(key, default)
+
+    shutter = holder("rolling_shutter")
+    if "rolling_shutter" in shutter and shutter.numbers("rolling_shutter", 4).any():
+        raise refuse_lens("a camera with a rolling shutter", shutter.where("rolling_shutter"))
+    size = _size(inside, holder, photo)
+    lens = _frame(size, holder, number)
+    radial, tangential = _terms(holder, number)
+    model = holder("camera_model").text("camera_model", "PERSPECTIVE").upper()
+    if model in _FISHEYE or holder("is_fisheye").value.get("is_fisheye") is True:
+        return lens.fisheye(radial)
+    if model not in _PERSPECTIVE:
+        raise refuse_lens(f"camera model {model}", holder("camera_model").where("camera_model"))
+    if radial[3]:
+        raise refuse_term("k4", radial[3], holder("k4").where("k4"))
+    return lens.brown(radial[:3], tangential)
+
+
+def _size(inside: Inside, holder: Callable[[str], Fields], photo: str) -> tuple[int, int]:
+    if "w" in holder("w") and "h" in holder("h"):
+        return holder("w").whole("w"), holder("h").whole("h")
+    header = read_header(inside.scene / photo)
+    return header.width, header.height
+
+
+def _frame(
+    size: tuple[int, int],
+    holder: Callable[[str], Fields],
+    number: Callable[[str, float | None], float],
+) -> Frame:
+    """Focal lengths in pixels, or from angles of view; the principal point, or the middle."""
+    width, height = size
+    across = _focal(holder, "fl_x", "camera_angle_x", width)
+    if across is None:
+        holder("fl_x").wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
+    down = _focal(holder, "fl_y", "camera_angle_y", height)
+    return Frame(
+        *(width, height, across, across if down is None else down),
+        *(number("cx", width / 2.0), number("cy", height / 2.0)),
+    )
+
+
+def _focal(holder: Callable[[str], Fields], name: str, angle_name: str, side: int) -> float | None:
+    if name in holder(name):
+        return holder(name).number(name)
+    if angle_name not in holder(angle_name):
+        return None
+    angle = holder(angle_name).number(angle_name)
+    if not 0.0 < angle < math.pi:
+        holder(angle_name).wrong(angle_name, "an angle of view above 0 and below pi, in radians")
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def _terms(
+    holder: Callable[[str], Fields], number: Callable[[str, float | None], float]
+) -> tuple[Sequence[float], Sequence[float]]:
+    """k1 to k4 and p1, p2, one by one or in one list of that order."""
+    fields = holder("distortion_params")
+    if "distortion_params" in fields:
+        terms = fields.numbers("distortion_params", 6).tolist()
+        return terms[:4], terms[4:]
+    return [number(key, 0.0) for key in _RADIAL], [number(key, 0.0) for key in _TANGENTIAL]
+
+
+def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
+    """The folder of the photos, `.` for the scene's own, and the views by their names in it."""
+    images = shared_folder(frame.photo for frame in frames)
+    start = 0 if images == "." else len(images) + 1
+    return images, tuple(
+        RawView(
+            name=frame.photo[start:],
+            calibration=frame.calibration,
+            world_to_camera=frame.pose,
+            seen=np.zeros(0, dtype=np.int64),
+            mask=frame.mask,
+            place=place_of(frame.photo[start:]),
+        )
+        for frame in frames
+    )
+
+
+def _is_file(inside: Inside, name: str) -> bool:
+    try:
+        return (inside.scene / name).is_file()
+    except OSError:
+        return False
+
+
+def _existing(path: Path, frame: Fields) -> Path:
+    if not path.is_file():
+        frame.wrong("mask_path", "a mask that is there", f"no file {path}")
+    return path

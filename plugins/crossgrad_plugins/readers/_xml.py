@@ -1,0 +1,75 @@
+"""XML files of scenes, read with the standard library's expat behind a guard.
+
+Entities are what makes XML dangerous: they expand without bound and can name other files. They can
+only be declared in a document type, so a file that has one is refused before anything in it is
+read; the formats have none. Size and depth are bounded too. That needs no further package.
+"""
+
+from pathlib import Path
+from typing import Final
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+from crossgrad_core.plugin import UserError, size_text
+
+#: Bytes of a file, and elements within each other.
+LARGEST: Final = 128 << 20
+_DEEPEST: Final = 64
+_AGAIN = "export the file again"
+
+
+class _RefusedError(Exception):
+    """The file holds something that is not read."""
+
+
+class _Builder:
+    """Builds a tree from expat's events and refuses what formats of scenes do not need."""
+
+    def __init__(self) -> None:
+        self.tree = TreeBuilder()
+        self._depth = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > _DEEPEST:
+            raise _RefusedError(f"elements more than {_DEEPEST} deep within each other")
+        self.tree.start(tag, attributes)
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        self.tree.end(tag)
+
+    def doctype(self, name: str, *rest: object) -> None:
+        raise _RefusedError("a document type, which may declare entities")
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of an XML file.
+
+    Raises:
+        UserError: The file is missing, too large or too deep, is not XML, or has a document type.
+    """
+    try:
+        return _parsed(path)
+    except (OSError, expat.ExpatError, LookupError, ValueError, _RefusedError) as error:
+        raise UserError(
+            "the file cannot be read",
+            where=path,
+            expected="XML without a document type",
+            found=str(error),
+            todo=_AGAIN,
+        ) from error
+
+
+def _parsed(path: Path) -> Element:
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise _RefusedError(f"{size_text(size)}, more than {size_text(LARGEST)}")
+    builder, parser = _Builder(), expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.tree.data
+    parser.StartDoctypeDeclHandler = builder.doctype
+    parser.Parse(path.read_bytes(), True)
+    return builder.tree.close()

@@ -1,0 +1,84 @@
+"""Reads scenes of NeRF synthetic, rendered by Blender: `transforms_train.json` and its siblings."""
+
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.raw import RawScene
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._inside import Inside
+from crossgrad_plugins.readers._json import read_object
+from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._sniff import begins_with
+from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
+
+_TRAIN: Final = "transforms_train.json"
+#: The first one that is there is held out; validation views are left out where there are others.
+_HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")
+_BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
+
+
+class BlenderReader(Reader):
+    """NeRF synthetic scenes: `transforms_train.json`, `transforms_test.json` and their photos.
+
+    Fields are those of nerfstudio's format; mostly `camera_angle_x` alone. The alpha channel of a
+    photo is how much of a pixel the object covers: photos are blended over `reader.background`,
+    white as in NeRF, and `--background` should name the same colour.
+    """
+
+    folder: str = Field(".", description="folder of the transforms files within the scene")
+    background: Literal["white", "black", "none"] = Field(
+        "white",
+        description="behind photos with transparency; none: pixels with alpha below a half do not "
+        "count",
+    )
+    points: str | None = Field(
+        None, description="PLY of points within the scene; by itself one beside the transforms"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return begins_with(path / self.folder / _TRAIN, b"{")
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        # A scene's own folder has no name within it.
+        file = inside.name(_TRAIN, "reader.folder", self.folder)
+        base = file[: -len(_TRAIN)]
+        train = _read(inside, file, base)
+        held_out = next(
+            (f"{base}{name}" for name in _HELD_OUT if (path / base / name).exists()), ""
+        )
+        test = _read(inside, held_out, base) if held_out else []
+        images, views = raw_views([*train, *test])
+        inside.check_photos(images)
+        names = [view.name for view in views]
+        asked = self.points if self.points is None else inside.name(self.points, "reader.points")
+        points = find_points(inside, asked, "reader.points", base="" if asked else base)
+        check_seen(points, views, path / file)
+        behind = f", photos with transparency over {self.background} (see --background)"
+        raw = RawScene(
+            root=path,
+            images=path if images == "." else path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=(f"blender: {count(len(views), 'posed image')}, {points.note}{behind}",),
+            split=(frozenset(names[: len(train)]), frozenset(names[len(train) :]))
+            if held_out
+            else None,
+            background=_BEHIND[self.background],
+        )
+        return build_scene(raw, options)
+
+
+def _read(inside: Inside, name: str, base: str) -> list[Posed]:
+    whole = read_object(inside.file(name, "reader.folder"))
+    return [read_frame(inside, frame, whole, base) for frame in whole.items("frames")]

@@ -1,0 +1,126 @@
+"""Reads scenes of MatrixCity as they are distributed: blocks of `transforms.json` and `rgb/`.
+
+Source of the format: https://github.com/city-super/MatrixCity, README (NeRF's axes; positions in
+metres; the rotation in `rot_mat` is to be multiplied by 100).
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.raw import RawScene
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._inside import Inside
+from crossgrad_plugins.readers._json import Fields, read_object
+from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._poses import from_opengl, rotation_of
+from crossgrad_plugins.readers._sniff import holds
+from crossgrad_plugins.readers._transforms import Posed, raw_views, read_lens, transform_of
+
+_FILE: Final = "transforms.json"
+#: Folders in which blocks are looked for, and how deep: such as small_city/aerial/train/block_1.
+_FOLDER: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
+_DEEPEST: Final = 4
+_TO_UNIT: Final = 100.0
+_PHOTOS: Final = "rgb"
+
+
+class MatrixCityReader(Reader):
+    """Blocks of MatrixCity: `transforms.json` with `rot_mat` and `frame_index`, and photos.
+
+    Photos lie in `rgb/`, or beside the poses. A scene is one block or a folder of several. Blocks
+    below a folder `test`, or whose name ends with `_test`, are held out.
+    """
+
+    points: str | None = Field(
+        None, description="PLY of points within the scene; by itself one in its folder"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return any(holds(path / name, b'"rot_mat"') for name in _files(Inside(path)))
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        files = _files(inside)
+        if not files:
+            raise UserError(
+                "the scene has no block of MatrixCity",
+                where=path,
+                expected=f"{_FILE} with the poses and {_PHOTOS}/ with the photos of a block",
+                todo="name the folder of a block, or one that holds blocks",
+            )
+        frames = {name: _read(inside, name) for name in files}
+        images, views = raw_views([frame for block in frames.values() for frame in block])
+        inside.check_photos(images)
+        points = find_points(inside, self.points, "reader.points")
+        check_seen(points, views, path)
+        names = [view.name for view in views]
+        held_out = [_is_test(name) for name in files for _ in frames[name]]
+        test = frozenset(name for name, out in zip(names, held_out, strict=True) if out)
+        raw = RawScene(
+            root=path,
+            images=path if images == "." else path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=(
+                f"MatrixCity: {count(len(views), 'posed image')} in {count(len(files), 'block')}, "
+                f"{points.note}",
+            ),
+            split=(frozenset(names) - test, test) if test else None,
+        )
+        return build_scene(raw, options)
+
+
+def _files(inside: Inside) -> Sequence[str]:
+    """Names of the pose files of all blocks; that of the scene's own folder alone, if any."""
+    found = [path.relative_to(inside.scene).as_posix() for path in _walk(inside.scene, 0)]
+    return [_FILE] if _FILE in found else sorted(found)
+
+
+def _walk(folder: Path, depth: int) -> Iterator[Path]:
+    """The pose files in a folder and in those below that may be of this data set."""
+    try:
+        inner = [path for path in folder.iterdir() if _FOLDER.fullmatch(path.name)]
+    except OSError:
+        return
+    if (folder / _FILE).is_file():
+        yield folder / _FILE
+    for path in inner:
+        if depth < _DEEPEST and path.is_dir() and not path.is_symlink():
+            yield from _walk(path, depth + 1)
+
+
+def _is_test(name: str) -> bool:
+    folders = PurePosixPath(name).parts[:-1]
+    return "test" in folders or (bool(folders) and folders[-1].endswith("_test"))
+
+
+def _read(inside: Inside, name: str) -> list[Posed]:
+    whole = read_object(inside.file(name, inside.scene / name))
+    base = PurePosixPath(name).parent
+    photos = str(base / _PHOTOS if (inside.scene / base / _PHOTOS).is_dir() else base)
+    return [_frame(inside, each, whole, photos) for each in whole.items("frames")]
+
+
+def _frame(inside: Inside, frame: Fields, whole: Fields, photos: str) -> Posed:
+    index = frame.number("frame_index")
+    if index != int(index) or index < 0:
+        frame.wrong("frame_index", "a whole number, 0 or more")
+    photo = inside.name(f"{int(index):04d}.png", frame.where("frame_index"), photos)
+    inside.file(photo, frame.where("frame_index"))
+    matrix = transform_of(frame, "rot_mat")
+    rotation = rotation_of(_TO_UNIT * matrix[:, :3])
+    if rotation is None:
+        frame.wrong("rot_mat", "a hundredth of a right-handed rotation, and a shift")
+    return Posed(photo, read_lens(inside, frame, whole, photo), from_opengl(rotation, matrix[:, 3]))

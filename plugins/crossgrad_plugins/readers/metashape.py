@@ -1,0 +1,309 @@
+"""Reads scenes of Agisoft Metashape: its XML of cameras.
+
+Sources of the format: Metashape Professional, user manual, appendix on camera models (p1 and p2
+stand where OpenCV has p2 and p1; b1 is fx - fy, b2 the skew; principal point from the middle of the
+photo); https://agisoft.freshdesk.com/support/solutions/articles/31000158119. Poses are camera to
+chunk with OpenCV's axes.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._earth import local_frame
+from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
+from crossgrad_plugins.readers._photos import PhotoNames
+from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._poses import SAME, Frame3D, from_opencv, rotation_of
+from crossgrad_plugins.readers._sniff import head_of
+from crossgrad_plugins.readers._xml import read_xml
+
+_TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+#: Coordinate systems whose chunk transform leads to geocentric coordinates.
+_ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
+
+
+class MetashapeReader(Reader):
+    """Agisoft Metashape's XML of cameras, and photos beside it; points come from a PLY.
+
+    The chunk's transform is applied. Where it leads to geocentric coordinates, cameras come into
+    the local frame at their middle: x east, y north, z up, in metres.
+    """
+
+    images: str = Field("images", description="folder of the photos within the scene")
+    file: str | None = Field(
+        None, description="XML file within the scene; by itself the one with a chunk"
+    )
+    frame: Literal["local", "chunk"] = Field(
+        "local",
+        description="local: the chunk's transform is applied, then east-north-up where it is on "
+        "Earth; chunk: the chunk's own coordinates. A PLY of points is taken to be in the same",
+    )
+    points: str | None = Field(
+        None, description="PLY of points within the scene; by itself one in its folder"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return bool(self._found(Inside(path)))
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        file = self._file(inside)
+        images = inside.name(self.images, "reader.images")
+        inside.check_photos(images)
+        chunk = _chunk(file)
+        cameras, notes = _cameras(chunk, file)
+        world, where = _world(chunk, file, cameras, self.frame)
+        sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
+        photos = PhotoNames.of(path / images)
+        views = tuple(_view(inside, images, each, sensors, photos, world) for each in cameras)
+        points = find_points(inside, self.points, "reader.points")
+        other = "chunk" if self.frame == "local" else "local"
+        check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
+        head = f"Metashape: {count(len(views), 'posed image')} from {file.name}, {points.note}"
+        raw = RawScene(
+            root=path,
+            images=path if images == "." else path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=(head, *notes, *where),
+        )
+        return build_scene(raw, options)
+
+    def _found(self, inside: Inside) -> list[Path]:
+        return [path for path in inside.files(self.file or "*.xml") if _is_metashape(path)]
+
+    def _file(self, inside: Inside) -> Path:
+        if self.file is not None:
+            return inside.file(inside.name(self.file, "reader.file"), "reader.file")
+        found = self._found(inside)
+        if len(found) == 1:
+            return inside.file(found[0].name, found[0])
+        raise UserError(
+            "the scene has no XML of Metashape" if not found else "the scene has several XMLs",
+            where=inside.scene,
+            expected="one file of File > Export > Export Cameras, with a chunk in a document",
+            found=", ".join(path.name for path in found) or "none",
+            todo="name it, with --set reader.file=NAME, or export it",
+        )
+
+
+def _is_metashape(path: Path) -> bool:
+    head = head_of(path)
+    return b"<document" in head and b"<chunk" in head
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """A posed camera: label, ids of sensor and component, camera to chunk, and its attributes."""
+
+    label: str
+    sensor: str
+    component: str
+    rotation: NDArray[np.float64]
+    center: NDArray[np.float64]
+    fields: Fields
+
+
+def _chunk(file: Path) -> Element:
+    chunk = read_xml(file).find("chunk")
+    if chunk is None:
+        raise _missing(file, "chunk")
+    return chunk
+
+
+def _missing(file: Path, what: str) -> UserError:
+    return UserError(
+        "the XML of Metashape cannot be read",
+        where=file,
+        expected=f"an element {what}",
+        found="none",
+        todo="align the photos and export the cameras again",
+    )
+
+
+def _numbers(element: Element | None, count: int, file: Path, place: str) -> NDArray[np.float64]:
+    """[count] numbers in the text of an element."""
+    words = (element.text or "").split() if element is not None else []
+    values: list[object] = []
+    for word in words[: count + 1]:
+        try:
+            values.append(word if "_" in word else float(word))
+        except ValueError:
+            values.append(word)
+    return Fields({"text": values}, file, place).numbers("text", count)
+
+
+def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
+    """The posed cameras of the largest component, and notes on those that are left out."""
+    holder = chunk.find("cameras")
+    if holder is None:
+        raise _missing(file, "cameras")
+    elements = list(holder.iter("camera"))
+    posed = [_camera(each, file, i) for i, each in enumerate(elements) if _is_posed(each)]
+    sizes = Counter(camera.component for camera in posed)
+    best = max(sizes, key=lambda component: sizes[component], default="")
+    kept = [camera for camera in posed if camera.component == best]
+    notes = []
+    if len(posed) < len(elements):
+        notes.append(f"Metashape: {count(len(elements) - len(posed), 'camera')} without a pose")
+    if len(kept) < len(posed):
+        notes.append(
+            f"Metashape: component {best} is taken, {count(len(posed) - len(kept), 'camera')} of "
+            "others left out"
+        )
+    return kept, notes
+
+
+def _is_posed(element: Element) -> bool:
+    return element.find("transform") is not None and element.get("enabled", "true") != "false"
+
+
+def _camera(element: Element, file: Path, index: int) -> _Camera:
+    place = f"cameras.camera[{index}]"
+    matrix = _numbers(element.find("transform"), 16, file, f"{place}.transform").reshape(4, 4)
+    rotation = rotation_of(matrix[:3, :3])
+    fields = Fields(dict(element.attrib), file, place)
+    if rotation is None:
+        fields.wrong("transform", "an orthonormal, right-handed rotation, and a shift", str(matrix))
+    return _Camera(
+        label=fields.text("label"),
+        sensor=fields.text("sensor_id"),
+        component=element.get("component_id", ""),
+        rotation=rotation,
+        center=matrix[:3, 3],
+        fields=fields,
+    )
+
+
+def _world(
+    chunk: Element, file: Path, cameras: list[_Camera], wanted: str
+) -> tuple[Frame3D, list[str]]:
+    """From the chunk's own coordinates to those of the scene, and a note on what was applied."""
+    if wanted == "chunk" or not cameras:
+        return SAME, []
+    frame, name = _transform(chunk, file, cameras[0].component)
+    system = (chunk.findtext("reference") or "").lstrip()
+    if name is None:
+        return SAME, []
+    if not system.startswith(_ON_EARTH):
+        return frame, [f"Metashape: the transform of the {name} is applied"]
+    centers = frame.points(np.stack([camera.center for camera in cameras]))
+    local, origin = local_frame(centers.mean(axis=0))
+    if local is None:
+        return frame, [f"Metashape: the transform of the {name} is applied"]
+    return local.after(frame), [f"Metashape: east, north, up in metres around {origin}"]
+
+
+def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
+    """The similarity of a component, or of the chunk, and what has it; None where none has."""
+    places = [(each, "component") for each in chunk.iterfind("components/component")
+              if each.get("id", "") == component]  # fmt: skip
+    for holder, name in (*places, (chunk, "chunk")):
+        element = holder.find("transform")
+        if element is not None:
+            return _similarity(element, file, f"{name}.transform"), name
+    return SAME, None
+
+
+def _similarity(element: Element, file: Path, place: str) -> Frame3D:
+    turn, shift, size = (element.find(tag) for tag in ("rotation", "translation", "scale"))
+    matrix = np.eye(3)
+    if turn is not None:
+        matrix = _numbers(turn, 9, file, f"{place}.rotation").reshape(3, 3)
+    rotation = rotation_of(matrix)
+    fields = Fields({}, file, place)
+    if rotation is None:
+        fields.wrong("rotation", "an orthonormal, right-handed rotation", str(matrix.tolist()))
+    moved = np.zeros(3) if shift is None else _numbers(shift, 3, file, f"{place}.translation")
+    scale = 1.0 if size is None else float(_numbers(size, 1, file, f"{place}.scale")[0])
+    if scale <= 0.0:
+        fields.wrong("scale", "a number above zero", f"{scale:g}")
+    return Frame3D(rotation, moved, scale)
+
+
+def _sensors(chunk: Element, file: Path, used: set[str]) -> dict[str, Calibration]:
+    """The calibrations of the sensors of some ids."""
+    return {
+        name: _sensor(each, file, f"sensors.sensor[{i}]")
+        for i, each in enumerate(chunk.iterfind("sensors/sensor"))
+        if (name := each.get("id", "")) in used
+    }
+
+
+def _sensor(element: Element, file: Path, place: str) -> Calibration:
+    kind = element.get("type", "frame")
+    fields = Fields(dict(element.attrib), file, place)
+    if kind not in {"frame", "fisheye"}:
+        raise refuse_lens(f"sensor type {kind}", fields.where("type"))
+    # An adjusted calibration comes behind the initial one.
+    calibrations = element.findall("calibration")
+    adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
+    chosen = next(reversed(adjusted or calibrations), None)
+    resolution = element.find("resolution")
+    if chosen is None or resolution is None:
+        fields.wrong("calibration", "a resolution and a calibration with a focal length f")
+    size = {key: _parsed(resolution.get(key)) for key in ("width", "height")}
+    values = {each.tag: _parsed(each.text) for each in chosen}
+    return _lens(Fields({**values, **size}, file, f"{place}.calibration"), kind)
+
+
+def _parsed(text: str | None) -> object:
+    try:
+        return float(text or "")
+    except ValueError:
+        return text
+
+
+def _lens(fields: Fields, kind: str) -> Calibration:
+    width, height, focal = fields.whole("width"), fields.whole("height"), fields.number("f")
+    term = {key: fields.number(key, 0.0) for key in _TERMS}
+    lens = Frame(
+        *(width, height, focal + term["b1"], focal),
+        fields.number("cx", 0.0) + width / 2.0,
+        fields.number("cy", 0.0) + height / 2.0,
+    )
+    missing = ("p3", "p4", "b2", *(("p1", "p2") if kind == "fisheye" else ("k4",)))
+    for key in missing:
+        if term[key]:
+            raise refuse_term(key, term[key], fields.where(key))
+    if kind == "fisheye":
+        return lens.fisheye((term["k1"], term["k2"], term["k3"], term["k4"]))
+    return lens.brown((term["k1"], term["k2"], term["k3"]), (term["p2"], term["p1"]))
+
+
+def _view(
+    inside: Inside,
+    images: str,
+    camera: _Camera,
+    sensors: dict[str, Calibration],
+    photos: PhotoNames,
+    world: Frame3D,
+) -> RawView:
+    fields = camera.fields
+    if camera.sensor not in sensors:
+        fields.wrong("sensor_id", "a sensor of the file")
+    name = photos.full(inside.photo(images, camera.label, fields.where("label")))
+    inside.file(f"{images}/{name}", fields.where("label"))
+    pose = from_opencv(camera.rotation, camera.center, world)
+    seen = np.zeros(0, dtype=np.int64)
+    return RawView(name, sensors[camera.sensor], pose, seen, place=place_of(name))

@@ -1,0 +1,117 @@
+"""Reads scenes of nerfstudio: `transforms.json` with photos, lenses, masks and points."""
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.raw import RawScene
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._inside import Inside
+from crossgrad_plugins.readers._json import Fields, read_object
+from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._poses import Frame3D, rotation_of
+from crossgrad_plugins.readers._sniff import begins_with, holds
+from crossgrad_plugins.readers._transforms import raw_views, read_frame, transform_of
+
+_FILE = "transforms.json"
+
+
+class NerfstudioReader(Reader):
+    """nerfstudio's and instant-ngp's `transforms.json`, with any lens that can be undistorted.
+
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html. What `applied_transform` and
+    `applied_scale` say was done to the world is undone, so that cameras and points stand where they
+    were posed. `train_filenames` and `test_filenames` (else `val_filenames`) are the split where no
+    train_list.txt or test_list.txt is.
+    """
+
+    file: str = Field(_FILE, description="file of the frames within the scene")
+    points: str | None = Field(
+        None,
+        description="PLY of points within the scene; by itself what the file names, or one "
+        "beside it",
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        file = path / self.file
+        return begins_with(file, b"{") and not holds(file, b'"rot_mat"')
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        name = inside.name(self.file, "reader.file")
+        base = str(PurePosixPath(name).parent)
+        whole = read_object(inside.file(name, "reader.file"))
+        world = _applied(whole).inverse
+        frames = [read_frame(inside, each, whole, base, world) for each in whole.items("frames")]
+        images, views = raw_views(frames)
+        inside.check_photos(images)
+        points = find_points(inside, *self._points(whole, base), frame=world)
+        check_seen(points, views, whole.file)
+        notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]
+        if "fisheye_crop_radius" in whole:
+            notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
+        raw = RawScene(
+            root=path,
+            images=path if images == "." else path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=tuple(notes),
+            split=_split(inside, whole, base, images),
+        )
+        return build_scene(raw, options)
+
+    def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
+        """The file of points that was asked for, and where."""
+        if self.points is not None:
+            return self.points, "reader.points"
+        if "ply_file_path" in whole:
+            where = whole.where("ply_file_path")
+            named = whole.text("ply_file_path")
+            return str(PurePosixPath(base, named)) if not named.startswith("/") else named, where
+        return None, whole.file
+
+
+def _applied(whole: Fields) -> Frame3D:
+    """From the world as it was posed to the world of the file."""
+    scale = whole.number("applied_scale", 1.0)
+    if scale <= 0.0:
+        whole.wrong("applied_scale", "a number above zero")
+    if "applied_transform" not in whole:
+        return Frame3D(np.eye(3), np.zeros(3), scale)
+    matrix = transform_of(whole, "applied_transform")
+    rotation = rotation_of(matrix[:, :3])
+    if rotation is None:
+        whole.wrong("applied_transform", "an orthonormal, right-handed rotation, and a shift")
+    return Frame3D(rotation, scale * matrix[:, 3], scale)
+
+
+def _split(
+    inside: Inside, whole: Fields, base: str, images: str
+) -> tuple[frozenset[str], frozenset[str]] | None:
+    """The names of training and held-out views below the photo folder; None without lists."""
+    train, test, validation = (
+        _listed(inside, whole, f"{part}_filenames", base, images)
+        for part in ("train", "test", "val")
+    )
+    if train is None:
+        return None
+    return frozenset(train), frozenset(test or validation or ())
+
+
+def _listed(
+    inside: Inside, whole: Fields, key: str, base: str, images: str
+) -> Sequence[str] | None:
+    if key not in whole:
+        return None
+    names = [inside.name(text, whole.where(key), base) for text in whole.texts(key)]
+    return names if images == "." else [name.removeprefix(f"{images}/") for name in names]

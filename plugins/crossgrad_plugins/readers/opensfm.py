@@ -1,0 +1,165 @@
+"""Reads scenes of OpenSfM and OpenDroneMap: `reconstruction.json`.
+
+Sources of the format: https://opensfm.org/docs/geometry.html (axes, camera models, pixels),
+https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates have
+their origin in the middle of the photo and its longer side as their unit.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._json import Fields, read_json
+from crossgrad_plugins.readers._lenses import Frame, refuse_lens
+from crossgrad_plugins.readers._points import Points
+from crossgrad_plugins.readers._sniff import begins_with
+
+#: OpenSfM's place, and that of a project of OpenDroneMap.
+_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
+_BYTE: Final = 255
+#: Below this many radians a rotation is its own sine.
+_SMALL: Final = 1e-12
+
+
+class OpenSfmReader(Reader):
+    """OpenSfM's `reconstruction.json`, by itself or in a project of OpenDroneMap.
+
+    Where there are several reconstructions, the one with most photos is taken. Perspective, radial,
+    Brown's and fisheye cameras are undistorted; others are refused.
+    """
+
+    images: str = Field("images", description="folder of the photos within the scene")
+    file: str | None = Field(
+        None,
+        description="reconstruction file within the scene; by itself reconstruction.json, also in "
+        "opensfm/",
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return any(begins_with(path / name, b"[") for name in self._names)
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        file = self._find(inside)
+        chosen, note = _choose(file)
+        images = inside.name(self.images, "reader.images")
+        inside.check_photos(images)
+        cameras = {name: _camera(fields) for name, fields in chosen.members("cameras").items()}
+        shots = chosen.members("shots")
+        views = tuple(_view(inside, images, name, shot, cameras) for name, shot in shots.items())
+        points = _points(chosen)
+        notes = [
+            f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
+            f"{count(len(points.positions), 'SfM point')} from {points.source}"
+        ]
+        raw = RawScene(
+            root=path,
+            images=path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=(*notes, *note),
+        )
+        return build_scene(raw, options)
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return _FILES if self.file is None else (self.file,)
+
+    def _find(self, inside: Inside) -> Path:
+        names = [inside.name(name, "reader.file") for name in self._names]
+        there = [name for name in names if (inside.scene / name).is_file()]
+        if not there:
+            raise UserError(
+                "the scene has no reconstruction of OpenSfM",
+                where=inside.scene,
+                expected=" or ".join(names),
+                todo="name the folder that OpenSfM or OpenDroneMap worked in",
+            )
+        return inside.file(there[0], "reader.file")
+
+
+def _choose(file: Path) -> tuple[Fields, list[str]]:
+    """The reconstruction with most photos, and a note on the others, if any."""
+    whole = Fields({"reconstructions": read_json(file)}, file)
+    models = whole.items("reconstructions")
+    if not models:
+        whole.wrong("reconstructions", "a list with a reconstruction", "an empty list")
+    counts = [len(model.members("shots")) for model in models]
+    best = int(np.argmax(counts))
+    others = ", ".join(str(number) for i, number in enumerate(counts) if i != best)
+    note = (
+        f"OpenSfM: the reconstruction with most photos is taken; left out are those with {others}"
+    )
+    return models[best], [note] if others else []
+
+
+def _camera(fields: Fields) -> Calibration:
+    """The calibration of a camera, in pixels.
+
+    Raises:
+        UserError: A field is missing or wrong, or the camera is none that can be undistorted.
+    """
+    kind = fields.text("projection_type", "perspective")
+    if kind not in {
+        *("perspective", "simple_radial", "radial", "brown"),
+        *("fisheye", "fisheye_opencv"),
+    }:
+        raise refuse_lens(f"projection type {kind}", fields.where("projection_type"))
+    width, height = fields.whole("width"), fields.whole("height")
+    unit = max(width, height)
+    single = "focal" in fields
+    across = fields.number("focal" if single else "focal_x") * unit
+    down = across if single else fields.number("focal_y") * unit
+    lens = Frame(
+        *(width, height, across, down),
+        fields.number("c_x", 0.0) * unit + width / 2.0,
+        fields.number("c_y", 0.0) * unit + height / 2.0,
+    )
+    k1, k2, k3, k4 = (fields.number(f"k{i}", 0.0) for i in range(1, 5))
+    if kind.startswith("fisheye"):
+        return lens.fisheye((k1, k2, k3, k4))
+    return lens.brown((k1, k2, k3), (fields.number("p1", 0.0), fields.number("p2", 0.0)))
+
+
+def _view(
+    inside: Inside, images: str, name: str, shot: Fields, cameras: dict[str, Calibration]
+) -> RawView:
+    camera = shot.text("camera")
+    if camera not in cameras:
+        shot.wrong("camera", f"a camera of the file, such as {min(cameras, default='(none)')}")
+    plain = inside.photo(images, name, shot.here)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_by(shot.numbers("rotation", 3))
+    pose[:3, 3] = shot.numbers("translation", 3)
+    return RawView(plain, cameras[camera], pose, np.zeros(0, dtype=np.int64), place=place_of(plain))
+
+
+def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3, 3] rotation about a vector [3] by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / max(angle, _SMALL)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))
+
+
+def _points(chosen: Fields) -> Points:
+    points = list(chosen.members("points").values()) if "points" in chosen else []
+    positions = np.array([each.numbers("coordinates", 3) for each in points]).reshape(-1, 3)
+    colors = np.array([each.numbers("color", 3) for each in points]).reshape(-1, 3)
+    rounded = np.rint(colors.clip(0.0, _BYTE)).astype(np.uint8)
+    return Points(positions, rounded, chosen.file.name)

@@ -1,0 +1,202 @@
+"""Reads scenes of RealityCapture (RealityScan): its CSV of internal and external parameters.
+
+Sources of the format: https://dev.epicgames.com/documentation/realityscan (camera geometry, XMP
+camera math): `f` in millimetres of a 36 mm sensor, principal point in units of the longer side from
+the middle of the photo. Angles as nerfstudio's converter reads them: heading clockwise from north,
+pitch 0 looking down, in degrees; x east, y north, alt up.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, read_rows
+from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._lenses import Frame, refuse_term
+from crossgrad_plugins.readers._photos import PhotoNames
+from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._poses import from_opengl
+from crossgrad_plugins.readers._sniff import head_of
+
+_NAME: Final = "#name"
+_POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
+_LENS: Final = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_SENSOR: Final = 36.0  # mm
+_LARGEST: Final = 256 << 20
+_TODO: Final = (
+    "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
+)
+
+
+class RealityCaptureReader(Reader):
+    """RealityCapture's CSV of internal and external camera parameters, and photos beside it.
+
+    Points come from a PLY; the CSV has none.
+    """
+
+    images: str = Field("images", description="folder of the photos within the scene")
+    file: str | None = Field(
+        None, description="CSV file within the scene; by itself the one that has its columns"
+    )
+    points: str | None = Field(
+        None, description="PLY of points within the scene; by itself one in its folder"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return bool(self._found(Inside(path)))
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        check_scene_folder(path)
+        inside = Inside(path)
+        file = self._file(inside)
+        images = inside.name(self.images, "reader.images")
+        inside.check_photos(images)
+        photos = PhotoNames.of(path / images)
+        views = tuple(_view(inside, images, row, photos) for row in _rows(file))
+        points = find_points(inside, self.points, "reader.points")
+        check_seen(points, views, file)
+        raw = RawScene(
+            root=path,
+            images=path if images == "." else path / images,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
+            notes=(
+                f"RealityCapture: {count(len(views), 'posed image')} from {file.name}, "
+                f"{points.note}",
+            ),
+        )
+        return build_scene(raw, options)
+
+    def _found(self, inside: Inside) -> list[Path]:
+        return [path for path in inside.files(self.file or "*.csv") if _has_columns(path)]
+
+    def _file(self, inside: Inside) -> Path:
+        if self.file is not None:
+            return inside.file(inside.name(self.file, "reader.file"), "reader.file")
+        found = self._found(inside)
+        if len(found) == 1:
+            return inside.file(found[0].name, found[0])
+        raise UserError(
+            "the scene has no CSV of RealityCapture" if not found else "the scene has several CSVs",
+            where=inside.scene,
+            expected=f"one file with the columns {_NAME}, {', '.join((*_POSE, 'f'))} ...",
+            found=", ".join(path.name for path in found) or "none",
+            todo="name it, with --set reader.file=NAME, or export it",
+        )
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the file: the photo's name and its numbers by column."""
+
+    name: str
+    fields: Fields
+
+
+def _has_columns(path: Path) -> bool:
+    line = head_of(path).decode("utf-8-sig", errors="replace").partition("\n")[0]
+    return {_NAME, *_POSE, "f"} <= {cell.strip(' "\r') for cell in line.split(",")}
+
+
+def _rows(file: Path) -> list[_Row]:
+    """The rows with photos; empty ones are passed over.
+
+    Raises:
+        UserError: The file cannot be read, lacks a column, or a row has another number of cells.
+    """
+    if file.is_file() and file.stat().st_size > _LARGEST:
+        raise _wrong(file, f"at most {_LARGEST:,} bytes", f"{file.stat().st_size:,} bytes")
+    rows = read_rows(file, "the CSV of RealityCapture", _TODO)
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    missing = [name for name in (_NAME, *_POSE, "f") if name not in header]
+    if missing:
+        raise _wrong(file, f"a column {missing[0]}", ", ".join(header) or "an empty file")
+    twice = [name for name in header if name and header.count(name) > 1]
+    if twice:
+        raise _wrong(file, "a name for each column", f"two columns {twice[0]}")
+    found = []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(header) and row:
+            raise _wrong(file, f"{len(header)} cells in line {number}", f"{len(row)} cells")
+        if row:
+            cells = dict(zip(header, row, strict=True))
+            found.append(_Row(cells[_NAME], _numbers(cells, file, number)))
+    return found
+
+
+def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
+    """The cells of a row with what is a number as one; others are refused when they are used."""
+    values: dict[str, object] = {}
+    for name, cell in cells.items():
+        try:
+            values[name] = float(cell) if "_" not in cell else cell
+        except ValueError:
+            values[name] = cell
+    return Fields(values, file, f"line {number}")
+
+
+def _wrong(file: Path, expected: str, found: str) -> UserError:
+    return UserError(
+        "the CSV of RealityCapture cannot be read",
+        where=file,
+        expected=expected,
+        found=found,
+        todo=_TODO,
+    )
+
+
+def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
+    where = row.fields.where(_NAME)
+    name = photos.full(inside.photo(images, row.name, where))
+    file = inside.file(f"{images}/{name}", where)
+    x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
+    rotation = rotation_of_angles(heading, pitch, roll)
+    pose = from_opengl(rotation, np.array([x, y, up]))
+    lens = _lens(row.fields, file)
+    return RawView(name, lens, pose, np.zeros(0, dtype=np.int64), place=place_of(name))
+
+
+def _lens(fields: Fields, photo: Path) -> Calibration:
+    """The lens of a photo that is there; the size of others cannot be told.
+
+    Raises:
+        UserError: A number is wrong, or a term has no counterpart.
+    """
+    focal, px, py, k1, k2, k3, k4, t1, t2 = (fields.number(key, 0.0) for key in _LENS)
+    if k4:
+        raise refuse_term("k4", k4, fields.where("k4"))
+    header = read_header(photo) if photo.is_file() else None
+    width, height = (header.width, header.height) if header else (1, 1)
+    unit = max(width, height)
+    across = focal * unit / _SENSOR
+    lens = Frame(
+        *(width, height, across, across), px * unit + width / 2.0, py * unit + height / 2.0
+    )
+    return lens.brown((k1, k2, k3), (t1, t2))
+
+
+def rotation_of_angles(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """[3, 3] camera (x right, y up, z backward) to east, north, up, from angles in degrees."""
+    (sh, ch), (sp, cp), (sr, cr) = (
+        (np.sin(angle), np.cos(angle)) for angle in np.deg2rad([-heading, pitch, roll])
+    )
+    about_z = np.array([[ch, -sh, 0.0], [sh, ch, 0.0], [0.0, 0.0, 1.0]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]])
+    about_y = np.array([[cr, 0.0, sr], [0.0, 1.0, 0.0], [-sr, 0.0, cr]])
+    return np.asarray(about_z @ about_x @ about_y)

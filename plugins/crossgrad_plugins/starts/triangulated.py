@@ -1,0 +1,148 @@
+"""Points of scenes that come without any: features of neighbouring photos, triangulated."""
+
+from collections.abc import Sequence
+from itertools import starmap
+from typing import ClassVar, Final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import MorePoints, Scene, Start, UserError, View, centers_of
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+from crossgrad_plugins.starts.two_views import Features, Met, meet
+
+#: Cosine of the largest angle between the axes of two cameras that are compared.
+_ASKEW: Final = 0.5
+_FEWEST: Final = 3
+_GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+
+#: What was worked out, as long as its scene is in use.
+_KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
+
+
+class Triangulated(Start):
+    """Triangulates SIFT features of neighbouring training photos, where a scene has no points.
+
+    Poses are taken as they are: nothing is optimised. A scene with points of its own starts from
+    those.
+    """
+
+    alone: ClassVar[bool] = True
+
+    views: int = Field(200, ge=2, description="photos that are looked at, at most")
+    neighbours: int = Field(4, ge=1, le=50, description="photos that each one is compared with")
+    features: int = Field(2048, ge=16, le=65_536, description="features of a photo, at most")
+    pixels: float = Field(2.0, gt=0.0, description="of a point from its feature, at most")
+
+    @override
+    def more_points(self, scene: Scene) -> MorePoints | None:
+        if len(scene.points):
+            return None
+        known = _KNOWN.setdefault(scene, {})
+        if self not in known:
+            known[self] = self._found(scene)
+        return known[self]
+
+    @override
+    def remarks(self, scene: Scene) -> tuple[str, ...]:
+        more = self.more_points(scene)
+        if more is None:
+            return ("start: the scene has points; none are triangulated",)
+        return (f"start: {len(more.positions)} points triangulated from pairs of photos",)
+
+    def _found(self, scene: Scene) -> MorePoints:
+        views = _spread(scene.train_views, self.views)
+        features = [self._features(view) for view in views]
+        pairs = _pairs(views, self.neighbours)
+        met = list(starmap(self._meet, ((features[i], features[j]) for i, j in pairs)))
+        kept = _best(pairs, met)
+        if len(kept) < _FEWEST:
+            raise UserError(
+                "no points could be triangulated",
+                where=scene.name,
+                expected=f"at least {_FEWEST} points that two photos show",
+                found=f"{len(kept)} in {len(pairs)} pairs of photos",
+                todo="check that poses and photos belong together, or start from random points "
+                "(--init random)",
+            )
+        unknown = np.full(len(kept), np.nan)
+        colors = [features[pairs[p][0]].colors[met[p].first[m]] for p, m in kept]
+        return MorePoints(
+            positions=np.array([met[p].points[m] for p, m in kept]),
+            colors=np.array(colors),
+            sizes=unknown,
+            opacities=unknown,
+        )
+
+    def _meet(self, first: Features, second: Features) -> Met:
+        return meet(first, second, self.pixels)
+
+    def _features(self, view: View) -> Features:
+        """SIFT features of a photo where its pixels count."""
+        photo = view.photo
+        image, mask = photo.image().cpu().numpy(), photo.mask()
+        grey = np.ascontiguousarray((image @ _GREY).round().astype(np.uint8))
+        pixels, found = _sift(grey, self.features)
+        across, down = np.floor(pixels).astype(np.int64).clip(0, np.array(grey.shape[::-1]) - 1).T
+        counts = np.ones(grey.shape, np.bool_) if mask is None else mask.cpu().numpy()
+        rows = np.flatnonzero(counts[down, across])
+        lengths = np.linalg.norm(found[rows], axis=1, keepdims=True)
+        colors = image[down[rows], across[rows]]
+        return Features(view.camera, pixels[rows], found[rows] / np.maximum(lengths, 1.0), colors)
+
+
+def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """[F, 2] pixels and [F, 128] descriptors, of length 512, of a photo [H, W]."""
+    guard_pycolmap()
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = most
+    options.num_threads = 1
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 1
+    try:
+        extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        keypoints, descriptors = extractor.extract_from_uint8_array(grey)
+    finally:
+        pycolmap.logging.minloglevel = before
+    pixels = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64)
+    return pixels.reshape(-1, 2), np.array(descriptors.data, dtype=np.float32).reshape(-1, 128)
+
+
+def _spread(views: Sequence[View], most: int) -> list[View]:
+    """At most so many of the views, evenly spread."""
+    if len(views) <= most:
+        return list(views)
+    return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
+
+
+def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
+    """Pairs of photos to compare: each with the nearest that look about the same way."""
+    centers = centers_of(views)
+    axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
+    found: set[tuple[int, int]] = set()
+    for i in range(len(views)):
+        distances = np.linalg.norm(centers - centers[i], axis=1)
+        # What stands in the same place shows no depth.
+        distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
+        near = np.argsort(distances, kind="stable")[:neighbours]
+        found |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
+    return sorted(found)
+
+
+def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[int, int]]:
+    """Pair and row of the points that are kept: each feature counts once, at its widest angle."""
+    angles = np.concatenate([each.angles for each in met]) if met else np.zeros(0)
+    places = [(p, m) for p, each in enumerate(met) for m in range(len(each.points))]
+    used: set[tuple[int, int]] = set()
+    kept = []
+    for place in np.argsort(-angles, kind="stable").tolist():
+        p, m = places[place]
+        ends = {(pairs[p][0], int(met[p].first[m])), (pairs[p][1], int(met[p].second[m]))}
+        if not ends & used:
+            used |= ends
+            kept.append((p, m))
+    return sorted(kept)

@@ -1,0 +1,104 @@
+"""`triangulated`: points where photos meet, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_plugins.readers.colmap import ColmapReader
+from crossgrad_plugins.starts import two_views
+from crossgrad_plugins.starts.triangulated import Triangulated
+
+FEW = Triangulated(views=4)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Real photos, and the points that COLMAP made of them."""
+    return ColmapReader().read(bundled_scene(), SceneOptions(max_size=240))
+
+
+@pytest.fixture(scope="module")
+def bare(scene):
+    views = tuple(replace(view, seen=np.zeros(0, np.int64)) for view in scene.views)
+    return replace(scene, views=views, points=scene.points[:0], point_colors=scene.point_colors[:0])
+
+
+def test_points_lie_among_those_of_colmap_and_have_their_colour(scene, bare):
+    from scipy.spatial import cKDTree
+
+    more = FEW.more_points(bare)
+    assert len(more.positions) > 100
+    distances, rows = cKDTree(scene.points).query(more.positions)
+    # In units of the extent of the cameras; COLMAP's own points are 0.0036 apart.
+    assert np.median(distances) < 0.006
+    assert np.quantile(distances, 0.9) < 0.03
+    difference = np.abs(more.colors.astype(int) - scene.point_colors[rows].astype(int))
+    assert np.median(difference) < 20
+    assert np.isnan(more.sizes).all()
+    begun = FEW.begun(bare)
+    assert begun.points.tobytes() == more.positions.tobytes()
+    assert f"{len(more.positions)} points triangulated" in FEW.remarks(bare)[0]
+
+
+def test_it_answers_alike(bare):
+    ours, again = FEW.more_points(bare), FEW.more_points(replace(bare))
+    assert ours.positions.tobytes() == again.positions.tobytes()
+
+
+def test_a_scene_with_points_starts_from_those(scene):
+    assert Triangulated().more_points(scene) is None
+    assert "has points" in Triangulated().remarks(scene)[0]
+
+
+def test_without_points_the_start_or_the_user_has_to_give_some(bare):
+    config = RunConfig(scene="somewhere", steps=2, threads=1)
+    with pytest.raises(UserError, match="no SfM points") as caught:
+        assemble(config, bare, "colmap")
+    assert "--start triangulated" in caught.value.todo
+    assert "--init random" in caught.value.todo
+    config = RunConfig(scene="somewhere", threads=1, start={"name": "triangulated", "views": 4})
+    setup = assemble(config, bare, "colmap")
+    assert setup.selection.start == FEW
+
+
+def test_photos_that_show_nothing_in_common_are_refused(bare):
+    alone = replace(bare, train=bare.train[:1])
+    with pytest.raises(UserError, match="no points could be triangulated"):
+        Triangulated().more_points(alone)
+
+
+def test_masked_pixels_are_left_out(bare):
+    from torch import zeros
+
+    class Hidden:
+        def __init__(self, photo):
+            self.image = photo.image
+
+        def mask(self):
+            return zeros(self.image().shape[:2], dtype=bool)
+
+    views = tuple(replace(view, photo=Hidden(view.photo)) for view in bare.views)
+    with pytest.raises(UserError, match="no points could be triangulated"):
+        FEW.more_points(replace(bare, views=views))
+
+
+def test_rays_meet_where_the_point_is(scene):
+    first, *others = scene.views
+    second = max(others, key=lambda view: len(np.intersect1d(view.seen, first.seen)))
+    points = scene.points[np.intersect1d(first.seen, second.seen)[:50]]
+    count = len(points)
+    colors, unlike = np.zeros((count, 3), np.uint8), np.eye(count, dtype=np.float32)
+    ends = [
+        two_views.Features(view.camera, view.camera.project(points)[0], unlike, colors)
+        for view in (first, second)
+    ]
+    met = two_views.meet(*ends, pixels=0.01)
+    assert len(met.points) > 10
+    assert met.first.tolist() == met.second.tolist()
+    np.testing.assert_allclose(met.points, points[met.first], atol=1e-9)
