@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.plugin import UserError, size_text
+from crossgrad_core.scene.raw_checks import FARTHEST
 
 #: Bytes of a file; Python's values take some ten times as many.
 LARGEST: Final = 512 << 20
-_FAR: Final = 1e30
 _AGAIN = "mend the file, or export it again"
 _LONGEST: Final = 80
 
@@ -66,7 +66,7 @@ class Fields:
             return default
         number = _number(self.value.get(key))
         if number is None:
-            self.wrong(key, f"a finite number of at most {_FAR:g}")
+            self.wrong(key, f"a finite number of at most {FARTHEST:g}")
         return number
 
     def whole(self, key: str) -> int:
@@ -170,7 +170,7 @@ def _number(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     # Compared before it becomes a float: whole numbers in JSON have any number of digits.
-    return float(value) if -_FAR <= value <= _FAR else None
+    return float(value) if -FARTHEST <= value <= FARTHEST else None
 
 
 def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:

@@ -5,6 +5,9 @@ https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised c
 their origin in the middle of the photo and its longer side as their unit.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +20,7 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw_checks import FARTHEST
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside, place_of
@@ -159,7 +163,21 @@ def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _points(chosen: Fields) -> Points:
     points = list(chosen.members("points").values()) if "points" in chosen else []
-    positions = np.array([each.numbers("coordinates", 3) for each in points]).reshape(-1, 3)
-    colors = np.array([each.numbers("color", 3) for each in points]).reshape(-1, 3)
-    rounded = np.rint(colors.clip(0.0, _BYTE)).astype(np.uint8)
-    return Points(positions, rounded, chosen.file.name)
+    colors = np.rint(_column(points, "color").clip(0.0, _BYTE)).astype(np.uint8)
+    return Points(_column(points, "coordinates"), colors, chosen.file.name)
+
+
+def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:
+    """[P, 3] of a field of all points.
+
+    All at once, since there may be millions; where a number is wrong one by one, which names it.
+    """
+    stored = [each.value.get(key) for each in points]
+    lists = [each for each in stored if isinstance(each, list) and len(each) == 3]  # noqa: PLR2004
+    flat = list(chain.from_iterable(lists))
+    if len(lists) == len(stored) and set(map(type, flat)) <= {int, float}:
+        with suppress(OverflowError):
+            table = np.array(flat, dtype=np.float64).reshape(-1, 3)
+            if (np.abs(table) <= FARTHEST).all():
+                return table
+    return np.array([each.numbers(key, 3) for each in points]).reshape(-1, 3)

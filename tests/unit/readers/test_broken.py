@@ -130,6 +130,10 @@ FIELDS = [
     ((*CAMERA, "focal_x"), "0.9", "cameras.v2 maker 1.focal_x"),
     ((*CAMERA, "k1"), HUGE, "cameras.v2 maker 1.k1"),
     (("opensfm", 1, "points", "3", "coordinates"), [1], "points.3.coordinates"),
+    (("opensfm", 1, "points", "3", "coordinates", 1), "1", "points.3.coordinates"),
+    (("opensfm", 1, "points", "3", "coordinates", 1), True, "points.3.coordinates"),
+    (("opensfm", 1, "points", "3", "coordinates", 1), NAN, "points.3.coordinates"),
+    (("opensfm", 1, "points", "3", "coordinates", 1), HUGE, "points.3.coordinates"),
     (("opensfm", 1, "points", "3", "color"), None, "points.3.color"),
     (("opensfm", 1, "shots"), [], "shots"),
 ]  # fmt: skip
