@@ -15,6 +15,8 @@ from crossgrad_core.scene.raw_checks import FARTHEST
 
 #: Bytes of a file; Python's values take some ten times as many.
 LARGEST: Final = 512 << 20
+#: Pixels along a side of a photo.
+LONGEST_SIDE: Final = 10_000_000
 _AGAIN = "mend the file, or export it again"
 _LONGEST: Final = 80
 
@@ -69,11 +71,18 @@ class Fields:
             self.wrong(key, f"a finite number of at most {FARTHEST:g}")
         return number
 
-    def whole(self, key: str) -> int:
-        """A whole number above zero."""
+    def positive(self, key: str) -> float:
+        """A finite number above zero."""
         number = self.number(key)
-        if number != int(number) or number < 1:
-            self.wrong(key, "a whole number above zero")
+        if number <= 0.0:
+            self.wrong(key, "a number above zero")
+        return number
+
+    def side(self, key: str) -> int:
+        """The width or height of a photo: a whole number of pixels."""
+        number = self.number(key)
+        if number != int(number) or not 1 <= number <= LONGEST_SIDE:
+            self.wrong(key, f"a whole number from 1 to {LONGEST_SIDE:,}")
         return int(number)
 
     def text(self, key: str, default: str | None = None) -> str:

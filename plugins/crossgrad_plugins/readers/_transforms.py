@@ -127,7 +127,7 @@ def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calib
 
 def _size(inside: Inside, holder: Callable[[str], Fields], photo: str) -> tuple[int, int]:
     if "w" in holder("w") and "h" in holder("h"):
-        return holder("w").whole("w"), holder("h").whole("h")
+        return holder("w").side("w"), holder("h").side("h")
     header = read_header(inside.scene / photo)
     return header.width, header.height
 
@@ -151,7 +151,7 @@ def _frame(
 
 def _focal(holder: Callable[[str], Fields], name: str, angle_name: str, side: int) -> float | None:
     if name in holder(name):
-        return holder(name).number(name)
+        return holder(name).positive(name)
     if angle_name not in holder(angle_name):
         return None
     angle = holder(angle_name).number(angle_name)

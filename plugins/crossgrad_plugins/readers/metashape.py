@@ -275,7 +275,7 @@ def _parsed(text: str | None) -> object:
 
 
 def _lens(fields: Fields, kind: str) -> Calibration:
-    width, height, focal = fields.whole("width"), fields.whole("height"), fields.number("f")
+    width, height, focal = fields.side("width"), fields.side("height"), fields.positive("f")
     term = {key: fields.number(key, 0.0) for key in _TERMS}
     lens = Frame(
         *(width, height, focal + term["b1"], focal),

@@ -83,9 +83,7 @@ class NerfstudioReader(Reader):
 
 def _applied(whole: Fields) -> Frame3D:
     """From the world as it was posed to the world of the file."""
-    scale = whole.number("applied_scale", 1.0)
-    if scale <= 0.0:
-        whole.wrong("applied_scale", "a number above zero")
+    scale = whole.positive("applied_scale") if "applied_scale" in whole else 1.0
     if "applied_transform" not in whole:
         return Frame3D(np.eye(3), np.zeros(3), scale)
     matrix = transform_of(whole, "applied_transform")

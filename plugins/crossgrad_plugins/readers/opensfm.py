@@ -124,11 +124,11 @@ def _camera(fields: Fields) -> Calibration:
         *("fisheye", "fisheye_opencv"),
     }:
         raise refuse_lens(f"projection type {kind}", fields.where("projection_type"))
-    width, height = fields.whole("width"), fields.whole("height")
+    width, height = fields.side("width"), fields.side("height")
     unit = max(width, height)
     single = "focal" in fields
-    across = fields.number("focal" if single else "focal_x") * unit
-    down = across if single else fields.number("focal_y") * unit
+    across = fields.positive("focal" if single else "focal_x") * unit
+    down = across if single else fields.positive("focal_y") * unit
     lens = Frame(
         *(width, height, across, down),
         fields.number("c_x", 0.0) * unit + width / 2.0,

@@ -33,7 +33,7 @@ from crossgrad_plugins.readers._sniff import head_of
 
 _NAME: Final = "#name"
 _POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
-_LENS: Final = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _SENSOR: Final = 36.0  # mm
 _LARGEST: Final = 256 << 20
 _TODO: Final = (
@@ -178,7 +178,8 @@ def _lens(fields: Fields, photo: Path) -> Calibration:
     Raises:
         UserError: A number is wrong, or a term has no counterpart.
     """
-    focal, px, py, k1, k2, k3, k4, t1, t2 = (fields.number(key, 0.0) for key in _LENS)
+    focal = fields.positive("f")
+    px, py, k1, k2, k3, k4, t1, t2 = (fields.number(key, 0.0) for key in _LENS)
     if k4:
         raise refuse_term("k4", k4, fields.where("k4"))
     header = read_header(photo) if photo.is_file() else None
