@@ -41,12 +41,13 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
-def arm(run: RunResults) -> tuple[str, str, str]:
-    """Scene and what is done at the end of a run."""
+def arm(run: RunResults) -> tuple[str, str, str, str]:
+    """Scene, growth, and what is done at the end of a run."""
     shares = (run.config.get(name) or 0.0 for name in ("final_decay", "average"))
     fades, averages = map(float, shares)
     left = f" to {run.config['final_rate']:g}" if fades else ""
-    return Path(str(run.config["scene"])).name, f"{fades:.0%}{left}", f"{averages:.0%}"
+    growth = str(run.config.get("growth") or "free")
+    return Path(str(run.config["scene"])).name, growth, f"{fades:.0%}{left}", f"{averages:.0%}"
 
 
 def main() -> None:
@@ -60,14 +61,13 @@ def main() -> None:
             steps, values = last_tenth(run) if run.summary is not None else ([], [])
             if len(steps) >= FEWEST:
                 found[arm(run)].append((jitter(steps, values), values[-1], len(steps)))
-    print(
-        "| scene | rates fade over | averaged | runs | evaluations | jitter, dB | last PSNR, dB |"
-    )
-    print("|---|---|---|---|---|---|---|")
-    for (scene, fades, averages), runs in sorted(found.items()):
+    heads = ("scene", "growth", "rates fade over", "averaged", "runs", "evaluations")
+    print(f"| {' | '.join(heads)} | jitter, dB | last PSNR, dB |")
+    print("|---" * (len(heads) + 2) + "|")
+    for (scene, growth, fades, averages), runs in sorted(found.items()):
         jitters, last, counts = zip(*runs, strict=True)
         print(
-            f"| {scene} | {fades} | {averages} | {len(runs)} | {min(counts)} | "
+            f"| {scene} | {growth} | {fades} | {averages} | {len(runs)} | {min(counts)} | "
             f"{mean(jitters):.3f} (at most {max(jitters):.3f}) | {mean(last):.2f} |"
         )
 

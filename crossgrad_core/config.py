@@ -213,7 +213,7 @@ class RunConfig(BaseModel):
         ge=0,
         le=1,
         description="Over the last share of the steps, rates that are constant as published fade. "
-        "Default: 0.",
+        "Default: 0.25; 0 with --preset inria.",
     )
     final_rate: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
     average: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(

@@ -54,9 +54,11 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if version == _FIRST and "reading" in rest:
         rest["reading"] = _reading(rest["reading"], rest.get("scene"))
     if "revisions" in rest:
-        # What a run wrote goes on, and is repeated, in its units, at its rates, with its columns.
+        # What a run wrote goes on, and is repeated, in its units, at its rates, with its columns,
+        # and ends as it did.
         rest.setdefault("events", "steps")
         rest.setdefault("rate_factor", 1.0)
+        rest.setdefault("final_decay", 0.0)
         rest.setdefault("metrics", [{"name": name} for name in METRICS_OF_0_1.split("+")])
     return rest
 

@@ -44,10 +44,16 @@ def resolved(setup: Setup) -> RunConfig:
             "views_per_step": selection.views.setting,
             "steps": None if config.seconds else config.steps or setup.schedule.total,
             "events": setup.schedule.counting.unit,
-            "final_decay": final_decay_of(config),
+            "final_decay": _final_decay(config, setup),
             "average": average_of(config),
         }
     )
+
+
+def _final_decay(config: RunConfig, setup: Setup) -> float:
+    """The share over which rates fade; 0, and no more may be asked for, where all decay."""
+    fading = any(not block.lr.decays for block in setup.trained_blocks)
+    return final_decay_of(config) if fading else 0.0
 
 
 def _choice(name: str, component: Component) -> ComponentChoice:

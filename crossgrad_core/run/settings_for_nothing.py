@@ -172,7 +172,7 @@ def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     """What is said about rates that fade, where none does."""
     fades = final_decay_of(config) > 0.0
     if config.final_rate != RunConfig.model_fields["final_rate"].default and not fades:
-        yield "final_rate", "no rate fades without --final-decay"
+        yield "final_rate", "no rate fades with --final-decay 0, which --preset inria has by itself"
     if config.final_decay and all(block.lr.decays for block in setup.trained_blocks):
         name = setup.selection.names["backbone"]
         yield "final_decay", f"backbone {name} has no constant rates"

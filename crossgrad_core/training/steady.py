@@ -16,7 +16,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 #: Shares of a run that names none; the published rule is 0.
-FINAL_DECAY: Final = 0.0
+FINAL_DECAY: Final = 0.25
 AVERAGE: Final = 0.0
 
 #: The name among the states of plugins.

@@ -39,8 +39,10 @@ def trained(number, *plugins, **settings):
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 @pytest.mark.parametrize("step", [1, 20, 40])
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
-    plain = assembled(backbone={"name": backbone}, rate_factor=1.0)
-    doubled = assembled(backbone={"name": backbone}, rate_factor=2.0)
+    plain, doubled = (
+        assembled(backbone={"name": backbone}, rate_factor=factor, final_decay=0.0)
+        for factor in (1.0, 2.0)
+    )
     rates = {
         name: block.lr.at(step / 40) for block in plain.trained_blocks for name in block.tensors
     }

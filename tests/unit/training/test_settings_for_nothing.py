@@ -122,7 +122,8 @@ IDLE = [
     ({"fewest_edits": 6, "densify_until": 600}, "fewest_edits"),
     ({"fewest_edits": 6, "densify_from": 0, "densify_every": 9}, "fewest_edits"),
     ({"fewest_edits": 6, "schedule": "absolute", "events": "views"}, "fewest_edits"),
-    ({"final_rate": 0.5}, "final_rate"),
+    ({"final_rate": 0.5, "final_decay": 0.0}, "final_rate"),
+    ({"final_rate": 0.5, "preset": "inria"}, "final_rate"),
     (
         {
             "backbone": {
@@ -151,6 +152,7 @@ AT_WORK = [
     {"fewest_edits": 6, "schedule": "absolute", "reference": 600},
     {"seconds": 9.0, "clock": "cpu"},
     {"final_decay": 0.5, "final_rate": 0.5},
+    {"final_rate": 0.5},
     {"backbone": {"name": "scaffold"}, "final_decay": 0.5},
     # A value that is the default is never refused.
     {"operator": {"name": "chain", "links": ["mean"], "granularity": "block"}},

@@ -101,8 +101,8 @@ def recorded(setup):
 def runs(request):
     """Runs of a backbone: as published, averaged, and with both; the last one also in two parts."""
     setups = {
-        "plain": setup_of(request.param),
-        "averaged": setup_of(request.param, average=0.4),
+        "plain": setup_of(request.param, final_decay=0.0),
+        "averaged": setup_of(request.param, average=0.4, final_decay=0.0),
         "both": setup_of(request.param, average=0.5, final_decay=0.5),
     }
     found = {name: recorded(setup) for name, setup in setups.items()}
@@ -280,8 +280,22 @@ def test_the_published_rule_has_neither():
     assert (asked.final_decay, asked.average) == (0.2, 0.1)
 
 
+def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
+    names = ("lr_features_final", "lr_scales_final", "lr_cov_final")
+    config = RunConfig(
+        steps=10, backbone=ComponentChoice(name="scaffold", **dict.fromkeys(names, 1e-5))
+    )
+    setup = assemble(config, sample_scene(), "none")
+    written = resolved(setup)
+    assert written.final_decay == 0.0
+    again = RunConfig.model_validate(written.model_dump() | {"reader": {"name": "auto"}})
+    assert resolved(assemble(again, sample_scene(), "none")).final_decay == 0.0
+
+
 def test_a_run_says_what_it_does_at_its_end():
-    assert not [note for note in setup_of().notes if "steady end" in note]
+    none = setup_of(final_decay=0.0)
+    assert not [note for note in none.notes if "steady end" in note]
+    assert resolved(setup_of()).final_decay == 0.25
     notes = [n for n in setup_of(final_decay=0.25, average=0.1).notes if "steady end" in n]
     assert "fade to 0.01 of themselves over the last 25% of the steps" in notes[0]
     assert "last 10% of the steps are averaged" in notes[1]
