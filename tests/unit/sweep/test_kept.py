@@ -1,0 +1,70 @@
+"""What is left of a sweep that is kept, as benchmarks/kept.py packs it."""
+
+import json
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from support.run_folders import RunFolder
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.sweep.standing import is_finished
+
+SCRIPT = Path(__file__).parents[3] / "benchmarks" / "kept.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    return SimpleNamespace(**runpy.run_path(str(SCRIPT)))
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    for seed in range(3):
+        RunFolder(seed=seed).write(tmp_path / "sweep" / "runs" / f"r{seed}")
+    (tmp_path / "sweep" / "runs" / "r0" / "point_cloud.ply").write_bytes(b"ply" * 1000)
+    (tmp_path / "sweep" / "runs.csv").write_text("run,configuration\nr0,a\nr1,a\nr2,a\n")
+    return tmp_path / "sweep"
+
+
+def contents(folder):
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def test_tables_come_back_and_models_do_not(script, sweep, tmp_path):
+    archive = tmp_path / "results" / "grid.tar.xz"
+    assert script.pack(sweep, archive) == 3
+    assert script.unpack(archive, tmp_path / "back") == 3
+    (sweep / "runs" / "r0" / "point_cloud.ply").unlink()
+    assert contents(tmp_path / "back") == contents(sweep)
+    assert all(is_finished(each) for each in (tmp_path / "back" / "runs").iterdir())
+    found = read_runs([tmp_path / "back"], skip_broken=False)
+    assert len(found.runs) == 3 and not found.left_out
+    again = tmp_path / "again.tar.xz"
+    script.pack(tmp_path / "back", again)
+    assert again.read_bytes() == archive.read_bytes()
+
+
+def test_runs_that_did_not_finish_are_left_out(script, sweep, tmp_path):
+    path = sweep / "runs" / "r1" / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "status": "interrupted"}))
+    (sweep / "runs" / "r2" / "summary.json").unlink()
+    assert script.pack(sweep, tmp_path / "grid.tar.xz") == 1
+    (sweep / "runs" / "r0" / "summary.json").unlink()
+    with pytest.raises(UserError, match="nothing to keep"):
+        script.pack(sweep, tmp_path / "grid.tar.xz")
+
+
+def test_what_is_there_stays(script, sweep, tmp_path):
+    script.pack(sweep, tmp_path / "grid.tar.xz")
+    (sweep / "runs" / "r0" / "metrics.csv").write_text("newer")
+    (sweep / "runs.csv").write_text("newer")
+    (sweep / "runs" / "r2").rename(tmp_path / "gone")
+    before = contents(sweep)
+    assert script.unpack(tmp_path / "grid.tar.xz", sweep) == 1
+    after = contents(sweep)
+    assert {name: after[name] for name in before} == before
+    assert {name.split("/")[1] for name in set(after) - set(before)} == {"r2"}
