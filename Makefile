@@ -11,7 +11,10 @@ FUZZ_SEED ?= 0
 BIN = $(VENV)/bin
 PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo install test slow matrix exposures compat faults fuzz lint bench clean
+# The commit that `make bits` holds this checkout against.
+BASE ?= HEAD~1
+
+.PHONY: demo install test bits slow matrix exposures compat faults fuzz lint bench clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -25,6 +28,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 test:  ## Build the wheel, install it into a fresh environment, run all tests against it
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh
+
+bits: install  ## Whether this checkout trains to the bits of its parent commit (BASE=COMMIT)
+	PYTHON="$(BIN)/python" BASE="$(BASE)" sh tests/bits.sh
 
 matrix:  ## Train every combination of components for a few steps (CONTRIBUTING.md says how long)
 	PYTHON="$(PYTHON)" TEST_VENV="$(abspath $(TEST_VENV))" sh tests/run.sh -m matrix
