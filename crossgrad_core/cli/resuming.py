@@ -9,7 +9,7 @@ from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.wording import listed
 
 #: What only this start of the command is asked.
-_OF_THE_COMMAND: Final = frozenset({"resume", "accept_scene", "quiet", "verbose"})
+_OF_THE_COMMAND: Final = frozenset({"resume", "accept_scene", "check", "quiet", "verbose"})
 
 
 def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:

@@ -68,6 +68,12 @@ _LAST: Final = (
         "--dry-run",
         help="Checks everything and prints the resolved settings; trains nothing.",
     ),
+    _own(
+        "check",
+        bool,
+        "--check",
+        help="Decodes all photos before training, so that no damaged one is found later.",
+    ),
     _own("quiet", bool, "--quiet", "-q", help="Prints errors and the result only."),
     _own("verbose", bool, "--verbose", "-v", help="Prints every decision and event."),
 )
@@ -135,5 +141,6 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
         dry_run=given["dry_run"],
         verbosity=int(given["verbose"]) - int(given["quiet"]),
         accept_scene=given["accept_scene"],
+        check=given["check"],
     )
     raise typer.Exit(code)

@@ -36,6 +36,9 @@ class SceneOptions(BaseModel):
         "Default: points.",
     )
     cache_mib: int = Field(2048, ge=16, description="memory for decoded photos, MiB")
+    disk_mib: int = Field(
+        20480, ge=0, description="disk space for large photos in the size as trained, MiB; 0: none"
+    )
     masks: Path | None = Field(None, description="mask folder; default <scene>/masks if present")
 
     @property

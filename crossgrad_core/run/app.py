@@ -91,6 +91,7 @@ def run(
     dry_run: bool = False,
     verbosity: int = 0,
     accept_scene: bool = False,
+    check: bool = False,
 ) -> int:
     """Trains, evaluates, exports, and prints the results: what `crossgrad run` does.
 
@@ -100,6 +101,7 @@ def run(
         dry_run: Of a new run, check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
         accept_scene: Continue although photos, masks or points of the scene have changed.
+        check: Decode all photos before training.
 
     Returns:
         The exit code: 0, 1 where training failed, 130 where the user interrupted the run (128 and
@@ -109,7 +111,7 @@ def run(
         UserError: The input is bad; nothing was written.
     """
     if resume is not None:
-        way = Way(verbosity, _print_results)
+        way = Way(verbosity, _print_results, check)
         return resumed(resume, settings, way, accept_scene=accept_scene).exit_code
     if accept_scene:
         raise UserError(
@@ -117,10 +119,11 @@ def run(
             where="--accept-scene",
             todo="leave it out, or name the run with --resume",
         )
+    way = Way(verbosity, _print_results, check)
     if dry_run:
-        _print_dry_run(_with_remarks(_checked(settings, verbosity)[0])[0])
+        _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0
-    return new(settings, Way(verbosity, _print_results)).exit_code
+    return new(settings, way).exit_code
 
 
 @dataclass(frozen=True)
@@ -130,10 +133,12 @@ class Way:
     Attributes:
         verbosity: -1 quiet, 0 normal, 1 verbose.
         tell: Is told the results.
+        check: Whether all photos are decoded before training, not the held-out ones only.
     """
 
     verbosity: int
     tell: Tell
+    check: bool = False
 
 
 def new(settings: Mapping[str, Any], way: Way) -> Outcome:
@@ -142,7 +147,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     Raises:
         UserError: The input is bad; nothing was written.
     """
-    setup, load_seconds = _checked(settings, way.verbosity)
+    setup, load_seconds = _checked(settings, way)
     config = setup.config
     check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
     compile_seconds = warm_up(setup)
@@ -169,17 +174,17 @@ def _with_remarks(setup: Setup) -> tuple[Setup, float]:
     return replace(setup, notes=(*setup.notes, *remarks)), perf_counter() - begun
 
 
-def _checked(settings: Mapping[str, Any], verbosity: int) -> tuple[Setup, float]:
+def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     """The setup of a new run, all that can be refused refused, and the seconds of loading."""
     config = with_defaults(parsed(settings))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
-    setup, load_seconds = set_up(config, verbosity)
+    setup, load_seconds = set_up(config, way.verbosity)
     check_clock(config)
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
     known_starts(setup)
-    return setup, load_seconds + _held_out_decoded(setup)
+    return setup, load_seconds + _decoded(setup, way)
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -298,7 +303,7 @@ def resumed(
                 todo="start a new run; --init point_cloud.ply starts from its Gaussians",
             )
         if step < total:
-            state.clock.load += _held_out_decoded(setup)
+            state.clock.load += _decoded(setup, way)
             state.clock.compile += warm_up(setup, state)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         session = Session.resumed(folder, setup, step)
@@ -306,11 +311,12 @@ def resumed(
         return _train(setup, state, session, length, way.tell)
 
 
-def _held_out_decoded(setup: Setup) -> float:
-    """Finds held-out photos that cannot be decoded before training; answers the seconds."""
+def _decoded(setup: Setup, way: Way) -> float:
+    """Finds held-out photos, or all, that cannot be decoded; answers the seconds."""
     start = perf_counter()
     keep = fits(setup.scene, setup.config.reading.cache_mib)
-    check_photos(setup.scene.test_views, keep=keep)
+    views = setup.scene.views if way.check else setup.scene.test_views
+    check_photos(views, keep=keep, whole=way.check)
     return perf_counter() - start
 
 

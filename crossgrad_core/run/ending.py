@@ -14,7 +14,7 @@ from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.summary import Status
 from crossgrad_core.run.session import PANELS, Session
-from crossgrad_core.scene.photo_check import checked_meanwhile, fits
+from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.training.budget import Length
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import evaluates_after, train
@@ -80,9 +80,10 @@ class Course:
     def _train(self, length: Length) -> None:
         setup = self.setup
         keep = fits(setup.scene, setup.config.reading.cache_mib)
+        views = (*setup.train_views, *setup.scene.test_views)
         with (
             self.stopper.interruptible(),
-            checked_meanwhile(setup.train_views, self.stopper.fail, keep=keep),
+            setup.photos_ahead.at_work(views, self.stopper.fail, keep=keep),
         ):
             setup.hook.crossgrad_run_start(run=self._info())
             self._catch_up()

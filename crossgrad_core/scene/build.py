@@ -12,6 +12,7 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene.blank_photos import without_blank_photos
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
+from crossgrad_core.scene.photo_store import PhotoStore, store_folder
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.raw_checks import (
@@ -55,7 +56,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         regimes = tuple(split.regimes[view.name] for view in used)
     else:
         regimes = by_folder or label_by_footprint(cameras, seen, local, train)
-    cache: PhotoCache[PhotoSource] = PhotoCache(options.cache_mib)
+    store = PhotoStore(store_folder(), options.disk_mib)
+    cache: PhotoCache[PhotoSource] = PhotoCache(options.cache_mib, store)
     return Scene(
         name=raw.root.resolve().name or "scene",
         views=tuple(

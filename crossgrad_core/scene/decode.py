@@ -21,6 +21,8 @@ Pixels = NDArray[np.uint8]
 RESIZE_FILTER = "scikit-image resize, anti-aliased"
 
 _FULL_8_BIT, _FULL_16_BIT = 255, 65535
+#: Standard deviations at which SciPy cuts its Gaussians off.
+_WIDTHS = 4.0
 
 
 def decode_photo(path: Path, reduction: int = 1) -> tuple[Pixels, Pixels | None]:
@@ -53,15 +55,37 @@ def decode_mask(path: Path) -> Pixels:
 
 
 def resize(image: Pixels, width: int, height: int) -> Pixels:
-    """[H, W] or [H, W, C] in another size, by scikit-image's anti-aliased resize."""
-    if image.shape[:2] == (height, width):
+    """[H, W] or [H, W, C] in another size, to the bits of scikit-image's anti-aliased resize."""
+    tall, wide = image.shape[:2]
+    if (tall, wide) == (height, width):
         return image
+    if height > tall or width > wide:
+        return _resized_by_skimage(image, width, height)
+    from crossgrad_core.scene.numba_kernels.shrinking import shrink
+
+    small = np.empty((height, width, image[0, 0].size), np.uint8)
+    rows = np.ascontiguousarray(image).reshape(tall, -1)
+    shrink(rows, _gaussian(tall / height), _gaussian(wide / width), small)
+    return small.reshape(height, width, *image.shape[2:])
+
+
+def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
     from skimage import transform
 
     resize_floats: Callable[..., NDArray[np.float32]] = transform.resize
     # float32 halves the time of float64 and differs by less than a hundredth of a grey level.
     floats = resize_floats(image.astype(np.float32), (height, width), anti_aliasing=True)
     return np.asarray(np.rint(floats).clip(0, _FULL_8_BIT), dtype=np.uint8)
+
+
+def _gaussian(factor: float) -> NDArray[np.float64]:
+    """Weights of the filter before a side is divided by `factor`, from the middle outwards."""
+    deviation = (factor - 1.0) / 2.0
+    radius = int(_WIDTHS * deviation + 0.5)
+    if radius == 0:
+        return np.ones(1)
+    weights = np.exp(-0.5 / (deviation * deviation) * np.arange(-radius, radius + 1) ** 2)
+    return np.asarray((weights / weights.sum())[radius:])
 
 
 def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) -> Pixels:
@@ -107,7 +131,7 @@ def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
     if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}:
         rgba = np.array(image.convert("RGBA"))
         return rgba[..., :3].copy(), rgba[..., 3].copy()
-    return np.array(image.convert("RGB")), None
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB")), None
 
 
 def _read_grey(image: "Image") -> NDArray[np.int32]:

@@ -7,10 +7,12 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.heif import SUFFIXES
 from crossgrad_core.scene.wording import name_some
 
 _SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+    | {*SUFFIXES}
 )
 _REDUCED = (2, 4, 8)
 

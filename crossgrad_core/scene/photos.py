@@ -1,10 +1,12 @@
 """Photos that are decoded when they are asked for, and the memory that keeps them."""
 
+import os
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
-from typing import Generic, Protocol, TypeVar
+from threading import Event, Lock
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -15,14 +17,17 @@ from crossgrad_core.contract.scene import Photo
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize, turn
-
-_Decoded = tuple[Tensor, Tensor | None]
+from crossgrad_core.scene.photo_store import Decoded, PhotoStore, Storable, made_by
 
 #: The smallest size that JPEG files can be decoded at: all of their data is read for it.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
+#: Seconds that a photo is waited for which another thread is decoding.
+_PATIENCE = 0.5
 # More than the views of one step, so that none is decoded twice in it.
 _LATEST = 16
+#: Photos of fewer pixels are decoded about as quickly as read.
+_LARGE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,26 @@ class PhotoSource:
             return self.width, self.height
         return self.distorted.pinhole.width, self.distorted.pinhole.height
 
-    def decode(self) -> _Decoded:
+    @property
+    def origin(self) -> str | None:
+        """All that the pixels come from; None where decoding takes no longer than reading them."""
+        pixels = self.width * self.height * self.reduction**2
+        if pixels < _LARGE or (self.target == (self.width, self.height) and not self.distorted):
+            return None
+        files = [self.path] if self.mask is None else [self.path, self.mask]
+        try:
+            facts = [os.stat(path) for path in files]
+        except OSError:  # Decoding says what is wrong.
+            return None
+        marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
+        return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
+
+    @property
+    def decoded_bytes(self) -> int:
+        """What the decoded photo and a mask take."""
+        return 4 * self.target[0] * self.target[1]
+
+    def decode(self) -> Decoded:
         """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts.
 
         Raises:
@@ -133,15 +157,8 @@ class PhotoSource:
         return _both(keep, np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8))
 
 
-class Decodable(Protocol):
-    """Something to be decoded; hashable, and equal where the outcome is."""
-
-    def decode(self) -> _Decoded:
-        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts."""
-        ...
-
-
-Key = TypeVar("Key", bound=Decodable)
+#: Hashable, and equal where the outcome is.
+Key = TypeVar("Key", bound=Storable)
 
 
 class PhotoCache(Generic[Key]):
@@ -149,18 +166,22 @@ class PhotoCache(Generic[Key]):
 
     Training walks through all photos again and again. Were the least recently used photo dropped, a
     set a little larger than the memory would hardly ever be found in it. So what is there stays,
-    and only the latest few photos make room for new ones: of a set twice as large as the memory,
-    about half is found.
+    and only the latest few photos, and those that are expected, make room for new ones: of a set
+    twice as large as the memory, about half is found.
 
     Args:
         mib: Memory for decoded photos and masks, MiB. The latest photo is kept in any case.
+        store: Where photos are kept on disk; None decodes their files.
     """
 
-    def __init__(self, mib: int) -> None:
-        self._limit = mib * 2**20
+    def __init__(self, mib: int, store: PhotoStore | None = None) -> None:
+        self.limit = mib * 2**20
+        self._store = store
         self._used = 0
-        self._kept: OrderedDict[Key, _Decoded] = OrderedDict()
-        self._latest: OrderedDict[Key, _Decoded] = OrderedDict()
+        self._kept: OrderedDict[Key, Decoded] = OrderedDict()
+        self._latest: OrderedDict[Key, Decoded] = OrderedDict()
+        self._expected: frozenset[Key] = frozenset()
+        self._under_way: dict[Key, Event] = {}
         self._lock = Lock()
 
     @property
@@ -168,30 +189,68 @@ class PhotoCache(Generic[Key]):
         """Bytes of the decoded photos and masks."""
         return self._used
 
-    def get(self, source: Key) -> _Decoded:
-        """The decoded photo and mask of `source`; shared, so never to be written to."""
-        with self._lock:
-            decoded = self._kept.get(source) or self._latest.get(source)
-        if decoded is None:
-            decoded = source.decode()
+    def expect(self, sources: Iterable[Key]) -> None:
+        """Names the photos that will be asked for next: they are dropped last."""
+        self._expected = frozenset(sources)
+
+    def holds(self, source: Key) -> bool:
+        """Whether a photo is there, or being decoded by some thread."""
+        return source in self._kept or source in self._latest or source in self._under_way
+
+    def get(self, source: Key) -> Decoded:
+        """The decoded photo and mask of `source`; shared, so never to be written to.
+
+        A photo that another thread is decoding is waited for, but not for long: where other
+        programs have the cores, that thread, which gives way to them, may get nowhere.
+        """
+        over, waited = Event(), False
+        while True:
+            with self._lock:
+                decoded = self._kept.get(source) or self._latest.get(source)
+                if decoded is not None:
+                    return decoded
+                other = self._under_way.setdefault(source, over)
+            if other is over or waited:
+                break
+            waited = not other.wait(_PATIENCE)
+        try:
+            decoded = self._decoded(source)
             with self._lock:
                 self._keep(source, decoded)
-        return decoded
+            return decoded
+        finally:
+            if other is over:
+                del self._under_way[source]
+                over.set()
 
-    def _keep(self, source: Key, decoded: _Decoded) -> None:
+    def prepare(self, source: Key) -> bool:
+        """Sees to it that the photo is on disk; False where none are kept: nothing was done."""
+        there = None if self._store is None else self._store.holds(source)
+        if there is False:
+            self._decoded(source)
+        return there is not None
+
+    def _decoded(self, source: Key) -> Decoded:
+        return source.decode() if self._store is None else self._store.decoded(source)
+
+    def _keep(self, source: Key, decoded: Decoded) -> None:
         if source in self._kept or source in self._latest:
             return
         self._latest[source] = decoded
         self._used += _bytes(decoded)
-        while self._used > self._limit and len(self._latest) + len(self._kept) > 1:
-            if len(self._latest) > 1:
-                _, dropped = self._latest.popitem(last=False)
-            else:
-                _, dropped = self._kept.popitem()
-            self._used -= _bytes(dropped)
+        while self._used > self.limit and len(self._latest) + len(self._kept) > 1:
+            self._used -= _bytes(self._dropped())
         if len(self._latest) > _LATEST:
             key, decoded = self._latest.popitem(last=False)
             self._kept[key] = decoded
+
+    def _dropped(self) -> Decoded:
+        """Takes out the oldest photo that is not expected, but never the latest one."""
+        *others, _ = self._latest
+        idle = next((key for key in others if key not in self._expected), None)
+        if idle is None and self._kept:
+            return self._kept.popitem()[1]
+        return self._latest.pop(others[0] if idle is None else idle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,5 +273,5 @@ def _both(first: Pixels | None, second: Pixels) -> Pixels:
     return second if first is None else np.minimum(first, second)
 
 
-def _bytes(decoded: _Decoded) -> int:
+def _bytes(decoded: Decoded) -> int:
     return sum(tensor.nbytes for tensor in decoded if tensor is not None)

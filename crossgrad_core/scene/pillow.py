@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 from typing_extensions import override
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene import heif
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -37,7 +38,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
     from PIL import UnidentifiedImageError
 
     try:
-        with _Bounded(path) as file, _identified(file) as image:
+        with _Bounded(path) as file, _identified(file, path) as image:
             _check_pixels(image, path)
             yield image
     except (UserError, MemoryError):
@@ -82,12 +83,14 @@ def _check_pixels(image: "Image", path: Path) -> None:
         raise UserError("the photo has no pixels", where=path, todo="replace or remove it")
 
 
-def _identified(file: BinaryIO) -> "Image":
+def _identified(file: BinaryIO, path: Path) -> "Image":
     """As `Image.open`, but without a bound on the size: ours depends on how it is decoded."""
     from PIL import Image
 
     Image.init()
-    formats = [name for name in _FORMATS if name in Image.OPEN]
+    known = (*_FORMATS, "HEIF") if heif.admit(file.read(heif.HEAD), path) else _FORMATS
+    file.seek(0)
+    formats = [name for name in known if name in Image.OPEN]
     with _LOCK:  # Pillow's bound is a global, and photos are decoded in several threads.
         bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:

@@ -10,6 +10,7 @@ from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+from crossgrad_core.training.foresight import Foresight
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.model import model_of
 from crossgrad_core.training.setup import Setup
@@ -88,7 +89,9 @@ def _steps(
 ) -> Ending:
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
+    foresight = Foresight(setup)
     while state.step < last and not stopper.requested:
+        foresight.look(state)
         try:
             record = timed_step(setup, state)
             leaves = state.step == last or stopper.requested
@@ -115,9 +118,11 @@ def _steps(
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     """One step on the training clock; decoding photos is counted as loading."""
     state.laps = Laps()
+    setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
     if setup.device.type == "cuda":
         torch.cuda.synchronize(setup.device)
+    state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
     state.clock.count(state.laps)
     state.last = replace(record, train_seconds=state.clock.train)

@@ -28,6 +28,11 @@ class ScaledPhotos:
         self._room = mib * 2**20
         self._kept: dict[str, dict[_Size, Pair]] = {}
 
+    def holds(self, view: View, camera: Camera) -> bool:
+        """Whether a photo in the size of a camera can be had without the view's own."""
+        kept = self._kept.get(view.name, {})
+        return any(size in kept for size in _sizes(view.camera, camera))
+
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
         """The photo and mask of a view in the size of a camera; shared, so never to be written to.
 

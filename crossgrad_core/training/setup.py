@@ -1,7 +1,7 @@
 """The parts of a run once its configuration is resolved; training changes nothing here."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import pluggy
@@ -20,6 +20,7 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.scene.photos_ahead import PhotosAhead
 from crossgrad_core.training.operator_scale import OperatorScale
 from crossgrad_core.training.scaled_photos import ScaledPhotos
 
@@ -39,6 +40,7 @@ class Setup:
         device: Where tensors live.
         notes: What was chosen or left out, and why.
         scaled_photos: Where photos of smaller sizes are kept.
+        photos_ahead: The threads that decode photos beside the steps.
         pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
 
@@ -52,6 +54,7 @@ class Setup:
     device: torch.device
     notes: tuple[str, ...]
     scaled_photos: ScaledPhotos
+    photos_ahead: PhotosAhead = field(default_factory=PhotosAhead)
     pixel_share: float = 0.6
 
     @property

@@ -83,14 +83,19 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     )
 
 
-def _sample(setup: Setup, state: TrainState) -> Draw:
-    context = SampleContext(
-        **context_fields(setup, state, "sampler"),
-        views_per_step=setup.schedule.pace.at(state.step),
+def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
+    """What the sampler is told in a step, if it were the next one."""
+    return SampleContext(
+        **{**context_fields(setup, state, "sampler"), "step": step},
+        views_per_step=setup.schedule.pace.at(step),
         groups=groups_of(setup, state),
         centers=setup.scene.centers,
         last=state.last,
     )
+
+
+def _sample(setup: Setup, state: TrainState) -> Draw:
+    context = sample_context(setup, state, state.step)
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
     state.commit(answer.states)
     counts = setup.sampler.counts(context.views_per_step)

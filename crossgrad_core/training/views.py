@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from math import isfinite
-from time import perf_counter, process_time
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -251,13 +251,13 @@ def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, An
 
 def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tensor | None]:
     """The decoded photo and mask of a view on the run's device; decoding counts as loading."""
-    start, cpu = perf_counter(), process_time()
+    start, cpu = perf_counter(), thread_time()
     image, mask = view.photo.image(), view.photo.mask()
     image = image.to(setup.device)
     mask = None if mask is None else mask.to(setup.device)
     seconds = perf_counter() - start
     state.clock.load += seconds
-    state.laps.leave_out(seconds, process_time() - cpu)
+    state.laps.leave_out(seconds, thread_time() - cpu)
     return image, mask
 
 

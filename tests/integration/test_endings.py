@@ -15,7 +15,7 @@ from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.scene import photo_check
+from crossgrad_core.scene import photos_ahead
 
 STEPS, FAILS_IN = 8, 5
 RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}
@@ -298,12 +298,23 @@ def test_a_held_out_photo_that_cannot_be_decoded_costs_no_step(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("dry", [False, True])
+def test_check_decodes_the_training_photos_too_before_anything_is_written(tmp_path, dry):
+    scene = write_tiny_scene(tmp_path / "tiny", views=9)
+    rotten(scene / "images" / "0003.png")
+    rotten(scene / "images" / "0005.png")
+    settings = {"scene": str(scene), "steps": 2, "out": str(tmp_path / "run")}
+    with pytest.raises(UserError, match=r"2 photos cannot be decoded(.|\n)*0003\.png.*0005\.png"):
+        app.run(settings, check=True, dry_run=dry, verbosity=-1)
+    assert not (tmp_path / "run").exists()
+
+
 class Waiting:
     """Holds up the first step until the run was asked to stop, and the photos until that step."""
 
     def __init__(self, monkeypatch):
         self.reached = threading.Event()
-        monkeypatch.setattr(photo_check, "_give_way", lambda: self.reached.wait(30))
+        monkeypatch.setattr(photos_ahead, "_give_way", lambda: self.reached.wait(30))
 
     @hookimpl
     def crossgrad_step_end(self, record):

@@ -15,7 +15,7 @@ _NO_ARM: Final = frozenset(
         *("steps", "max_views", "seconds", "revisions", "planned_seconds", "stop_after", "clock"),
         *("eval_every", "eval_from", "save_every", "threads", "max_dropped"),
         *("observers", "metrics", "exporter"),
-        *("reading.cache_mib", "reading.masks"),
+        *("reading.cache_mib", "reading.disk_mib", "reading.masks"),
     }
 )
 

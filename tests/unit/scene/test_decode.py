@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from PIL import Image, ImageOps
 from skimage.transform import resize as skimage_resize
 
@@ -103,3 +105,28 @@ def test_blend_puts_a_colour_behind():
     mixed = blend(RGB, alpha, (1.0, 0.5, 0.0))
     np.testing.assert_array_equal(mixed[:20], RGB[:20])
     assert tuple(mixed[30, 30]) == (255, 128, 0)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    old=st.tuples(st.integers(1, 90), st.integers(1, 90)),
+    new=st.tuples(st.integers(1, 90), st.integers(1, 90)),
+    kind=st.sampled_from(["noise", "mask", "grey"]),
+    seed=st.integers(0, 99),
+)
+@example((90, 90), (45, 30), "noise", 0)
+@example((61, 1), (60, 1), "noise", 0)
+@example((7, 90), (1, 2), "mask", 1)
+def test_photos_are_made_smaller_to_the_bits_of_skimage(old, new, kind, seed):
+    height, width = (min(pair) for pair in zip(old, new, strict=True))
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, old if kind == "grey" else (*old, 3), dtype=np.uint8)
+    if kind == "mask":
+        image = np.where(rng.random(old) < 0.5, 255, 0).astype(np.uint8)
+    whole = skimage_resize(image.astype(np.float32), (height, width), anti_aliasing=True)
+    np.testing.assert_array_equal(resize(image, width, height), np.rint(whole).clip(0, 255))
+
+
+def test_one_side_may_grow():
+    whole = skimage_resize(RGB.astype(np.float32), (50, 30), anti_aliasing=True)
+    np.testing.assert_array_equal(resize(RGB, 30, 50), np.rint(whole).clip(0, 255))

@@ -10,7 +10,8 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_scene
-from crossgrad_core.scene.photo_check import check_photos, checked_meanwhile, fits
+from crossgrad_core.scene.photo_check import check_photos, fits
+from crossgrad_core.scene.photos_ahead import AT_ONCE, PhotosAhead
 from crossgrad_core.testing.fixtures import sample_scene
 
 SECONDS = 30
@@ -48,7 +49,7 @@ def test_every_held_out_photo_that_cannot_be_decoded_is_named(folder, keep):
         check_photos(scene.test_views, keep=keep)
     rotten(folder / "images" / "0008.png")
     scene = read(folder)
-    with pytest.raises(UserError, match=r"2 held-out photos(.|\n)*0000\.png(.|\n)*0008\.png"):
+    with pytest.raises(UserError, match=r"2 photos(.|\n)*0000\.png(.|\n)*0008\.png"):
         check_photos(scene.test_views, keep=keep)
 
 
@@ -79,7 +80,7 @@ def test_a_training_photo_is_reported_from_the_background(folder, keep):
         found.append(error)
         told.set()
 
-    with checked_meanwhile(scene.train_views, report, keep=keep):
+    with PhotosAhead().at_work(scene.train_views, report, keep=keep):
         assert told.wait(SECONDS)
     assert len(found) == 1 and "0005.png" in str(found[0])
 
@@ -102,11 +103,11 @@ class Slow:
 def test_the_background_ends_with_the_block():
     gate = Event()
     views = [replace(view, photo=Slow(gate)) for view in sample_scene().train_views]
-    with checked_meanwhile(views, pytest.fail, keep=False):
-        assert views[0].photo.asked.wait(SECONDS)
+    with PhotosAhead().at_work(views, pytest.fail, keep=False):
+        assert all(view.photo.asked.wait(SECONDS) for view in views[:AT_ONCE])
         Timer(0.2, gate.set).start()  # After the block is left.
     assert gate.is_set()
-    assert not views[1].photo.asked.is_set()
+    assert not views[AT_ONCE].photo.asked.is_set()
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ValueError("odd")])
@@ -123,7 +124,7 @@ def test_want_of_memory_beside_training_is_left_to_training(error):
         found.append(each)
         told.set()
 
-    with checked_meanwhile([view], report, keep=True):
+    with PhotosAhead().at_work([view], report, keep=True):
         assert asked.wait(SECONDS)
         told.wait(0.2 if isinstance(error, MemoryError) else SECONDS)
     assert found == ([] if isinstance(error, MemoryError) else [error])

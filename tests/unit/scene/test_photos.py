@@ -1,3 +1,4 @@
+import os
 import threading
 from dataclasses import replace
 
@@ -129,6 +130,32 @@ def test_a_photo_that_changed_its_size_is_refused(source):
         source.decode()
 
 
+def test_large_photos_that_are_changed_say_what_they_come_from(source, tmp_path):
+    large = replace(source, width=2000, height=1500, target=(200, 150))
+    assert source.origin is None
+    assert replace(large, target=(2000, 1500)).origin is None
+    assert replace(large, width=400, height=300, target=(40, 30), reduction=8).origin is not None
+    lens = Calibration("SIMPLE_RADIAL", 2000, 1500, (1500.0, 1000.0, 750.0, -0.1))
+    mask = save_mask(tmp_path, RGB[..., 0])
+    others = [
+        large,
+        replace(large, target=(2000, 1500), distorted=lens),
+        replace(large, target=(100, 75)),
+        replace(large, orientation=6),
+        replace(large, background=(1.0, 1.0, 1.0)),
+        replace(large, mask=mask),
+    ]
+    origins = [each.origin for each in others]
+    assert len(set(origins)) == len(others) and None not in origins
+    assert [each.origin for each in others] == origins
+    os.utime(mask, (1, 1))
+    assert others[-1].origin != origins[-1]
+    Image.fromarray(255 - RGB).save(source.path)
+    assert all(each.origin not in origins for each in others)
+    source.path.unlink()
+    assert large.origin is None
+
+
 class Counting:
     """Stands in for a source; counts how often it is decoded."""
 
@@ -144,7 +171,7 @@ class Counting:
 @pytest.fixture
 def small_cache():
     cache = PhotoCache(0)
-    cache._limit = 50_000
+    cache.limit = 50_000
     return cache
 
 

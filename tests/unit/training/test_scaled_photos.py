@@ -140,7 +140,9 @@ def test_what_was_asked_for_before_changes_no_pixel(asked, room):
     photos._room = room * 1000
     for index, width in asked:
         view, camera = VIEWS[index], resized(VIEWS[index], width, max(1, width * 2 // 3))
-        found = photos.get(view, camera, Counted())
+        full, held = Counted(), photos.holds(view, camera)
+        found = photos.get(view, camera, full)
+        assert full.times == (0 if held else 1)
         alone = ScaledPhotos(0).get(view, camera, Counted())
         assert torch.equal(found[0], alone[0]) and found[0].shape[:2] == (camera.height, width)
 

@@ -1,0 +1,210 @@
+"""Photos in the size that they are trained in, kept on disk from one run to the next.
+
+A file holds one photo and is named by all that its pixels come from, so an entry never has to be
+brought up to date. It appears whole or not at all, carries a checksum, and counts as missing where
+anything about it is not as expected.
+"""
+
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from threading import Lock
+from time import time
+from typing import Final, Protocol
+from zlib import crc32
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_LOG = logging.getLogger(__name__)
+#: The folder of all entries, where not below the user's cache folder.
+FOLDER: Final = "CROSSGRAD_CACHE"
+#: Raised whenever decoding, undistorting or resizing gives other bits than before.
+PIXELS_VERSION: Final = 1
+#: Bytes of a disk that are never taken.
+RESERVE: Final = 2 * 2**30
+_MAGIC, _SUM = b"CGphoto1", 4
+_KEPT, _TEMPORARY = ".photo", ".tmp"
+#: Seconds after which an unfinished file is one of a process that was killed.
+_STALE = 3600.0
+#: Seconds by which the times of files may be off.
+_GRAIN = 2.0
+_NUMBER = count()
+
+Decoded = tuple[Tensor, Tensor | None]
+
+
+class Storable(Protocol):
+    """Something to be decoded that may be kept on disk."""
+
+    @property
+    def target(self) -> tuple[int, int]:
+        """(width, height) as trained."""
+        ...
+
+    @property
+    def origin(self) -> str | None:
+        """All that the pixels come from; None where decoding takes no longer than reading."""
+        ...
+
+    def decode(self) -> Decoded:
+        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts."""
+        ...
+
+
+def store_folder() -> Path:
+    """Where photos are kept: `CROSSGRAD_CACHE`, else below the user's cache folder."""
+    if given := os.environ.get(FOLDER):
+        return Path(given) / "photos"
+    beside = {"darwin": "~/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", "~")}
+    base = os.environ.get("XDG_CACHE_HOME") or beside.get(sys.platform, "~/.cache")
+    return Path(base).expanduser() / "crossgrad" / "photos"
+
+
+class PhotoStore:
+    """A folder of decoded photos of bounded size; several threads and processes may share it.
+
+    What was used since this one began stays; of the others those go first that were not used for
+    longest. Where that makes no room, or the disk has none, nothing more is kept.
+
+    Args:
+        folder: The folder; made when something is kept.
+        mib: Size of all entries together, MiB.
+    """
+
+    def __init__(self, folder: Path, mib: int) -> None:
+        self._folder = folder
+        self._limit = mib * 2**20
+        self._begun = time() - _GRAIN
+        self._used: int | None = None
+        self._lock = Lock()
+        self._open = mib > 0
+
+    def holds(self, source: Storable) -> bool | None:
+        """Whether there is an entry of this photo, whole or not; None where none will be."""
+        origin = source.origin if self._open else None
+        return None if origin is None else self._path(origin).is_file()
+
+    def decoded(self, source: Storable) -> Decoded:
+        """The photo, from its entry where there is a good one; else decoded and kept.
+
+        Raises:
+            UserError: The photo is damaged.
+        """
+        origin = source.origin if self._limit else None
+        if origin is None:
+            return source.decode()
+        path = self._path(origin)
+        found = _read(path, *source.target)
+        if found is not None:
+            with suppress(OSError):
+                os.utime(path)
+            return found
+        decoded = source.decode()
+        if self._open:
+            self._keep(path, _packed(decoded))
+        return decoded
+
+    def _path(self, origin: str) -> Path:
+        return self._folder / f"{sha256(origin.encode()).hexdigest()[:40]}{_KEPT}"
+
+    def _keep(self, path: Path, content: list[bytes | memoryview]) -> None:
+        temporary = path.with_name(f"{path.stem}.{os.getpid()}.{next(_NUMBER)}{_TEMPORARY}")
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            size = sum(len(part) for part in content)
+            if not self._has_room(size):
+                self._close("its limit is reached or the disk is full")
+                return
+            with temporary.open("wb") as file:
+                file.writelines(content)
+            temporary.replace(path)
+        except OSError as error:
+            self._close(error.strerror or str(error))
+        finally:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+    def _close(self, why: str) -> None:
+        """Keeps nothing more in this run: photos are decoded again instead."""
+        self._open = False
+        _LOG.info("no more photos are kept in %s: %s", self._folder, why)
+
+    def _has_room(self, size: int) -> bool:
+        with self._lock:
+            if self._used is None or self._used + size > self._limit:
+                self._used = self._made_room(size)
+            fits = self._used + size <= self._limit
+            self._used += size if fits else 0
+        return fits and shutil.disk_usage(self._folder).free >= size + RESERVE
+
+    def _made_room(self, size: int) -> int:
+        """Deletes what nobody uses as far as needed; the bytes of what is left."""
+        entries = sorted(_entries(self._folder))
+        used = sum(length for _, length, _ in entries)
+        for last_used, length, path in entries:
+            if used + size <= self._limit or last_used >= self._begun:
+                break
+            with suppress(OSError):  # Another process may be faster, or hold it open.
+                path.unlink()
+                used -= length
+        return used
+
+
+def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
+    """When each was last used, its bytes and its path; deletes what killed processes left."""
+    with os.scandir(folder) as found:
+        for each in found:
+            with suppress(OSError):
+                facts, path = each.stat(), Path(each.path)
+                if path.suffix == _KEPT:
+                    yield facts.st_mtime, facts.st_size, path
+                elif path.suffix == _TEMPORARY and facts.st_mtime < time() - _STALE:
+                    path.unlink()
+
+
+def _packed(decoded: Decoded) -> list[bytes | memoryview]:
+    """An entry: magic, CRC-32 of the rest, pixels, and one bit for each pixel of a mask."""
+    image, mask = decoded
+    pixels = image.contiguous().numpy().reshape(-1).data
+    bits = b"" if mask is None else np.packbits(mask.numpy()).tobytes()
+    check = crc32(bits, crc32(pixels))
+    return [_MAGIC, check.to_bytes(_SUM, "little"), pixels, bits]
+
+
+def _read(path: Path, width: int, height: int) -> Decoded | None:
+    """The photo and mask of an entry; None where it is missing or not what it should be."""
+    head, pixels, bits = len(_MAGIC) + _SUM, 3 * width * height, -(-width * height // 8)
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size - head
+            if size not in {pixels, pixels + bits}:
+                return None
+            start, content = file.read(head), np.empty(size, np.uint8)
+            if file.readinto(content.data) != size:
+                return None
+    except OSError:
+        return None
+    if start != _MAGIC + crc32(content.data).to_bytes(_SUM, "little"):
+        return None
+    image = torch.from_numpy(content[:pixels].reshape(height, width, 3))
+    if size == pixels:
+        return image, None
+    mask = np.unpackbits(content[pixels:], count=width * height).astype(np.bool_)
+    return image, torch.from_numpy(mask.reshape(height, width))
+
+
+@cache
+def made_by() -> str:
+    """What decides about the bits of a decoded photo, besides its file."""
+    names = ("pillow", "pycolmap")
+    return f"{PIXELS_VERSION} {' '.join(f'{name} {version(name)}' for name in names)}"

@@ -1,0 +1,103 @@
+"""The views of the next steps are foreseen, and nothing of the run is touched by it."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import WIDTH, sample_scene
+from crossgrad_core.training.foresight import Foresight
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+
+SAMPLERS = ("random", "epoch", "near-far", "fps", "horizon", "random-split", "three-way")
+
+
+class Told:
+    """Stands in for the threads; notes what was expected."""
+
+    useful = True
+
+    def __init__(self):
+        self.names = []
+
+    def expect(self, views):
+        self.names.append([view.name for view in views])
+
+    def taken_cpu(self):
+        return 0.0
+
+
+def setup_of(sampler, **changes):
+    config = RunConfig.model_validate({"steps": 12, "sampler": {"name": sampler}, **changes})
+    return replace(assemble(config, sample_scene(), "none"), photos_ahead=Told())
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
+    setup = setup_of(sampler)
+    state, foresight = first_state(setup), Foresight(setup)
+    for _ in range(12):
+        foresight.look(state)
+        expected = list(setup.photos_ahead.names[-1])
+        assert len(expected) >= min(8, 12 - state.step)
+        drawn = timed_step(setup, state).names
+        assert tuple(expected[: len(drawn)]) == drawn
+    assert len(setup.photos_ahead.names) == 12
+
+
+@pytest.mark.parametrize("sampler", [*SAMPLERS, "active"])
+def test_looking_ahead_touches_nothing(sampler):
+    setup = setup_of(sampler)
+    state, foresight = first_state(setup), Foresight(setup)
+    for _ in range(6):
+        before = deepcopy((state.states.get("sampler"), state.rngs, state.step))
+        foresight.look(state)
+        streams = {name: rng.bit_generator.state for name, rng in state.rngs.items()}
+        assert streams == {name: rng.bit_generator.state for name, rng in before[1].items()}
+        assert (state.states.get("sampler"), state.step) == (before[0], before[2])
+        timed_step(setup, state)
+
+
+def test_a_step_that_drew_something_else_begins_the_guess_anew():
+    setup = setup_of("random")
+    state, foresight = first_state(setup), Foresight(setup)
+    foresight.look(state)
+    timed_step(setup, state)
+    state.last = replace(state.last, views=(-1, -1))
+    state.rngs["sampler"].random(3)
+    foresight.look(state)
+    expected = setup.photos_ahead.names[-1]
+    assert tuple(expected[:2]) == timed_step(setup, state).names
+
+
+def test_nothing_is_foreseen_of_a_sampler_that_fails():
+    setup = setup_of("random")
+    state, foresight = first_state(setup), Foresight(setup)
+
+    def fail(*_):
+        raise ValueError
+
+    object.__setattr__(setup.sampler, "sample", fail)
+    foresight.look(state)
+    foresight.look(state)
+    assert setup.photos_ahead.names == []
+
+
+def test_photos_that_are_kept_in_a_smaller_size_are_not_decoded_for_it():
+    class OddOnesKept:
+        def holds(self, view, camera):
+            asked.append(camera.width)
+            return view.name in odd
+
+    setup = replace(setup_of("epoch"), scaled_photos=OddOnesKept())
+    odd, asked = {view.name for view in setup.train_views[1::2]}, []
+    state = first_state(setup)
+    state.last = StepRecord(0, (0,), ("",), None, (0.1,), 1, {}, 0.0, scales=(0.5,))
+    Foresight(setup).look(state)
+    assert set(asked) == {WIDTH // 2}
+    (expected,) = setup.photos_ahead.names
+    assert expected and not odd & set(expected)
