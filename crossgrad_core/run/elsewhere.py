@@ -57,7 +57,8 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     points = frame.to_local(other.similarity.to_input(other.points))
     moved = [replace(view, camera=_moved(view.camera, other, frame)) for view in other.views]
     _check_place(setup.scene, points, centers_of(moved), path)
-    views = tuple(view for view in moved if not _is_trained(view, setup.train_views))
+    trained = _are_trained(moved, setup.train_views)
+    views = tuple(view for view, known in zip(moved, trained, strict=True) if not known)
     if not views:
         raise UserError(
             "the run was trained on all views of this scene",
@@ -77,15 +78,23 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
     return replace(camera, world_to_camera=pose)
 
 
-def _is_trained(view: View, trained: Sequence[View]) -> bool:
-    return any(_same_pose(view.camera, each.camera) for each in trained)
+def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
+    """Whether the pose of each view is that of a training view."""
+    centers, rotations = centers_of(trained), _rotations_of(trained)
+    # The trace of the rotation from one camera to the other falls with its angle.
+    least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
+
+    def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:
+        near = np.linalg.norm(centers - center, axis=1) <= SAME_PLACE
+        alike = np.einsum("nij,ij->n", rotations, rotation) >= least
+        return bool((near & alike).any())
+
+    return list(map(is_trained, centers_of(views), _rotations_of(views)))
 
 
-def _same_pose(one: Camera, other: Camera) -> bool:
-    if float(torch.linalg.vector_norm(one.center - other.center)) > SAME_PLACE:
-        return False
-    turned = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
-    return math.acos(min(1.0, (float(turned.trace()) - 1.0) / 2.0)) <= SAME_DIRECTION
+def _rotations_of(views: Sequence[View]) -> NDArray[np.float64]:
+    """[V, 3, 3] world to camera."""
+    return np.stack([view.camera.world_to_camera[:3, :3].numpy() for view in views])
 
 
 def _check_place(

@@ -1,0 +1,43 @@
+"""Which views of another capture the run was trained on."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from crossgrad_core.run.elsewhere import SAME_DIRECTION, SAME_PLACE, _are_trained
+from crossgrad_core.testing.posed import posed_view
+
+
+def moved(view, shift, angle, rng):
+    """The view somewhere in `shift` from its place, turned by an angle about any axis."""
+    away, axis = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+    x, y, z = angle * axis
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    pose = view.camera.world_to_camera.clone()
+    pose[:3, :3] = turn @ pose[:3, :3]
+    pose[:3, 3] = -pose[:3, :3] @ (view.camera.center + torch.from_numpy(shift * away))
+    return replace(view, camera=replace(view.camera, world_to_camera=pose))
+
+
+def test_a_view_is_that_of_training_where_place_and_direction_are():
+    rng = np.random.default_rng(0)
+    trained = [posed_view(rng.normal(size=3), forward=rng.normal(size=3)) for _ in range(20)]
+    shares = [(s, a) for s in (0.0, 0.5, 0.999, 1.001, 2.0) for a in (0.0, 0.5, 0.999, 1.001, 9.0)]
+    views = [
+        moved(view, s * SAME_PLACE, a * SAME_DIRECTION, rng) for view in trained for s, a in shares
+    ]
+    expected = [s < 1 and a < 1 for _ in trained for s, a in shares]
+    assert _are_trained(views, trained) == expected
+
+
+def test_a_view_that_looks_back_from_the_same_place_is_another():
+    rng = np.random.default_rng(1)
+    trained = [posed_view(rng.normal(size=3), forward=rng.normal(size=3)) for _ in range(100)]
+    assert not any(_are_trained([moved(each, 0.0, np.pi, rng) for each in trained], trained))
+
+
+def test_place_and_direction_are_those_of_one_view():
+    here, there = posed_view((0, 0, 0)), posed_view((1, 0, 0), forward=(1, 0, 0))
+    mixed = posed_view((1, 0, 0))
+    assert _are_trained([here, mixed, there], [here, there]) == [True, False, True]
