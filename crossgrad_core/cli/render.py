@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
+from crossgrad_core.errors import UserError
 from crossgrad_core.system.startup import announce
 
 
@@ -20,7 +21,9 @@ class Split(StrEnum):
 
 def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: RunFolder,
-    split: Annotated[Split, typer.Option(help="Which views are drawn.")] = Split.TEST,
+    split: Annotated[
+        Split | None, typer.Option(help="Which views are drawn. Default: test.")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
@@ -40,13 +43,23 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         ),
     ] = None,
     frames: Annotated[
-        int, typer.Option(metavar="N", min=2, help="Frames of a ladder. Default: 120.")
-    ] = 120,
+        int | None, typer.Option(metavar="N", min=2, help="Frames of a ladder. Default: 120.")
+    ] = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
     """Draw the views of a run as PNG files."""
+    alone = "a film shows what the cameras of its path see"
+    _check_together(("--on", on), ("--path", path), alone)
+    _check_together(("--split", split), ("--path", path), alone)
+    _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")
+    if frames is not None and path is None:
+        raise UserError(
+            "--frames does nothing without --path ladder",
+            where="--frames",
+            todo="leave out --frames, or draw a ladder",
+        )
     announce()
     from crossgrad_core.run import afterwards
 
@@ -54,4 +67,14 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     if path is not None:
         afterwards.fly(run, path, frames=frames, out=out, how=how)
         return
-    afterwards.render(run, split=split.value, out=out, how=how, on=on)
+    afterwards.render(run, split=split or "test", out=out, how=how, on=on)
+
+
+def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:
+    """Refuses an option that would do nothing beside another."""
+    if option[1] is not None and other[1] is not None:
+        raise UserError(
+            f"{option[0]} does nothing beside {other[0]}: {why}",
+            where=option[0],
+            todo=f"leave out {option[0]}, or {other[0]}",
+        )

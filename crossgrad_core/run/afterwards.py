@@ -25,9 +25,9 @@ from crossgrad_core.run.export import (
     plain_renderer,
     renderer,
 )
-from crossgrad_core.run.flight import flight
+from crossgrad_core.run.flight import FRAMES, LADDER, flight
 from crossgrad_core.run.opening import opened, require_checkpoint
-from crossgrad_core.run.results.film import write_film, write_frames
+from crossgrad_core.run.results.film import film_files, write_film, write_frames
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import flat_names
@@ -225,29 +225,45 @@ def render(
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
 
-def fly(folder: Path, path: str, *, frames: int, out: Path | None, how: Opens = AS_IT_IS) -> None:
-    """Draws what cameras along a path see, as pictures and as a film.
+def fly(
+    folder: Path,
+    path: str,
+    *,
+    frames: int | None = None,
+    out: Path | None,
+    how: Opens = AS_IT_IS,
+) -> None:
+    """Draws what cameras along a path see, as pictures and, beside them, as a film.
 
     Args:
         folder: The run's folder.
         path: See `flight`.
-        frames: See `flight`.
+        frames: How many a ladder has, `FRAMES` by default.
         out: Where the pictures go; by default into the run's folder.
         how: How the run is opened.
 
     Raises:
-        UserError: See `flight`; or it is no run, it has no checkpoint, or it is training and no
-            other folder is named.
+        UserError: See `flight`; or it is no run, it has no checkpoint, it is training and no other
+            folder is named, the named one holds a film, or there are frames for a path from a file.
     """
+    if frames is not None and path != LADDER:
+        raise UserError(
+            "--frames is the number of frames of a ladder; a camera path has its own",
+            where=f"--path {path}",
+            todo=f"leave out --frames, or draw --path {LADDER}",
+        )
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
+        for film in () if out is None else film_files(out):
+            _check_new(film)
         setup, state = how.open(folder)
-        along, draw = flight(setup.scene, path, frames), camera_renderer(setup, state)
+        along = flight(setup.scene, path, frames or FRAMES)
+        draw = camera_renderer(setup, state)
         out = out or folder_of(folder, state.step) / f"path_{along.name}"
         with torch.no_grad():
             files = write_frames(map(draw, along.cameras), out)
-        film = write_film(files, out.with_name(f"{out.name}_film"), along.fps)
-        print(f"{len(files)} frames in {out}" + (f", film {film}" if film else ""))  # noqa: T201
+        made = write_film(files, along.fps)
+        print(f"{len(files)} frames in {out}" + (f", film {made}" if made else ""))  # noqa: T201
 
 
 def export(

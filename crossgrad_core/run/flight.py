@@ -19,6 +19,8 @@ from crossgrad_core.system.text_files import read_json
 #: Instead of a file: from the farthest photos down to the nearest.
 LADDER: Final = "ladder"
 FRAMES_PER_SECOND: Final = 24.0
+#: Of a ladder.
+FRAMES: Final = 120
 #: Views that observe fewer SfM points say too little about what they look at.
 FEWEST_SEEN: Final = 8
 #: Of more views the ends of a ladder are sought among so many, spread over all.
@@ -86,7 +88,7 @@ def ladder(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera,
             todo="give a file of cameras: --path FILE.json",
         )
     distances = np.array([_distance(view.camera, points[view.seen]) for view in known])
-    first, last = _ends(known, distances)
+    first, last = _ends(known, distances, len(points))
     nearer = distances[last] / distances[first]
     ends = known[first].camera, known[last].camera
     return tuple(_between(*ends, share, nearer) for share in np.linspace(0.0, 1.0, frames))
@@ -98,13 +100,20 @@ def _distance(camera: Camera, seen: _Floats) -> float:
     return float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
 
 
-def _ends(views: Sequence[View], distances: _Floats) -> tuple[int, int]:
+def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, int]:
     order, few = np.argsort(distances, kind="stable"), max(1, len(views) // 5)
-    pairs = [(int(far), int(near)) for far in order[-few:] for near in order[:few] if far != near]
-    shared = [len(np.intersect1d(views[i].seen, views[j].seen)) for i, j in pairs]
     forward = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
-    alike = [float(forward[i] @ forward[j]) for i, j in pairs]
-    return max(zip(shared, alike, pairs, strict=True))[2]
+    seen = {int(near): np.unique(views[near].seen) for near in order[:few]}
+    found = []
+    for far in map(int, order[-few:]):
+        mark = np.zeros(points, dtype=np.bool_)
+        mark[views[far].seen] = True
+        found += [
+            (int(mark[rows].sum()), float(forward[far] @ forward[near]), (far, near))
+            for near, rows in seen.items()
+            if near != far
+        ]
+    return max(found)[2]
 
 
 def _way(share: float, nearer: float) -> float:

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
@@ -75,10 +76,40 @@ def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
 
 
 def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
-    afterwards.fly(trained, "ladder", frames=3, out=tmp_path / "ladder")
-    assert len(list((tmp_path / "ladder").glob("*.png"))) == 3
-    assert len(list(tmp_path.glob("ladder_film.*"))) == 1
-    assert "3 frames" in capsys.readouterr().out
+    folder = tmp_path / "ladder"
+    afterwards.fly(trained, "ladder", frames=3, out=folder)
+    assert len(list(folder.glob("*.png"))) == 3
+    (film,) = folder.glob("film.*")
+    assert f"3 frames in {folder}, film {film}" in capsys.readouterr().out
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(UserError, match="the file exists"):
+        afterwards.fly(trained, "ladder", frames=2, out=folder)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    # In the run's own folder a film takes the place of the one before.
+    for frames in (3, 2):
+        afterwards.fly(trained, "ladder", frames=frames, out=None)
+    assert len(list((trained / "renders").glob("*/path_ladder/film.*"))) == 1
+    with pytest.raises(UserError, match="frames of a ladder"):
+        afterwards.fly(trained, "path.json", frames=2, out=None)
+
+
+@pytest.mark.parametrize(
+    ("options", "idle", "other"),
+    [
+        (("--on", "scene", "--path", "ladder"), "--on", "--path"),
+        (("--split", "train", "--path", "ladder"), "--split", "--path"),
+        (("--split", "test", "--on", "scene"), "--split", "--on"),
+        (("--frames", "9"), "--frames", "--path ladder"),
+        (("--frames", "9", "--on", "scene"), "--frames", "--path ladder"),
+        (("--frames", "9", "--path", "tour.json"), "--frames", "ladder"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(trained, options, idle, other, capsys):
+    before = sorted(trained.rglob("*"))
+    assert ended("render", trained, *options) == 2
+    said = capsys.readouterr().err
+    assert idle in said and other in said and "Traceback" not in said
+    assert sorted(trained.rglob("*")) == before
 
 
 def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.images import eight_bit
 from crossgrad_core.errors import UserError
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import atomic_file, write_atomically
 
 #: A program that writes films; where there is none, Pillow writes an animated picture.
 ENCODER: Final = "ffmpeg"
@@ -42,36 +42,46 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
     return files
 
 
-def write_film(frames: list[Path], path: Path, fps: float) -> Path | None:
-    """Writes the frames as `path`.mp4 where ffmpeg is installed, else as `path`.webp.
+def film_files(folder: Path) -> tuple[Path, Path]:
+    """The film in a folder of frames: as an encoder writes it, and as Pillow does."""
+    return folder / "film.mp4", folder / "film.webp"
+
+
+def write_film(frames: list[Path], fps: float) -> Path | None:
+    """Writes the frames as film.mp4 beside them where ffmpeg is installed, else as film.webp.
 
     Frames that are too many for an animated picture remain frames.
 
     Args:
-        frames: PNG files named by their numbers, in one folder.
-        path: Without a suffix.
+        frames: PNG files named by their numbers from 0 on, in one folder.
         fps: Frames per second.
 
     Raises:
         UserError: ffmpeg failed, or the disk is full.
     """
-    encoder = shutil.which(ENCODER)
+    encoder, (encoded, animated) = shutil.which(ENCODER), film_files(frames[0].parent)
     if encoder is None:
-        return _animated(frames, path.with_suffix(".webp"), fps)
-    target = path.with_suffix(".mp4")
+        return _animated(frames, animated, fps)
+    with atomic_file(encoded) as file:
+        _encode(encoder, frames, Path(file.name), fps)
+    return encoded
+
+
+def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
+    # The folder may hold more frames, of a longer film.
+    source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
+    count = ["-frames:v", str(len(frames))]
     # Players want even sides and this pixel format.
     shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
-    source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
-    command = [encoder, "-y", "-loglevel", "error", *source, *shape, str(target)]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [encoder, "-y", "-loglevel", "error", *source, *count, *shape, "-f", "mp4"]
+    ended = subprocess.run([*command, str(target)], capture_output=True, text=True, check=False)
     if ended.returncode != 0:
         raise UserError(
             "the film could not be written",
-            where=target,
+            where=frames[0].parent,
             found=ended.stderr.strip()[-300:],
-            todo=f"the frames are in {frames[0].parent}",
+            todo="the frames are there",
         )
-    return target
 
 
 def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
@@ -85,8 +95,9 @@ def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
     for frame in frames:  # Pillow wants them all at once.
         with Image.open(frame) as image:
             images.append(image.copy())
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0,
-        quality=_QUALITY,
-    )  # fmt: skip
+    with atomic_file(path) as file:
+        images[0].save(
+            file, format="webp", save_all=True, append_images=images[1:],
+            duration=round(1000 / fps), loop=0, quality=_QUALITY,
+        )  # fmt: skip
     return path

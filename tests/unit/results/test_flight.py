@@ -48,6 +48,29 @@ def test_a_ladder_begins_and_ends_with_photos_that_show_the_same():
     torch.testing.assert_close(ends[0].world_to_camera, views[1].camera.world_to_camera)
 
 
+def test_the_ends_of_a_ladder_against_all_pairs():
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        views, points = views_above(rng.choice(np.arange(1.0, 90.0), 12, replace=False))
+        points = np.concatenate([points] * 6)
+        views = [replace(v, seen=rng.integers(0, 60, rng.integers(8, 50))) for v in views]
+        views.sort(key=lambda view: float(view.camera.center[2]))
+        pairs = [
+            (len(set(far.seen.tolist()) & set(near.seen.tolist())), far, near)
+            for far in views[-2:]
+            for near in views[:2]
+        ]
+        most = max(shared for shared, _, _ in pairs)
+        best = {
+            (float(far.camera.center[2]), float(near.camera.center[2]))
+            for shared, far, near in pairs
+            if shared == most
+        }
+        ends = ladder(views, points, 2)
+        found = tuple(float(camera.center[2]) for camera in ends)
+        assert any(found == pytest.approx(pair) for pair in best)
+
+
 def test_views_at_one_distance_give_a_ladder_too():
     views, points = views_above([3.0, 3.0])
     assert {round(float(camera.center[2]), 9) for camera in ladder(views, points, 5)} == {3.0}
@@ -119,11 +142,12 @@ def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypa
     frames = film.write_frames(images, tmp_path / "frames")
     assert [frame.name for frame in frames] == ["00000.png", "00001.png", "00002.png"]
     assert [Image.open(frame).getpixel((0, 0))[0] for frame in frames] == [0, 128, 255]
-    path = film.write_film(frames, tmp_path / "film", 10.0)
+    path = film.write_film(frames, 10.0)
+    assert path == tmp_path / "frames" / "film.webp"
     with Image.open(path) as found:
-        assert (path.suffix, found.n_frames, found.size) == (".webp", 3, (8, 6))
+        assert (found.n_frames, found.size) == (3, (8, 6))
     monkeypatch.setattr(film, "_LARGEST", 100)
-    assert film.write_film(frames, tmp_path / "large", 10.0) is None
+    assert film.write_film(frames, 10.0) is None
 
 
 def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monkeypatch):
@@ -132,8 +156,14 @@ def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monke
     encoder.chmod(0o755)
     monkeypatch.setattr(film.shutil, "which", lambda _: str(encoder))
     frames = film.write_frames([torch.zeros(6, 8, 3)], tmp_path / "frames")
-    path = film.write_film(frames, tmp_path / "film", 10.0)
-    assert path.name == "film.mp4" and "-framerate 10 -i" in path.read_text()
-    encoder.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
-    with pytest.raises(UserError, match="no such codec"):
-        film.write_film(frames, tmp_path / "film", 10.0)
+    (tmp_path / "frames" / "00001.png").write_bytes(b"of a longer film")
+    path = film.write_film(frames, 10.0)
+    assert path == tmp_path / "frames" / "film.mp4"
+    told = path.read_text()
+    assert "-framerate 10 -i" in told and "-frames:v 1 " in told
+    encoder.write_text("#!/bin/sh\nfor last; do :; done\necho half > $last\necho bad >&2\nexit 1\n")
+    with pytest.raises(UserError, match="bad"):
+        film.write_film(frames, 10.0)
+    # Nothing of the film that failed is left, and the one before is.
+    assert sorted(each.name for each in path.parent.iterdir())[2:] == ["film.mp4"]
+    assert path.read_text() == told
