@@ -6,23 +6,8 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import (
-    GradientProbe,
-    Grouping,
-    Quantity,
-    Rule,
-    Scene,
-    View,
-    radial_distances,
-)
-from crossgrad_plugins.groupings.split import (
-    FAR,
-    NEAR,
-    halves,
-    log_distances,
-    require_groups,
-    require_training_views,
-)
+from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
+from crossgrad_plugins.groupings.split import log_distances, rule_of_distances
 
 
 class Percentile(Grouping):
@@ -40,13 +25,9 @@ class Percentile(Grouping):
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
     ) -> Rule:
-        require_training_views(scene, "percentile")
-        train = radial_distances(scene, scene.train_views)
-        threshold = float(np.percentile(train, self.q))
-        quantity = "distance from their mean"
-        require_groups("percentile", halves(train, threshold), (NEAR, FAR), quantity)
-        note = f"grouping percentile: near up to {threshold:.4g} local units from the mean camera"
-        return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
+        return rule_of_distances(
+            scene, "percentile", lambda distances: np.percentile(distances, self.q)
+        )
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

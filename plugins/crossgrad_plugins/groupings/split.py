@@ -1,11 +1,11 @@
 """Labels from a threshold, and the check that every group has training views."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Quantity, Scene, UserError, View, radial_distances
+from crossgrad_core.plugin import Quantity, Rule, Scene, UserError, View, radial_distances
 
 #: Distances below this share of the median one are rounding.
 _NOWHERE = 1e-9
@@ -16,6 +16,27 @@ NEAR, MIDDLE, FAR = "near", "middle", "far"
 def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
     """`near` where a value [V] is at most the threshold, else `far`."""
     return tuple(NEAR if value <= threshold else FAR for value in values)
+
+
+def rule_of_distances(
+    scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], np.floating]
+) -> Rule:
+    """Labels `near` where the distance from the mean training camera is at most a threshold.
+
+    Args:
+        scene: The scene.
+        grouping: Name of the grouping.
+        threshold_of: The threshold, from the distances [V] of the training views.
+
+    Raises:
+        UserError: There are no training views, or all are on one side.
+    """
+    require_training_views(scene, grouping)
+    train = radial_distances(scene, scene.train_views)
+    threshold = float(threshold_of(train))
+    require_groups(grouping, halves(train, threshold), (NEAR, FAR), "distance from their mean")
+    note = f"grouping {grouping}: near up to {threshold:.4g} local units from the mean camera"
+    return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
 
 
 def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
