@@ -59,7 +59,15 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Camera, Photo, Scene, Similarity, View, centers_of
+from crossgrad_core.contract.scene import (
+    Camera,
+    Photo,
+    Pinhole,
+    Scene,
+    Similarity,
+    View,
+    centers_of,
+)
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
@@ -131,6 +139,7 @@ __all__ = [
     "PerPhoto",
     "Phase",
     "Photo",
+    "Pinhole",
     "PixelContext",
     "PluginState",
     "Quantity",

@@ -3,31 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from crossgrad_core.plugin import UserError
+from crossgrad_core.plugin import Pinhole, UserError
 from crossgrad_core.scene.calibration import Calibration
 
 _UNDISTORT = "undistort the photos with the program that posed them and export them as pinhole ones"
 
 
-@dataclass(frozen=True)
-class Frame:
-    """Size, focal lengths and principal point, in pixels; pixel centres at +0.5.
-
-    Attributes:
-        width: Of the photos.
-        height: Likewise.
-        fx: Focal length.
-        fy: Likewise.
-        cx: Principal point from the left border.
-        cy: From the top border.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+@dataclass(frozen=True, eq=False)
+class Frame(Pinhole):
+    """Size, focal lengths and principal point of a lens, to which its distortion is added."""
 
     @property
     def params(self) -> tuple[float, float, float, float]:

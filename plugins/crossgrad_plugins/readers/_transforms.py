@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.raw import RawView
-from crossgrad_plugins.readers._inside import Inside, place_of, shared_folder
+from crossgrad_plugins.readers._inside import Inside, shared_folder
 from crossgrad_plugins.readers._json import Fields
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
 from crossgrad_plugins.readers._poses import SAME, Frame3D, from_opengl, rotation_of
+from crossgrad_plugins.readers._raw import raw_view
 
 _RADIAL: Final = ("k1", "k2", "k3", "k4")
 _TANGENTIAL: Final = ("p1", "p2")
@@ -176,15 +177,7 @@ def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
     images = shared_folder(frame.photo for frame in frames)
     start = 0 if images == "." else len(images) + 1
     return images, tuple(
-        RawView(
-            name=frame.photo[start:],
-            calibration=frame.calibration,
-            world_to_camera=frame.pose,
-            seen=np.zeros(0, dtype=np.int64),
-            mask=frame.mask,
-            place=place_of(frame.photo[start:]),
-        )
-        for frame in frames
+        raw_view(frame.photo[start:], frame.calibration, frame.pose, frame.mask) for frame in frames
     )
 
 

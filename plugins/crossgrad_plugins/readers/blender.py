@@ -1,5 +1,6 @@
 """Reads scenes of NeRF synthetic, rendered by Blender: `transforms_train.json` and its siblings."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -8,12 +9,12 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
-from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import read_object
 from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
 
@@ -64,19 +65,13 @@ class BlenderReader(Reader):
         points = find_points(inside, asked, "reader.points", base="" if asked else base)
         check_seen(points, views, path / file)
         behind = f", photos with transparency over {self.background} (see --background)"
-        raw = RawScene(
-            root=path,
-            images=path if images == "." else path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=(f"blender: {count(len(views), 'posed image')}, {points.note}{behind}",),
-            split=(frozenset(names[: len(train)]), frozenset(names[len(train) :]))
-            if held_out
-            else None,
-            background=_BEHIND[self.background],
+        note = f"blender: {count(len(views), 'posed image')}, {points.note}{behind}"
+        raw = raw_scene(inside, images, views, points, note)
+        split = frozenset(names[: len(train)]), frozenset(names[len(train) :])
+        background = _BEHIND[self.background]
+        return build_scene(
+            replace(raw, split=split if held_out else None, background=background), options
         )
-        return build_scene(raw, options)
 
 
 def _read(inside: Inside, name: str, base: str) -> list[Posed]:

@@ -6,6 +6,7 @@ metres; the rotation in `rot_mat` is to be multiplied by 100).
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -14,13 +15,13 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
-from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import from_opengl, rotation_of
+from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import holds
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_lens, transform_of
 
@@ -67,19 +68,10 @@ class MatrixCityReader(Reader):
         names = [view.name for view in views]
         held_out = [_is_test(name) for name in files for _ in frames[name]]
         test = frozenset(name for name, out in zip(names, held_out, strict=True) if out)
-        raw = RawScene(
-            root=path,
-            images=path if images == "." else path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=(
-                f"MatrixCity: {count(len(views), 'posed image')} in {count(len(files), 'block')}, "
-                f"{points.note}",
-            ),
-            split=(frozenset(names) - test, test) if test else None,
-        )
-        return build_scene(raw, options)
+        blocks = f"{count(len(views), 'posed image')} in {count(len(files), 'block')}"
+        raw = raw_scene(inside, images, views, points, f"MatrixCity: {blocks}, {points.note}")
+        split = (frozenset(names) - test, test) if test else None
+        return build_scene(replace(raw, split=split), options)
 
 
 def _files(inside: Inside) -> Sequence[str]:

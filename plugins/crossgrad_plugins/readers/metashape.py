@@ -20,22 +20,35 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._earth import local_frame
-from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import SAME, Frame3D, from_opencv, rotation_of
+from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import head_of
 from crossgrad_plugins.readers._xml import read_xml
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
 #: Coordinate systems whose chunk transform leads to geocentric coordinates.
 _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
+
+
+def _is_metashape(path: Path) -> bool:
+    head = head_of(path)
+    return b"<document" in head and b"<chunk" in head
+
+
+_XML: Final = Kind(
+    *("XML", "Metashape", ".xml", _is_metashape),
+    "one file of File > Export > Export Cameras, with a chunk in a document",
+)
 
 
 class MetashapeReader(Reader):
@@ -60,13 +73,13 @@ class MetashapeReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return bool(self._found(Inside(path)))
+        return bool(_XML.find(Inside(path), self.file))
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        file = self._file(inside)
+        file = _XML.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
         inside.check_photos(images)
         chunk = _chunk(file)
@@ -79,37 +92,8 @@ class MetashapeReader(Reader):
         other = "chunk" if self.frame == "local" else "local"
         check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
         head = f"Metashape: {count(len(views), 'posed image')} from {file.name}, {points.note}"
-        raw = RawScene(
-            root=path,
-            images=path if images == "." else path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=(head, *notes, *where),
-        )
+        raw = raw_scene(inside, images, views, points, head, *notes, *where)
         return build_scene(raw, options)
-
-    def _found(self, inside: Inside) -> list[Path]:
-        return [path for path in inside.files(self.file or "*.xml") if _is_metashape(path)]
-
-    def _file(self, inside: Inside) -> Path:
-        if self.file is not None:
-            return inside.file(inside.name(self.file, "reader.file"), "reader.file")
-        found = self._found(inside)
-        if len(found) == 1:
-            return inside.file(found[0].name, found[0])
-        raise UserError(
-            "the scene has no XML of Metashape" if not found else "the scene has several XMLs",
-            where=inside.scene,
-            expected="one file of File > Export > Export Cameras, with a chunk in a document",
-            found=", ".join(path.name for path in found) or "none",
-            todo="name it, with --set reader.file=NAME, or export it",
-        )
-
-
-def _is_metashape(path: Path) -> bool:
-    head = head_of(path)
-    return b"<document" in head and b"<chunk" in head
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,6 +288,6 @@ def _view(
         fields.wrong("sensor_id", "a sensor of the file")
     name = photos.full(inside.photo(images, camera.label, fields.where("label")))
     inside.file(f"{images}/{name}", fields.where("label"))
-    pose = from_opencv(camera.rotation, camera.center, world)
-    seen = np.zeros(0, dtype=np.int64)
-    return RawView(name, sensors[camera.sensor], pose, seen, place=place_of(name))
+    return raw_view(
+        name, sensors[camera.sensor], from_opencv(camera.rotation, camera.center, world)
+    )

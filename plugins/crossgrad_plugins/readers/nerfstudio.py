@@ -1,6 +1,7 @@
 """Reads scenes of nerfstudio: `transforms.json` with photos, lenses, masks and points."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -9,13 +10,13 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
-from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import Frame3D, rotation_of
+from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with, holds
 from crossgrad_plugins.readers._transforms import raw_views, read_frame, transform_of
 
@@ -59,16 +60,8 @@ class NerfstudioReader(Reader):
         notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]
         if "fisheye_crop_radius" in whole:
             notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
-        raw = RawScene(
-            root=path,
-            images=path if images == "." else path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=tuple(notes),
-            split=_split(inside, whole, base, images),
-        )
-        return build_scene(raw, options)
+        raw = raw_scene(inside, images, views, points, *notes)
+        return build_scene(replace(raw, split=_split(inside, whole, base, images)), options)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
         """The file of points that was asked for, and where."""

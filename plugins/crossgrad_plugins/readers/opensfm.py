@@ -19,14 +19,15 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.raw_checks import FARTHEST
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
-from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_json
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens
 from crossgrad_plugins.readers._points import Points
+from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import begins_with
 
 #: OpenSfM's place, and that of a project of OpenDroneMap.
@@ -66,19 +67,11 @@ class OpenSfmReader(Reader):
         shots = chosen.members("shots")
         views = tuple(_view(inside, images, name, shot, cameras) for name, shot in shots.items())
         points = _points(chosen)
-        notes = [
+        head = (
             f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
             f"{count(len(points.positions), 'SfM point')} from {points.source}"
-        ]
-        raw = RawScene(
-            root=path,
-            images=path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=(*notes, *note),
         )
-        return build_scene(raw, options)
+        return build_scene(raw_scene(inside, images, views, points, head, *note), options)
 
     @property
     def _names(self) -> tuple[str, ...]:
@@ -150,7 +143,7 @@ def _view(
     pose = np.eye(4)
     pose[:3, :3] = rotation_by(shot.numbers("rotation", 3))
     pose[:3, 3] = shot.numbers("translation", 3)
-    return RawView(plain, cameras[camera], pose, np.zeros(0, dtype=np.int64), place=place_of(plain))
+    return raw_view(plain, cameras[camera], pose)
 
 
 def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,15 +20,17 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, read_r
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import read_header
-from crossgrad_core.scene.raw import RawScene, RawView
+from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
-from crossgrad_plugins.readers._inside import Inside, place_of
+from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import from_opengl
+from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import head_of
 
 _NAME: Final = "#name"
@@ -38,6 +40,17 @@ _SENSOR: Final = 36.0  # mm
 _LARGEST: Final = 256 << 20
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
+)
+
+
+def _has_columns(path: Path) -> bool:
+    line = head_of(path).decode("utf-8-sig", errors="replace").partition("\n")[0]
+    return {_NAME, *_POSE, "f"} <= {cell.strip(' "\r') for cell in line.split(",")}
+
+
+_CSV: Final = Kind(
+    *("CSV", "RealityCapture", ".csv", _has_columns),
+    f"one file with the columns {_NAME}, {', '.join((*_POSE, 'f'))} ...",
 )
 
 
@@ -57,48 +70,22 @@ class RealityCaptureReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return bool(self._found(Inside(path)))
+        return bool(_CSV.find(Inside(path), self.file))
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        file = self._file(inside)
+        file = _CSV.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
         inside.check_photos(images)
         photos = PhotoNames.of(path / images)
         views = tuple(_view(inside, images, row, photos) for row in _rows(file))
         points = find_points(inside, self.points, "reader.points")
         check_seen(points, views, file)
-        raw = RawScene(
-            root=path,
-            images=path if images == "." else path / images,
-            views=views,
-            points=points.positions,
-            point_colors=points.colors,
-            notes=(
-                f"RealityCapture: {count(len(views), 'posed image')} from {file.name}, "
-                f"{points.note}",
-            ),
-        )
-        return build_scene(raw, options)
-
-    def _found(self, inside: Inside) -> list[Path]:
-        return [path for path in inside.files(self.file or "*.csv") if _has_columns(path)]
-
-    def _file(self, inside: Inside) -> Path:
-        if self.file is not None:
-            return inside.file(inside.name(self.file, "reader.file"), "reader.file")
-        found = self._found(inside)
-        if len(found) == 1:
-            return inside.file(found[0].name, found[0])
-        raise UserError(
-            "the scene has no CSV of RealityCapture" if not found else "the scene has several CSVs",
-            where=inside.scene,
-            expected=f"one file with the columns {_NAME}, {', '.join((*_POSE, 'f'))} ...",
-            found=", ".join(path.name for path in found) or "none",
-            todo="name it, with --set reader.file=NAME, or export it",
-        )
+        posed = f"{count(len(views), 'posed image')} from {file.name}"
+        note = f"RealityCapture: {posed}, {points.note}"
+        return build_scene(raw_scene(inside, images, views, points, note), options)
 
 
 @dataclass(frozen=True)
@@ -107,11 +94,6 @@ class _Row:
 
     name: str
     fields: Fields
-
-
-def _has_columns(path: Path) -> bool:
-    line = head_of(path).decode("utf-8-sig", errors="replace").partition("\n")[0]
-    return {_NAME, *_POSE, "f"} <= {cell.strip(' "\r') for cell in line.split(",")}
 
 
 def _rows(file: Path) -> list[_Row]:
@@ -168,8 +150,7 @@ def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView
     x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))
-    lens = _lens(row.fields, file)
-    return RawView(name, lens, pose, np.zeros(0, dtype=np.int64), place=place_of(name))
+    return raw_view(name, _lens(row.fields, file), pose)
 
 
 def _lens(fields: Fields, photo: Path) -> Calibration:

@@ -6,15 +6,14 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_core.plugin import Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import find_models
 from crossgrad_plugins.readers._inside import Inside
-from crossgrad_plugins.readers.colmap import read_raw
+from crossgrad_plugins.readers.colmap import ColmapReader, read_raw
 
 #: Names of photo folders, and what a name of a held-out photo holds.
 _TRAIN, _TEST = "train", "test"
@@ -23,19 +22,13 @@ _EVAL: Final = re.compile(r"(?<![a-z])eval(?![a-z])")
 _MOST: Final = 10_000
 
 
-class UcGsReader(Reader):
+class UcGsReader(ColmapReader):
     """COLMAP scenes whose photo folders begin with `train` and `test`, as those of UC-GS.
 
     Held out are photos below a folder that begins with `test`, and those with the word `eval` in
-    their name;
-    all others are trained on. Regimes are told by further folders (`aerial`, `street`), else by
-    footprint.
+    their name; all others are trained on. Regimes are told by further folders (`aerial`,
+    `street`), else by footprint.
     """
-
-    images: str = Field("images", description="folder of the photos within the scene")
-    model: str | None = Field(
-        None, description="folder of the model within the scene, such as sparse/1"
-    )
 
     @override
     def accepts(self, path: Path) -> bool:

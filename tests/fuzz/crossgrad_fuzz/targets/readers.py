@@ -25,6 +25,7 @@ from crossgrad_fuzz.target import Mutator, Target
 from crossgrad_plugins.readers import (
     _inside,
     _json,
+    _kind,
     _lenses,
     _photos,
     _points,
@@ -188,9 +189,8 @@ def _target(
         _poses: ("Frame3D.after",),
         # Links, which no input holds.
         _inside: ("Inside.files", "Inside.check_photos", "Inside._check"),
-        # Files that options name.
-        metashape: ("MetashapeReader._file",),
-        realitycapture: ("RealityCaptureReader._file",),
+        # Files that options name, or of which there are none or several.
+        _kind: ("Kind.one",),
         matrixcity: ("_walk",),
         # Sizes that no input has, and what other formats have.
         _json: ("read_json", "read_object", "Fields.texts"),
@@ -219,7 +219,7 @@ TARGETS = (
         _forms("matrixcity", *_PLAIN),
     ),
     _target(
-        *("metashape", metashape.MetashapeReader, (metashape, _xml)),
+        *("metashape", metashape.MetashapeReader, (metashape, _kind, _xml)),
         _metashape_seeds,
         mutators=(),
     ),
