@@ -1,9 +1,11 @@
 """The grid file: which settings, on which scenes, with which seeds."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
+from math import prod
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
 
@@ -11,8 +13,11 @@ from crossgrad_core.commands import UserError, did_you_mean, listed, read_settin
 from crossgrad_plugins.sweep.problems import Problem, refuse
 
 Settings: TypeAlias = dict[str, Any]
+T = TypeVar("T")
 
 _TODO = "docs/sweep.md shows the format"
+#: Every run is planned before the first one begins; a few lines of a grid can stand for any number.
+MOST_RUNS = 100_000
 #: Settings that the sweep decides about, and how.
 _RESERVED = {
     "out": "every run has its own folder below --out",
@@ -156,13 +161,18 @@ def choices(grid: Grid) -> list[Choice]:
     """All configurations, arm by arm; the last parameter varies fastest."""
     found = []
     for arm in grid.arms:
-        parameters = {**grid.parameters, **arm.parameters}
-        axes = dict(axis for name, each in parameters.items() for axis in each.axes(name))
+        axes = _axes(grid, arm)
         found += [
             Choice(arm=arm, parameters=dict(zip(axes, values, strict=True)))
             for values in product(*axes.values())
         ]
     return found
+
+
+def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
+    """What varies in an arm: setting -> its values."""
+    parameters = {**grid.parameters, **arm.parameters}
+    return dict(axis for name, each in parameters.items() for axis in each.axes(name))
 
 
 def read_grid(path: Path) -> Grid:
@@ -215,21 +225,32 @@ def _of_the_settings(grid: Grid) -> Iterator[Problem]:
             if name in settings:
                 yield Problem(f"{place}.{name}", f"is not for a grid to set: list it in {axis}")
     yield from _of_the_names(grid)
+    if (runs := _number_of_runs(grid)) > MOST_RUNS:
+        yield Problem("the grid", f"has {runs:.3g} runs, more than {MOST_RUNS:,}")
 
 
 def _of_the_names(grid: Grid) -> Iterator[Problem]:
-    names = [arm.name for arm in grid.arms]
-    for name in sorted({name for name in names if names.count(name) > 1}):
+    for name in _twice(arm.name for arm in grid.arms):
         yield Problem("arms", f"two are named {name!r}")
-    if len(set(grid.seeds)) < len(grid.seeds):
-        yield Problem("seeds", f"one of them stands there twice: {list(grid.seeds)}")
+    for seed in _twice(grid.seeds):
+        yield Problem("seeds", f"{seed} stands there twice")
     scenes = [scene_name(scene) for scene in grid.scenes]
-    for name in sorted({name for name in scenes if scenes.count(name) > 1}):
+    for name in _twice(scenes):
         yield Problem("scenes", f"two are named {name!r}")
     for arm in grid.arms:
         for name in arm.by_scene.keys() - set(scenes):
             hint = did_you_mean(name, scenes)
             yield Problem(f"arms.{arm.name}.by_scene", f"there is no scene named {name!r}", hint)
+
+
+def _twice(values: Iterable[T]) -> list[T]:
+    """What occurs more than once, in its order."""
+    return [value for value, number in Counter(values).items() if number > 1]
+
+
+def _number_of_runs(grid: Grid) -> int:
+    configurations = sum(prod(map(len, _axes(grid, arm).values())) for arm in grid.arms)
+    return len(grid.scenes) * len(grid.seeds) * configurations
 
 
 def scene_name(scene: str | None) -> str:

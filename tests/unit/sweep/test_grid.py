@@ -123,3 +123,15 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path):
 def test_an_empty_grid_is_one_run_of_the_bundled_scene(tmp_path):
     grid = read_grid(written(tmp_path, ""))
     assert (grid.scenes, grid.seeds, labels(grid)) == ((None,), (0,), ["run"])
+
+
+def test_a_few_lines_that_stand_for_too_many_runs_are_refused(tmp_path):
+    ten = "{values: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]}"
+    grid = lambda number: "parameters:\n" + "".join(  # noqa: E731
+        f"  p{i}: {ten}\n" for i in range(number)
+    )  # fmt: skip
+    assert len(choices(read_grid(written(tmp_path, grid(4))))) == 10_000
+    seeds = "seeds: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]\n"
+    for text in (grid(80), seeds + grid(4)):
+        with pytest.raises(UserError, match="more than 100,000"):
+            read_grid(written(tmp_path, text))
