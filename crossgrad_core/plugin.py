@@ -89,8 +89,9 @@ from crossgrad_core.run.results.lines import (
 )
 from crossgrad_core.scene.bimodality import bimodality
 from crossgrad_core.system.files import atomic_file, size_text
+from crossgrad_core.system.input_files import is_file, open_file, read_file
 from crossgrad_core.system.terminal import shows_bar
-from crossgrad_core.system.text_files import read_rows
+from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.wording import listed
 
 __all__ = [
@@ -190,15 +191,19 @@ __all__ = [
     "footprint_of",
     "hookimpl",
     "installed_plugins",
+    "is_file",
     "length_lines",
     "listed",
     "masked",
     "objections_to_views",
     "octave",
+    "open_file",
     "plain_component",
     "progress_line",
     "psnr",
     "radial_distances",
+    "read_file",
+    "read_json",
     "read_rows",
     "screen_statistics",
     "set_for_nothing",

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.heif import SUFFIXES
 from crossgrad_core.scene.wording import name_some
+from crossgrad_core.system.input_files import is_file
 
 _SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
@@ -39,7 +40,7 @@ class PhotoFolder:
             name: What the pose calls the photo.
             posed: All names with a pose: their own photos stand in for no other.
         """
-        if name in self._exact or (self.path / name).is_file():
+        if name in self._exact or is_file(self.path / name):
             return self.path / name
         alike = [other for other in self._loose.get(_fold(name), ()) if other not in posed]
         return self.path / alike[0] if len(alike) == 1 else None
@@ -77,7 +78,7 @@ def find_mask(folder: Path, name: str) -> Path | None:
     """
     stem = str(PurePosixPath(name).with_suffix(""))
     candidates = (folder / f"{name}.png", folder / f"{stem}.png", folder / name)
-    return next((path for path in candidates if path.is_file()), None)
+    return next(filter(is_file, candidates), None)
 
 
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BufferedReader, FileIO
+from io import BufferedReader
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, BinaryIO, Final
@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene import heif
+from crossgrad_core.system.input_files import open_file
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -68,7 +69,7 @@ class _Bounded(BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(FileIO(path))
+        super().__init__(open_file(path).detach())
         self._size = os.fstat(self.fileno()).st_size
 
     @override

@@ -9,12 +9,15 @@ from typing import Final, TypeAlias
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.wording import count, name_some
+from crossgrad_core.system.input_files import read_file
 
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
 #: Names of training views -> regime of every view; where no folder tells, the median is theirs.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
+
+_LINES: Final = {b"\n": 150}  # bytes of a name in memory
 
 #: A mean over fewer held-out views says little about a regime.
 _FEWEST: Final = 2
@@ -184,7 +187,7 @@ def _read_list(path: Path) -> frozenset[str] | None:
     if not path.is_file():
         return None
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_file(path, _LINES).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
             "the list of views cannot be read",

@@ -7,10 +7,14 @@ import re
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.input_files import LARGEST, read_file
 
 # `int` and `float` also take digits of other scripts, digit groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
+# Bytes of a list, a cell, an object with one member, and of a value with its place or key.
+_CSV = {b"\n": 160, b"\r": 160, b",": 60}
+_JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
 
 def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[list[str]]:
@@ -23,10 +27,10 @@ def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[
         whole: Leave out a last line that has no end.
 
     Raises:
-        UserError: The file is missing or is not CSV.
+        UserError: The file is missing or is not CSV, or too large.
     """
     try:
-        content = path.read_bytes()
+        content = read_file(path, _CSV)
         text = (content[: content.rfind(b"\n") + 1] if whole else content).decode("utf-8-sig")
         return list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -35,15 +39,19 @@ def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[
         ) from error
 
 
-def read_json(path: Path) -> object:
-    """The value in a JSON file in UTF-8.
+def read_json(path: Path, most: int = LARGEST) -> object:
+    """The value in a JSON file in UTF-8, with or without a byte order mark.
+
+    Args:
+        path: The file.
+        most: Bytes that it may have.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, or is not JSON.
+        ValueError: It cannot be read, is too large or too deep, or is not JSON.
     """
     try:
-        value: object = json.loads(path.read_bytes().decode("utf-8"))
+        value: object = json.loads(read_file(path, _JSON, most).decode("utf-8-sig"))
     except RecursionError as error:
         raise ValueError("lists or objects within each other without an end") from error
     except FileNotFoundError:

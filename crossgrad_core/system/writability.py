@@ -37,6 +37,24 @@ def check_folder(folder: Path, needed: int = 0) -> None:
         raise disk_full(folder, needed)
 
 
+def check_own(path: Path) -> None:
+    """Refuses what stands in place of a file that is written where it is.
+
+    What a link leads to would be overwritten, and a pipe waited for without an end.
+
+    Raises:
+        UserError: There is a link, a pipe or a device.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        found = f"a link to {path.resolve()}" if path.is_symlink() else "a pipe, device or folder"
+        raise UserError(
+            "this is written to, and is no file of its own",
+            where=path,
+            found=found,
+            todo="remove it",
+        )
+
+
 def check_file(path: Path) -> None:
     """Refuses a file that cannot be written because of its folder or because it is one.
 

@@ -18,6 +18,7 @@ from yaml.error import Mark
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.input_files import open_file
 
 #: Bounds of a text: bytes, values (each alias counts as what it stands for), lists within lists,
 #: digits of a number.
@@ -120,7 +121,8 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
         UserError: The file is missing, not YAML, or holds something else than a mapping.
     """
     try:
-        settings = read_yaml(path.read_bytes()[: MOST_BYTES + 1].decode("utf-8-sig"))
+        with open_file(path) as file:
+            settings = read_yaml(file.read(MOST_BYTES + 1).decode("utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
             f"{what} cannot be read", where=path, found=str(error), todo=todo

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import read_json
 from crossgrad_core.wording import listed
 
 #: The file in a run's folder.
@@ -67,17 +68,10 @@ def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, T
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        content: Any = json.loads(path.read_bytes())
-    except OSError as error:
+        content = read_json(path)
+    except (FileNotFoundError, ValueError) as error:
         raise UserError(
-            "the values of photos cannot be read",
-            where=path,
-            found=error.strerror or str(error),
-            todo=_TODO,
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            "the file of values of photos is not JSON", where=path, found=str(error), todo=_TODO
+            "the values of photos cannot be read", where=path, found=str(error), todo=_TODO
         ) from error
     if not isinstance(content, dict) or not _is_of_photos(content):
         raise UserError(

@@ -34,6 +34,7 @@ from crossgrad_core.run.checkpoint.tensors import (
     write_tensors,
 )
 from crossgrad_core.system.files import disk_errors, is_full, sync_file
+from crossgrad_core.system.input_files import open_file
 
 
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
@@ -178,5 +179,5 @@ def _plain_state(checkpoint: Checkpoint, tensors: list[str]) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return file_digest(file, "sha256").hexdigest()

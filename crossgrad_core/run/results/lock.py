@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import disk_errors
+from crossgrad_core.system.writability import check_own
 
 #: The file that is locked. It stays when its process is gone; then no process holds the lock on it.
 FILE = "run.lock"
@@ -23,6 +24,7 @@ FILE = "run.lock"
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
 # Windows locks ranges of bytes, which no other process can read: one far behind the content.
 _FAR = 2**30
+_MOST = 4096  # bytes of a holder
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,10 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
     Raises:
         RunInUseError: Another process holds the lock; says which and since when.
-        UserError: The folder may not be written to.
+        UserError: The folder may not be written to, or the lock is no file.
     """
     path = folder / FILE
+    check_own(path)
     with disk_errors(path):
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
     with file:
@@ -144,6 +147,6 @@ def _read(file: BinaryIO) -> Holder | None:
     """What the holder wrote; None where it has not written yet, or something else did."""
     file.seek(0)
     try:
-        return Holder(**json.loads(file.read()))
-    except (TypeError, ValueError, RecursionError):
+        return Holder(**json.loads(file.read(_MOST)))
+    except (OSError, TypeError, ValueError, RecursionError):
         return None

@@ -7,6 +7,7 @@ from pathlib import Path
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
+from crossgrad_core.system.writability import check_own
 
 FILE = "log.txt"
 #: Progress goes into the log so many times in a run.
@@ -23,10 +24,14 @@ class RunLog:
     Args:
         folder: The run's folder; a log that is there already is continued.
         clock: The local time.
+
+    Raises:
+        UserError: The log is a link or a pipe.
     """
 
     def __init__(self, folder: Path, clock: Callable[[], datetime] = _now) -> None:
         self._path = folder / FILE
+        check_own(self._path)
         self._clock = clock
         self._pace = Pace(1)
         self._interval = 1

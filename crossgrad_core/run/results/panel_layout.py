@@ -110,9 +110,9 @@ def read_panel(path: Path) -> "dict[str, Image]":
     from PIL import Image
 
     try:
-        with Image.open(path) as file:
+        with Image.open(path, formats=["PNG"]) as file:
             panel = file.convert("RGB")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise _unreadable(path, str(error)) from error
     layout = Layout.in_canvas(panel.size)
     if layout is None:

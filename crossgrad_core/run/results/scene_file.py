@@ -11,6 +11,7 @@ from crossgrad_core.run.results.reading import SCENE as FILE
 from crossgrad_core.scene.differences import Weight, differences
 from crossgrad_core.scene.fingerprint import Fingerprint
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.input_files import read_file
 
 #: What to do about the heaviest difference; None stands for one that can be accepted.
 _WAYS_OUT = {
@@ -40,7 +41,7 @@ def read_scene_file(folder: Path) -> Fingerprint | None:
     """The scene that a run was trained on; None, with a note, where that cannot be told."""
     path = folder / FILE
     try:
-        fingerprint = Fingerprint.model_validate_json(path.read_bytes())
+        fingerprint = Fingerprint.model_validate_json(read_file(path))
     except OSError:
         why = f"{folder} has no {FILE}: the run is of an older version"
     except ValidationError:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import UserError
+from crossgrad_core.plugin import UserError, open_file
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_plugins.readers._colmap_types import (
     ColmapImage,
@@ -111,7 +111,7 @@ class _Walk:
 @contextmanager
 def _open(path: Path) -> Iterator[_Walk]:
     try:
-        file = path.open("rb")
+        file = open_file(path)
     except OSError as error:
         raise UserError(
             "the file cannot be read", where=path, found=str(error), todo="check its permissions"

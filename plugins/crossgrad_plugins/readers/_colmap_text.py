@@ -16,7 +16,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import UserError
+from crossgrad_core.plugin import UserError, open_file
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_plugins.readers._colmap_types import (
     ColmapImage,
@@ -69,7 +69,8 @@ class _Lines:
         self.path = path
         self._number = 0
         try:
-            content = path.read_bytes()
+            with open_file(path) as file:
+                content = file.read()
         except OSError as error:
             raise UserError(
                 "the file cannot be read",

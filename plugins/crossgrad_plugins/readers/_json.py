@@ -1,6 +1,5 @@
 """JSON files of scenes: of bounded size and depth, with typed fields whose errors name them."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -10,10 +9,11 @@ from typing import Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import UserError, size_text
+from crossgrad_core.plugin import UserError
+from crossgrad_core.plugin import read_json as json_in
 from crossgrad_core.scene.raw_checks import FARTHEST
 
-#: Bytes of a file; Python's values take some ten times as many.
+#: Bytes of a file. Large reconstructions have millions of points.
 LARGEST: Final = 512 << 20
 #: Pixels along a side of a photo.
 LONGEST_SIDE: Final = 10_000_000
@@ -145,15 +145,9 @@ def read_json(path: Path) -> object:
         UserError: The file is missing, too large, too deep, or not JSON.
     """
     try:
-        size = path.stat().st_size
-        if size > LARGEST:
-            raise _unreadable(path, f"a file of {size_text(size)}", f"{size_text(LARGEST)} at most")
-        value: object = json.loads(path.read_bytes().decode("utf-8-sig"))
-    except RecursionError as error:
-        raise _unreadable(path, "lists or objects within each other without an end") from error
-    except (OSError, ValueError) as error:
+        return json_in(path, LARGEST)
+    except (FileNotFoundError, ValueError) as error:
         raise _unreadable(path, str(error)) from error
-    return value
 
 
 def read_object(path: Path) -> Fields:

@@ -2,7 +2,8 @@
 
 Entities are what makes XML dangerous: they expand without bound and can name other files. They can
 only be declared in a document type, so a file that has one is refused before anything in it is
-read; the formats have none. Size and depth are bounded too. That needs no further package.
+read; the formats have none. Size, depth and number are bounded too, so that a file takes at most
+some ten times its size in memory. That needs no further package.
 """
 
 from pathlib import Path
@@ -10,11 +11,14 @@ from typing import Final
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
-from crossgrad_core.plugin import UserError, size_text
+from crossgrad_core.plugin import UserError, open_file, size_text
 
-#: Bytes of a file, and elements within each other.
+#: Bytes of a file and of one tag or comment; elements within each other; elements and attributes.
 LARGEST: Final = 128 << 20
+_LONGEST: Final = 4 << 20
 _DEEPEST: Final = 64
+_MOST: Final = 2_000_000
+_PIECE: Final = 1 << 20
 _AGAIN = "export the file again"
 
 
@@ -28,9 +32,13 @@ class _Builder:
     def __init__(self) -> None:
         self.tree = TreeBuilder()
         self._depth = 0
+        self._count = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         self._depth += 1
+        self._count += 1 + len(attributes)
+        if self._count > _MOST:
+            raise _RefusedError(f"more than {_MOST:,} elements and attributes")
         if self._depth > _DEEPEST:
             raise _RefusedError(f"elements more than {_DEEPEST} deep within each other")
         self.tree.start(tag, attributes)
@@ -62,14 +70,18 @@ def read_xml(path: Path) -> Element:
 
 
 def _parsed(path: Path) -> Element:
-    size = path.stat().st_size
-    if size > LARGEST:
-        raise _RefusedError(f"{size_text(size)}, more than {size_text(LARGEST)}")
     builder, parser = _Builder(), expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.tree.data
     parser.StartDoctypeDeclHandler = builder.doctype
-    parser.Parse(path.read_bytes(), True)
+    with open_file(path) as file:
+        while piece := file.read(_PIECE):
+            if file.tell() > LARGEST:
+                raise _RefusedError(f"a file of more than {size_text(LARGEST)}")
+            parser.Parse(piece, False)
+            if file.tell() - parser.CurrentByteIndex > _LONGEST:
+                raise _RefusedError(f"a tag or comment of more than {size_text(_LONGEST)}")
+    parser.Parse(b"", True)
     return builder.tree.close()

@@ -1,5 +1,6 @@
 """The vertices of a PLY file as named columns: ascii or binary, any property order and type."""
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import UserError, listed, size_text
+from crossgrad_core.plugin import UserError, is_file, listed, open_file, size_text
 
 #: PLY type name -> numpy type without byte order.
 _TYPES = {
@@ -85,7 +86,7 @@ def read_vertices(path: Path) -> Vertices:
         UserError: The file is missing, is not a PLY file, has no vertices or ends too early.
     """
     _require_file(path)
-    with path.open("rb") as file:
+    with open_file(path) as file:
         header = _read_header(file, path)
         before: list[Element] = []
         for element in header.elements:
@@ -109,18 +110,18 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
         UserError: The file is missing or is not a PLY file.
     """
     _require_file(path)
-    with path.open("rb") as file:
+    with open_file(path) as file:
         elements = _read_header(file, path).elements
     fields = (each.fields or () for each in elements if each.name == "vertex")
     return tuple(name for each in fields for name, _ in each)
 
 
 def _require_file(path: Path) -> None:
-    if not path.is_file():
+    if not is_file(path):
         raise UserError(
             "no such PLY file",
             where=path,
-            found="a folder" if path.is_dir() else "nothing",
+            found="a folder" if os.path.isdir(path) else "nothing",
             todo="check the path",
         )
 
