@@ -30,7 +30,7 @@ from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.film import film_files, write_film, write_frames
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
-from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.run.results.panel_names import ending, flat_names
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
@@ -132,7 +132,7 @@ def evaluated_on(
         draw, points = plain_renderer(setup, state), there.points
         result = measured(there.views, draw, setup.metrics, points=points)
         if writes:
-            write_per_view(folder, result, f"per_view_on_{there.name}.csv")
+            write_per_view(folder, result, f"per_view_on_{ending(there.name)}.csv")
         return result, there
 
 
@@ -211,7 +211,8 @@ def render(
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
-            views, out = there.views, out or folder_of(folder, state.step) / f"on_{there.name}"
+            own = folder_of(folder, state.step) / f"on_{ending(there.name)}"
+            views, out = there.views, out or own
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -259,7 +260,7 @@ def fly(
         setup, state = how.open(folder)
         along = flight(setup.scene, path, frames or FRAMES)
         draw = camera_renderer(setup, state)
-        out = out or folder_of(folder, state.step) / f"path_{along.name}"
+        out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
         with torch.no_grad():
             files = write_frames(map(draw, along.cameras), out)
         made = write_film(files, along.fps)

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from crossgrad_core.contract.scene import View
 
 _UNSAFE = re.compile(r"[^\w.+-]+")
-_LONGEST = 120
+_LONGEST = 120  # bytes
 
 
 def flat_names(names: Sequence[str]) -> dict[str, str]:
@@ -22,7 +22,7 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
     for name in names:
         path = PurePosixPath(name)
         parts = [part for part in path.with_suffix("").parts if part not in {"..", "/"}]
-        base = _UNSAFE.sub("_", "__".join(parts)).strip(".")[-_LONGEST:] or "view"
+        base = ending(_UNSAFE.sub("_", "__".join(parts)).strip(".")) or "view"
         unique, number = base, 1
         while unique.casefold() in taken:
             number += 1
@@ -30,6 +30,11 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
         taken.add(unique.casefold())
         flat[name] = unique
     return flat
+
+
+def ending(name: str) -> str:
+    """The end of a name that is too long to be a part of another one."""
+    return name.encode()[-_LONGEST:].decode(errors="ignore")
 
 
 def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
