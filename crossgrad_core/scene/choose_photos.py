@@ -19,6 +19,7 @@ from crossgrad_core.scene.photo_files import (
 )
 from crossgrad_core.scene.photo_notes import (
     note_kinds,
+    note_links,
     note_memory,
     note_pairing,
     note_reductions,
@@ -104,6 +105,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
         _check_mask(mask, sources[name])
     notes = (
         *note_pairing(full.folder, full.paths, names),
+        *note_links(raw.root, sources),
         *reduced_notes,
         *note_undistortion(sources),
         *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),

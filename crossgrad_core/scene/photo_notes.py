@@ -1,5 +1,6 @@
 """Notes on what was done to the photos of a scene."""
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,6 +33,20 @@ def note_pairing(folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence
         f"photos: {count(len(which), noun)} {what}: {name_some(which)}"
         for which, noun, what in told
         if which
+    ]
+
+
+def note_links(root: Path, sources: Sources) -> list[str]:
+    """Where photos and masks lie that are no part of the scene's folder."""
+    home = os.path.join(os.path.realpath(root), "")
+    files = [file for each in sources.values() for file in (each.path, each.mask) if file]
+    outside = [file for file in files if not os.path.realpath(file).startswith(home)]
+    if not outside:
+        return []
+    first = min(outside)
+    return [
+        f"photos: {count(len(outside), 'file')} outside the scene's folder, such as {first}, "
+        f"which is {os.path.realpath(first)}"
     ]
 
 

@@ -1,10 +1,11 @@
 """Checks on what a reader found, before anything is built from it."""
 
 import os
+import re
 import unicodedata
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import PurePosixPath, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,8 @@ from crossgrad_core.scene.wording import count, name_some
 FARTHEST = 1e30
 #: And beyond this in local units: their squares must stay within float32.
 FARTHEST_LOCAL = 1e15
-_LONGEST_NAME = 255  # bytes of a folder or file, on every usual file system
+#: Bytes of a file or folder, on every usual file system, and of a whole name.
+LONGEST_PART, LONGEST_NAME = 255, 1024
 _NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
 # Rotations written with six digits pass; a pose with a scale in it does not.
 _RIGID = 1e-4
@@ -47,6 +49,14 @@ class CheckedPoints:
         """Those that are marked in `chosen` [P]."""
         numbers = np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)
         return CheckedPoints(self.xyz[chosen], self.colors[chosen], numbers[self.new_row])
+
+
+def is_possible_name(text: str) -> bool:
+    """Whether a file can have a name, with folders, on every usual file system."""
+    if any(unicodedata.category(sign) in _NO_SIGNS for sign in text):
+        return False
+    longest = max(len(os.fsencode(part)) for part in re.split(r"[/\\]", text))
+    return longest <= LONGEST_PART and len(os.fsencode(text)) <= LONGEST_NAME
 
 
 def check_views(raw: RawScene) -> None:
@@ -115,7 +125,8 @@ def check_distances(
 
 def _check_name(raw: RawScene, name: str) -> None:
     path = PurePosixPath(name)
-    if not path.name or path.is_absolute() or ".." in path.parts:
+    absolute = path.is_absolute() or PureWindowsPath(name).drive
+    if not path.name or absolute or ".." in path.parts:
         raise UserError(
             "an image name leads out of the image folder",
             where=raw.root,
@@ -123,13 +134,12 @@ def _check_name(raw: RawScene, name: str) -> None:
             found=repr(name),
             todo="rename the image in the model and its photo below the image folder",
         )
-    longest = max(len(os.fsencode(part)) for part in path.parts)
-    if longest > _LONGEST_NAME or any(unicodedata.category(sign) in _NO_SIGNS for sign in name):
+    if not is_possible_name(name):
         raise UserError(
             "an image name that no photo can be found or listed by",
             where=raw.root,
-            expected=f"UTF-8 without control characters, at most {_LONGEST_NAME} bytes for a file "
-            "or folder",
+            expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file "
+            f"or folder and {LONGEST_NAME} in all",
             found=ascii(name),
             todo="rename the image in the model, and its photo",
         )

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.plugin import is_file
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.raw import RawView
@@ -56,9 +57,8 @@ def photo_name(inside: Inside, fields: Fields, key: str, base: str) -> str:
     """
     name = inside.name(fields.text(key), fields.where(key), base)
     bare = not PurePosixPath(name).suffix
-    if not _is_file(inside, name) and (bare or _is_file(inside, f"{name}.png")):
+    if not is_file(inside.scene / name) and (bare or is_file(inside.scene / f"{name}.png")):
         name += ".png"
-    inside.file(name, fields.where(key))
     return name
 
 
@@ -81,7 +81,7 @@ def read_frame(
     mask = None
     if "mask_path" in frame:
         name = inside.name(frame.text("mask_path"), frame.where("mask_path"), base)
-        mask = _existing(inside.file(name, frame.where("mask_path")), frame)
+        mask = _existing(inside.scene / name, frame)
     matrix = transform_of(frame, "transform_matrix")
     rotation = rotation_of(matrix[:, :3])
     if rotation is None:
@@ -181,14 +181,7 @@ def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
     )
 
 
-def _is_file(inside: Inside, name: str) -> bool:
-    try:
-        return (inside.scene / name).is_file()
-    except OSError:
-        return False
-
-
 def _existing(path: Path, frame: Fields) -> Path:
-    if not path.is_file():
+    if not is_file(path):
         frame.wrong("mask_path", "a mask that is there", f"no file {path}")
     return path

@@ -59,7 +59,6 @@ class BlenderReader(Reader):
         )
         test = _read(inside, held_out, base) if held_out else []
         images, views = raw_views([*train, *test])
-        inside.check_photos(images)
         names = [view.name for view in views]
         asked = self.points if self.points is None else inside.name(self.points, "reader.points")
         points = find_points(inside, asked, "reader.points", base="" if asked else base)

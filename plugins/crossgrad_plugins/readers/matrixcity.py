@@ -62,7 +62,6 @@ class MatrixCityReader(Reader):
             )
         frames = {name: _read(inside, name) for name in files}
         images, views = raw_views([frame for block in frames.values() for frame in block])
-        inside.check_photos(images)
         points = find_points(inside, self.points, "reader.points")
         check_seen(points, views, path)
         names = [view.name for view in views]
@@ -110,7 +109,6 @@ def _frame(inside: Inside, frame: Fields, whole: Fields, photos: str) -> Posed:
     if index != int(index) or index < 0:
         frame.wrong("frame_index", "a whole number, 0 or more")
     photo = inside.name(f"{int(index):04d}.png", frame.where("frame_index"), photos)
-    inside.file(photo, frame.where("frame_index"))
     matrix = transform_of(frame, "rot_mat")
     rotation = rotation_of(_TO_UNIT * matrix[:, :3])
     if rotation is None:

@@ -81,13 +81,12 @@ class MetashapeReader(Reader):
         inside = Inside(path)
         file = _XML.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
-        inside.check_photos(images)
         chunk = _chunk(file)
         cameras, notes = _cameras(chunk, file)
         world, where = _world(chunk, file, cameras, self.frame)
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
         photos = PhotoNames.of(path / images)
-        views = tuple(_view(inside, images, each, sensors, photos, world) for each in cameras)
+        views = tuple(_view(inside, each, sensors, photos, world) for each in cameras)
         points = find_points(inside, self.points, "reader.points")
         other = "chunk" if self.frame == "local" else "local"
         check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
@@ -277,7 +276,6 @@ def _lens(fields: Fields, kind: str) -> Calibration:
 
 def _view(
     inside: Inside,
-    images: str,
     camera: _Camera,
     sensors: dict[str, Calibration],
     photos: PhotoNames,
@@ -286,8 +284,7 @@ def _view(
     fields = camera.fields
     if camera.sensor not in sensors:
         fields.wrong("sensor_id", "a sensor of the file")
-    name = photos.full(inside.photo(images, camera.label, fields.where("label")))
-    inside.file(f"{images}/{name}", fields.where("label"))
+    name = photos.full(inside.name(camera.label, fields.where("label")))
     return raw_view(
         name, sensors[camera.sensor], from_opencv(camera.rotation, camera.center, world)
     )

@@ -54,7 +54,6 @@ class NerfstudioReader(Reader):
         world = _applied(whole).inverse
         frames = [read_frame(inside, each, whole, base, world) for each in whole.items("frames")]
         images, views = raw_views(frames)
-        inside.check_photos(images)
         points = find_points(inside, *self._points(whole, base), frame=world)
         check_seen(points, views, whole.file)
         notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]

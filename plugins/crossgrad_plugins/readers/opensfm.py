@@ -62,10 +62,9 @@ class OpenSfmReader(Reader):
         file = self._find(inside)
         chosen, note = _choose(file)
         images = inside.name(self.images, "reader.images")
-        inside.check_photos(images)
         cameras = {name: _camera(fields) for name, fields in chosen.members("cameras").items()}
         shots = chosen.members("shots")
-        views = tuple(_view(inside, images, name, shot, cameras) for name, shot in shots.items())
+        views = tuple(_view(inside, name, shot, cameras) for name, shot in shots.items())
         points = _points(chosen)
         head = (
             f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
@@ -133,13 +132,11 @@ def _camera(fields: Fields) -> Calibration:
     return lens.brown((k1, k2, k3), (fields.number("p1", 0.0), fields.number("p2", 0.0)))
 
 
-def _view(
-    inside: Inside, images: str, name: str, shot: Fields, cameras: dict[str, Calibration]
-) -> RawView:
+def _view(inside: Inside, name: str, shot: Fields, cameras: dict[str, Calibration]) -> RawView:
     camera = shot.text("camera")
     if camera not in cameras:
         shot.wrong("camera", f"a camera of the file, such as {min(cameras, default='(none)')}")
-    plain = inside.photo(images, name, shot.here)
+    plain = inside.name(name, shot.here)
     pose = np.eye(4)
     pose[:3, :3] = rotation_by(shot.numbers("rotation", 3))
     pose[:3, 3] = shot.numbers("translation", 3)

@@ -37,7 +37,6 @@ _NAME: Final = "#name"
 _POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _SENSOR: Final = 36.0  # mm
-_LARGEST: Final = 256 << 20
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
 )
@@ -78,7 +77,6 @@ class RealityCaptureReader(Reader):
         inside = Inside(path)
         file = _CSV.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
-        inside.check_photos(images)
         photos = PhotoNames.of(path / images)
         views = tuple(_view(inside, images, row, photos) for row in _rows(file))
         points = find_points(inside, self.points, "reader.points")
@@ -102,8 +100,6 @@ def _rows(file: Path) -> list[_Row]:
     Raises:
         UserError: The file cannot be read, lacks a column, or a row has another number of cells.
     """
-    if file.is_file() and file.stat().st_size > _LARGEST:
-        raise _wrong(file, f"at most {_LARGEST:,} bytes", f"{file.stat().st_size:,} bytes")
     rows = read_rows(file, "the CSV of RealityCapture", _TODO)
     header = [cell.strip() for cell in rows[0]] if rows else []
     missing = [name for name in (_NAME, *_POSE, "f") if name not in header]
@@ -145,12 +141,11 @@ def _wrong(file: Path, expected: str, found: str) -> UserError:
 
 def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
     where = row.fields.where(_NAME)
-    name = photos.full(inside.photo(images, row.name, where))
-    file = inside.file(f"{images}/{name}", where)
+    name = photos.full(inside.name(row.name, where))
     x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))
-    return raw_view(name, _lens(row.fields, file), pose)
+    return raw_view(name, _lens(row.fields, inside.scene / images / name), pose)
 
 
 def _lens(fields: Fields, photo: Path) -> Calibration:

@@ -12,7 +12,6 @@ from crossgrad_core.plugin import Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import find_models
-from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers.colmap import ColmapReader, read_raw
 
 #: Names of photo folders, and what a name of a held-out photo holds.
@@ -40,11 +39,6 @@ class UcGsReader(ColmapReader):
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         raw = read_raw(path, self.images, self.model)
-        inside = Inside(path)
-        images = inside.name(self.images, "reader.images")
-        inside.check_photos(images)
-        for view in raw.views:
-            inside.photo(images, view.name, f"{path}: image {view.name}")
         test = frozenset(view.name for view in raw.views if is_test(view.name))
         train = frozenset(view.name for view in raw.views) - test
         views = tuple(replace(view, place=_place(view.name)) for view in raw.views)

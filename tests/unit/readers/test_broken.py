@@ -1,4 +1,4 @@
-"""Broken and hostile scenes end in one error that names file and field; nothing outside is read."""
+"""Broken and hostile scenes end in one error that names file and field; no name leads outside."""
 
 import json
 import os
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from support.formats import write_formats, write_ply
 from support.scenes import write_tiny_scene
@@ -14,6 +15,7 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
+from crossgrad_plugins.readers import _xml
 
 PHOTO = "0001.png"
 PHOTO_TAG = f'label="{PHOTO}"><transform>'
@@ -167,7 +169,7 @@ def test_files_that_are_no_scene_are_named(reader, content, make):
 def test_files_beyond_a_size_are_not_read(reader, make, monkeypatch):
     path = make(reader)
     monkeypatch.setattr("crossgrad_plugins.readers._json.LARGEST", 50)
-    refuses(path, reader, FILES[reader], "at most")
+    refuses(path, reader, FILES[reader], "more than")
 
 
 OUT = ["../../secret.png", "/etc/hostname", "..\\..\\secret.png", "C:\\secret.png", "a/../../../b"]
@@ -204,33 +206,91 @@ def test_names_that_no_file_can_have_are_refused(key, name, make):
     refuses(path, "nerfstudio", "a name that no file can have", key)
 
 
-@pytest.mark.parametrize("reader", FILES)
-def test_links_that_lead_out_of_the_scene_are_refused(reader, make):
+@pytest.mark.parametrize("reader", [*FILES, "colmap"])
+@pytest.mark.parametrize("what", ["photo", "folder"])
+def test_photos_may_be_links_and_a_note_says_where_they_lie(reader, what, make):
     path = make(reader)
-    secret = path.parent.parent / "secret.png"
-    Image.new("RGB", (24, 16)).save(secret)
+    before = read(path, reader)
     photo = min(path.rglob("0001.png"))
-    photo.unlink()
-    photo.symlink_to(secret)
-    refuses(path, reader, "leads out of the scene", secret)
+    moved = photo if what == "photo" else photo.parent
+    away = path.parent.parent / "elsewhere"
+    number = 1 if what == "photo" else len(list(moved.iterdir()))
+    moved.rename(away)
+    moved.symlink_to(away)
+    scene = read(path, reader)
+    assert [view.name for view in scene.views] == [view.name for view in before.views]
+    for old, new in zip(before.views, scene.views, strict=True):
+        assert torch.equal(old.photo.image(), new.photo.image())
+    (note,) = set(scene.notes) - set(before.notes)
+    assert f"photos: {number} file" in note and f"such as {path}" in note and str(away) in note
+
+
+@pytest.mark.parametrize("reader", [*FILES, "colmap"])
+@pytest.mark.parametrize("what", ["a text", "a pipe", "a device", "a folder", "nothing", "itself"])
+def test_what_stands_in_place_of_a_photo_is_refused_at_once(reader, what, make):
+    path = make(reader)
+    for photo in path.rglob("*.png"):
+        photo.unlink()
+        if what == "a pipe":
+            os.mkfifo(photo)
+        else:
+            to = {"a text": "/etc/passwd", "a device": "/dev/zero", "a folder": path}
+            photo.symlink_to(to.get(what, photo if what == "itself" else path / "gone"))
+    refuses(path, reader, ".png" if what in {"a text", "a pipe", "a device"} else "photo")
 
 
 @pytest.mark.parametrize("reader", FILES)
-def test_a_folder_of_photos_elsewhere_is_refused(reader, make):
+@pytest.mark.parametrize("what", ["a pipe", "a device"])
+def test_what_stands_in_place_of_the_poses_is_refused_at_once(reader, what, make):
     path = make(reader)
-    folder = min(path.rglob("0001.png")).parent
-    folder.rename(path.parent.parent / "elsewhere")
-    folder.symlink_to(path.parent.parent / "elsewhere", target_is_directory=True)
-    refuses(path, reader, "leads out of the scene", "elsewhere")
+    file = path / FILES[reader]
+    file.unlink()
+    if what == "a pipe":
+        os.mkfifo(file)
+    else:
+        file.symlink_to("/dev/zero")
+    assert not build("readers", reader, {}).accepts(path)
+    refuses(path, reader)
+    if reader in {"nerfstudio", "opensfm", "metashape", "realitycapture"}:
+        refuses(path, reader, FILES[reader], options={"file": FILES[reader]})
 
 
-def test_a_link_that_is_found_by_another_suffix_is_refused(make):
+def test_every_file_may_be_a_link_as_caches_lay_them_out(make):
     path = make("nerfstudio")
-    secret = path.parent.parent / "secret.jpg"
-    Image.new("RGB", (24, 16)).save(secret)
-    (path / "images" / PHOTO).unlink()
-    (path / "images" / "0001.jpg").symlink_to(secret)
-    refuses(path, "nerfstudio", "leads out of the scene", "0001.jpg")
+    before = read(path, "nerfstudio")
+    store = path.parent.parent / "blobs"
+    store.mkdir()
+    for number, file in enumerate(sorted(p for p in path.rglob("*") if p.is_file())):
+        file.rename(store / str(number))
+        file.symlink_to(store / str(number))
+    scene = read(path, "nerfstudio")
+    assert np.array_equal(scene.points, before.points)
+    assert [v.photo.image().sum() for v in scene.views] == [
+        v.photo.image().sum() for v in before.views
+    ]
+
+
+def test_no_name_leads_through_a_folder_elsewhere_but_to_photos(make):
+    path = make("nerfstudio")
+    away = path.parent.parent / "away"
+    away.mkdir()
+    shutil.move(path / "cloud.ply", away)
+    (path / "far").symlink_to(away, target_is_directory=True)
+    edit(path, "nerfstudio", put("ply_file_path", value="far/cloud.ply"))
+    refuses(path, "nerfstudio", "leads out of the scene", "ply_file_path", away)
+    refuses(path, "nerfstudio", "leads out", options={"points": "far/cloud.ply"})
+    # Within the scene folders may be links.
+    (path / "far").unlink()
+    away.rename(path / "there")
+    (path / "far").symlink_to(path / "there", target_is_directory=True)
+    assert len(read(path, "nerfstudio").points) == 20
+
+
+def test_too_many_values_for_the_memory_are_not_built(make, monkeypatch):
+    path = make("nerfstudio")
+    monkeypatch.setattr("crossgrad_plugins.readers._json.LARGEST", 1 << 20)
+    (path / "transforms.json").write_bytes(b'{"frames": [' + b"[]," * 100_000 + b"0]}")
+    refuses(path, "nerfstudio", "in memory", "transforms.json")
 
 
 @pytest.mark.parametrize("key", ["mask_path", "ply_file_path", "train_filenames"])
@@ -249,11 +309,10 @@ def test_every_name_in_a_file_is_held_to_the_scene(key, make):
         ("blender", "points"), ("matrixcity", "points"), ("opensfm", "images"),
         ("opensfm", "file"), ("realitycapture", "images"), ("realitycapture", "file"),
         ("metashape", "images"), ("metashape", "file"), ("metashape", "points"),
-        ("uc-gs", "images"),
     ],
 )  # fmt: skip
 def test_options_name_files_of_the_scene_only(reader, option, make):
-    path = make("colmap" if reader == "uc-gs" else reader)
+    path = make(reader)
     refuses(path, reader, f"reader.{option}", options={option: "../elsewhere"})
 
 
@@ -297,6 +356,25 @@ class TestXml:
         path = make("metashape")
         (path / "cameras.xml").write_bytes(content)
         refuses(path, "metashape", "cameras.xml", word, options={"file": "cameras.xml"})
+
+    @pytest.mark.parametrize(
+        ("content", "word"),
+        [
+            (b"<d>" + b"<a/>" * 1_000, "more than 1,000 elements"),
+            (b"<d><a " + b" ".join(b'a%d=""' % i for i in range(1_000)) + b"/></d>", "elements"),
+            (b"<d><a " + b" ".join(b'a%d=""' % i for i in range(20_000)) + b"/></d>", "tag or"),
+            (b"<d><!--" + b"-x" * 50_000 + b"--></d>", "tag or comment"),
+            (b"<d>" + b"x" * 200_000 + b"</d>", "a file of more"),
+        ],
+        ids=["elements", "attributes", "wide", "comment", "size"],
+    )
+    def test_number_and_size_are_bounded(self, content, word, tmp_path, monkeypatch):
+        bounds = {"_MOST": 1_000, "_LONGEST": 1 << 15, "_PIECE": 1 << 12, "LARGEST": 190_000}
+        for name, bound in bounds.items():
+            monkeypatch.setattr(_xml, name, bound)
+        (tmp_path / "a.xml").write_bytes(content)
+        with pytest.raises(UserError, match=word):
+            _xml.read_xml(tmp_path / "a.xml")
 
     def test_entities_cannot_name_files(self, make):
         path = make("metashape")

@@ -33,7 +33,7 @@ def refused(check, *words):
 
 @pytest.mark.parametrize(
     "name", ["", ".", "..", "/a.jpg", "../a.jpg", "x/../a.jpg", "\udcff.jpg", "a\n.jpg",
-             "\x1b[2J.jpg", "a" * 256, "ä" * 128, "a\0.jpg"],
+             "\x1b[2J.jpg", "a" * 256, "ä" * 128, "a\0.jpg", "a/" * 600 + "b.jpg", "C:/a.jpg"],
 )  # fmt: skip
 def test_names_that_are_no_paths_below_the_photos_are_refused(name):
     refused(lambda: check_views(raw(("b.jpg", name))), "an image name")
