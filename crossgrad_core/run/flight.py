@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import radians, tan
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.validation import as_user_error
+from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
 #: Instead of a file: from the farthest photos down to the nearest.
@@ -148,8 +149,10 @@ def _unit(vector: _Floats) -> _Floats:
 class _Frame(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    camera_to_world: list[float] = Field(min_length=16, max_length=16)
-    fov: float = Field(gt=0, lt=180)
+    camera_to_world: list[Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]] = Field(
+        min_length=16, max_length=16
+    )
+    fov: float = Field(ge=0.01, lt=180)
 
 
 class _Path(BaseModel):
@@ -190,8 +193,17 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
             found=str(frame.camera_to_world),
             todo=_TODO,
         )
+    center = similarity.to_local(matrix[None, :3, 3])[0]
+    if np.abs(center).max() > FARTHEST_LOCAL:
+        raise UserError(
+            "a camera of the path is too far from the scene",
+            where=f"{path}, camera_to_world",
+            expected=f"at most {FARTHEST_LOCAL:g} times the extent of the training cameras",
+            found=str(matrix[:3, 3].tolist()),
+            todo=_TODO,
+        )
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ similarity.to_local(matrix[None, :3, 3])[0]
+    pose[:3, 3] = -rotation.T @ center
     focal = size[1] / 2 / tan(radians(frame.fov) / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2, torch.from_numpy(pose))

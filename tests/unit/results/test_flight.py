@@ -16,6 +16,7 @@ from crossgrad_core.testing.posed import posed_scene, posed_view
 
 FRAMES = 9
 IDENTITY = np.eye(4).ravel().tolist()
+FAR_AWAY = [*IDENTITY[:3], 1e20, *IDENTITY[4:]]
 
 
 def views_above(heights, seen=range(10)):
@@ -120,6 +121,9 @@ def test_a_camera_path_is_read_in_input_coordinates(tmp_path):
         ({"camera_path": [{"camera_to_world": [0.0] * 16, "fov": 50}]}, "no rotation"),
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16, "fov": 50}]}, "camera_to_world"),
         ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 180}]}, "fov"),
+        ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 1e-9}]}, "fov"),
+        ({"camera_path": [{"camera_to_world": [1e308] * 16, "fov": 50}]}, "camera_to_world"),
+        ({"camera_path": [{"camera_to_world": FAR_AWAY, "fov": 50}]}, "too far from the scene"),
     ],
 )
 def test_a_wrong_camera_path_names_its_field(tmp_path, changes, message):

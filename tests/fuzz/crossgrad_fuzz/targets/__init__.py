@@ -5,6 +5,7 @@ from crossgrad_fuzz.targets import (
     checkpoints,
     colmap,
     lists,
+    named,
     photos,
     ply,
     readers,
@@ -18,7 +19,7 @@ TARGETS: dict[str, Target] = {
     target.name: target
     for module in (
         *(ply, colmap, scenes, readers, photos, settings, checkpoints, lists, tables),
-        *(records,),
+        *(records, named),
     )
     for target in module.TARGETS
 }

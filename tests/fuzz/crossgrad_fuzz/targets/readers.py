@@ -38,6 +38,7 @@ from crossgrad_plugins.readers import (
     nerfstudio,
     opensfm,
     realitycapture,
+    uc_gs,
 )
 
 _SIZE = (24, 16)
@@ -57,18 +58,22 @@ _WORDS = (
 )
 
 
+def _write(name: str, lens: str, folder: Path) -> Path:
+    """The folder of a small scene in a format."""
+    split = name == "uc-gs"
+    scene = write_tiny_scene(
+        folder / "scene", views=3, width=_SIZE[0], height=_SIZE[1], points=4, model=lens,
+        centered=True, text=split, folders=("train", "test") if split else ("",),
+    )  # fmt: skip
+    (folder / "out").mkdir()
+    return FORMATS["colmap" if split else name](Written.of(scene), folder / "out")
+
+
 @cache
 def _written(name: str, lens: str) -> Case:
     """The files of a small scene in a format, without its photos."""
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        scene = write_tiny_scene(
-            folder / "scene", views=3, width=_SIZE[0], height=_SIZE[1], points=4, model=lens,
-            centered=True,
-        )  # fmt: skip
-        (folder / "out").mkdir()
-        FORMATS[name](Written.of(scene), folder / "out")
-        files = load(folder / "out")
+        files = load(_write(name, lens, Path(place)))
     return {file: data for file, data in files.items() if not file.endswith(_PHOTO)}
 
 
@@ -129,13 +134,7 @@ def _metashape_seeds() -> Sequence[Case]:
 def _prepare(name: str, folder: Path) -> None:
     """The photos of the scene, a mask, and nothing else."""
     with tempfile.TemporaryDirectory() as place:
-        scene = write_tiny_scene(
-            Path(place), views=3, width=_SIZE[0], height=_SIZE[1], points=4, model=_PLAIN[0],
-            centered=True,
-        )  # fmt: skip
-        out = Path(place) / "out"
-        out.mkdir()
-        FORMATS[name](Written.of(scene), out)
+        out = _write(name, _PLAIN[0], Path(place))
         for photo in out.rglob(f"*{_PHOTO}"):
             to = folder / photo.relative_to(out)
             to.parent.mkdir(parents=True, exist_ok=True)
@@ -159,6 +158,15 @@ def _parse(kind: type[Reader], folder: Path) -> None:
             assert path.resolve().is_relative_to(folder.resolve())
     for note in scene.notes:
         note.encode()
+
+
+def _renamed(data: bytes, rng: random.Random) -> bytes:
+    """Another name for a photo of the lists that folders make."""
+    old, new = (
+        rng.choice((b"train/", b"test/", b".png")),
+        rng.choice((b"eval/", b"test", b"", b"/")),
+    )
+    return data.replace(old, new, rng.randrange(1, 4))
 
 
 def _deepen(data: bytes, rng: random.Random) -> bytes:
@@ -188,13 +196,13 @@ def _target(
         # Of chunks on Earth, which another target has.
         _poses: ("Frame3D.after",),
         # Links, which no input holds.
-        _inside: ("Inside.files", "Inside.check_photos", "Inside._check"),
+        _inside: ("Inside.files",),
         # Files that options name, or of which there are none or several.
         _kind: ("Kind.one",),
         matrixcity: ("_walk",),
         # Sizes that no input has, and what other formats have.
-        _json: ("read_json", "read_object", "Fields.texts"),
-        _xml: ("_parsed",),
+        _json: ("read_object", "Fields.texts"),
+        _xml: ("_parsed", "_Builder.start"),
     }.get
     return Target(
         name=f"{name}-scene",
@@ -228,6 +236,7 @@ TARGETS = (
         (nerfstudio, _transforms, _points, _poses, _inside, _lenses),
         *(_nerfstudio_seeds, _FIELDS),
     ),
+    _target("uc-gs", uc_gs.UcGsReader, (uc_gs,), _forms("uc-gs", *_PLAIN), (), (_renamed,)),
     _target("opensfm", opensfm.OpenSfmReader, (opensfm, _json), _forms("opensfm", *_LENSES)),
     _target(
         *("realitycapture", realitycapture.RealityCaptureReader, (realitycapture, _photos)),

@@ -1,4 +1,4 @@
-"""Settings: YAML files and `--set` texts, up to the validated configuration of a run."""
+"""Settings: YAML files and `--set` texts, up to the validated configuration of a run; grids."""
 
 import random
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from crossgrad_core.system.yaml_values import read_mapping, read_yaml, write_yam
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target
+from crossgrad_plugins.sweep import grid
 
 _FILE, _SETS = "run.yaml", "set.txt"
 #: PyYAML takes half a second for 64 KiB.
@@ -104,6 +105,31 @@ def _stored_seeds() -> Sequence[Case]:
     return [{_FILE: case[_FILE]} for case in (_seeds()[0], _seeds()[-1])]
 
 
+def _grid_seeds() -> Sequence[Case]:
+    arms = (
+        b"arms:\n- {name: one, settings: {views: 1}, by_scene: {kite: {steps: 5}}}\n- name: two\n"
+    )
+    own = b"  parameters: {rate: {values: [1, 2]}}\n"
+    nested = (
+        b"parameters:\n  operator: {parameters: {c: {values: [0.4, 0.5]}}}\n  steps: {value: 9}\n"
+    )
+    moved = b"parameters: {seed: {values: [1, 2]}, scene: {value: kite}}\nmetric: {name: ssim}\n"
+    bomb = b"".join(b"  p%d: {values: [1, 2, 3, 4, 5, 6, 7]}\n" % i for i in range(7))
+    return [
+        {_FILE: b"scenes: [kite, null]\nseeds: [0, 1]\n" + arms + own},
+        {_FILE: b"name: small\nbase: {steps: 3}\n" + nested},
+        {_FILE: moved},
+        {_FILE: b"parameters:\n" + bomb},
+        {_FILE: b""},
+    ]
+
+
+def _parse_grid(folder: Path) -> None:
+    found = grid.read_grid(folder / _FILE)
+    labels = [choice.label for choice in grid.choices(found)]
+    assert len(labels) * len(found.seeds) * len(found.scenes) <= grid.MOST_RUNS
+
+
 _WORDS = (
     *(b"&a ", b"*a", b"<<: *a", b"!!int ", b"!!float ", b"!!python/object:os.system ", b"!x "),
     *(b"!!set ", b"!!omap ", b"!!binary ", b"!!timestamp ", b"!!null ", b"? ", b"- ", b": "),
@@ -138,4 +164,13 @@ STORED = Target(
     mutators=_FORMAT,
     most_bytes=_MOST_BYTES,
 )
-TARGETS = (SETTINGS, STORED)
+GRID = Target(
+    name="sweep-grid",
+    seeds=_grid_seeds,
+    parse=_parse_grid,
+    parser={grid: ("with_scenes",)},
+    words=(*_WORDS, b"values: ", b"value: ", b"parameters: ", b"arms: ", b"seeds: ", b"scenes: "),
+    mutators=_FORMAT,
+    most_bytes=_MOST_BYTES,
+)
+TARGETS = (SETTINGS, STORED, GRID)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.results import metrics_csv, summary
+from crossgrad_core.run.results import metrics_csv, per_view, summary
 from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system import text_files
@@ -17,6 +17,7 @@ from crossgrad_plugins.diagnostics import report
 from crossgrad_plugins.diagnostics.report import read_probes
 
 _METRICS, _SUMMARY, _TABLE = metrics_csv.FILE, summary.FILE, "table.csv"
+_PER_VIEW = per_view.FILE
 _REGIMES = ("far", "near")
 
 
@@ -63,6 +64,17 @@ def _parse_summary(folder: Path) -> None:
     assert isinstance(read_summary(folder), dict)
 
 
+def _views() -> bytes:
+    return b"name,regime,psnr,ssim,psnr_track\na.jpg,far,21.5,0.8,\nb/c.jpg,near,inf,1,20\n"
+
+
+def _parse_views(folder: Path) -> None:
+    views = per_view.read_per_view(folder)
+    for view in views:
+        assert view.values.keys() == views[0].values.keys()
+        assert all(value is None or isinstance(value, float) for value in view.values.values())
+
+
 def _summaries() -> Sequence[Case]:
     text = b'{"status": "finished", "psnr": 21.5, "notes": ["\xc3\xa4", null, true]}'
     return [{_SUMMARY: text}, {_SUMMARY: b"{}"}]
@@ -102,4 +114,12 @@ SUMMARY = Target(
     words=(b"{", b"}", b"[" * 5000, b"]", b'"a": ', b",", b"NaN", b"Infinity", b"1e999"),
     mutators=(matcher(rb"([\d.]+)", NUMBERS),),
 )
-TARGETS = (METRICS, TABLE, SUMMARY)
+PER_VIEW = Target(
+    name="per-view",
+    seeds=lambda: [{_PER_VIEW: _views()}, {_PER_VIEW: _views() + b"b.jpg,near,,,\n"}],
+    parse=_parse_views,
+    parser={text_files: ("read_json",), per_view: ("write_per_view",)},
+    words=(b",", b"\n", b'"', b"name", b"regime", b"psnr", b"nan", b"inf", b"1_0"),
+    mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
+)
+TARGETS = (METRICS, TABLE, SUMMARY, PER_VIEW)
