@@ -170,7 +170,7 @@ def test_photos_that_the_file_lacks_keep_their_distance(varied, tmp_path, model)
 
 
 WRONG = {
-    "no JSON": (b"{", "is not JSON"),
+    "no JSON": (b"{", "cannot be read"),
     "another file": (b'{"status": "finished"}', "does not hold values"),
     "other photos": (
         b'{"format": 1, "exposure": "gain", "photos": {"x.png": {"stops": 0}}}',
