@@ -9,9 +9,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
-from crossgrad_core.scene import decode, headers, photos, pillow, reduction
+from crossgrad_core.scene import decode, headers, photo_store, photos, pillow, reduction
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.decode import decode_photo
 from crossgrad_core.scene.headers import read_header, read_quarter_turn
@@ -171,6 +172,33 @@ def _sizes(data: bytes) -> list[tuple[int, int, str]]:
     return [(16, 4, "I"), (20, 4, "I"), (24, 1, "I"), (25, 1, "I")]
 
 
+def _kept_seeds() -> Sequence[Case]:
+    rng = np.random.default_rng(0)
+    image = torch.from_numpy(rng.integers(0, 256, (*_SIZE[::-1], 3), dtype=np.uint8))
+    mask = torch.from_numpy(rng.random(_SIZE[::-1]) < 0.5)
+    return [{_PHOTO: b"".join(photo_store._packed((image, each)))} for each in (None, mask)]
+
+
+def _parse_kept(folder: Path) -> None:
+    found = photo_store._read(folder / _PHOTO, *_SIZE)
+    if found is None:
+        return
+    image, mask = found
+    assert image.shape == (*_SIZE[::-1], 3)
+    assert mask is None or mask.shape == _SIZE[::-1]
+    # What is read is what was kept, to the byte.
+    kept = b"".join(photo_store._packed(found))
+    assert (folder / _PHOTO).read_bytes()[: len(kept)] == kept
+
+
+def _mended(data: bytes, rng: random.Random) -> bytes:
+    """Other bits behind a checksum that fits."""
+    content = bytearray(data[12:])
+    for _ in range(rng.randrange(4) if content else 0):
+        content[rng.randrange(len(content))] = rng.randrange(256)
+    return data[:8] + zlib.crc32(content).to_bytes(4, "little") + bytes(content)
+
+
 _FORMAT: tuple[Mutator, ...] = (_png_chunks, at_offsets(_sizes))
 _WORDS = (
     *(b"\xff\xd8", b"\xff\xd9", b"\xff\xda", b"\xff\xc0", b"\xff\xc2", b"Exif\0\0"),
@@ -196,4 +224,13 @@ PIXELS = Target(
     mutators=_FORMAT,
     quiet=False,
 )
-TARGETS = (HEADERS, PIXELS)
+KEPT = Target(
+    name="kept-photos",
+    seeds=_kept_seeds,
+    parse=_parse_kept,
+    parser={
+        photo_store: tuple(name for name in vars(photo_store) if name not in {"_read", "_packed"}),
+    },
+    mutators=(_mended,),
+)
+TARGETS = (HEADERS, PIXELS, KEPT)
