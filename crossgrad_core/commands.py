@@ -20,7 +20,7 @@ from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
-from crossgrad_core.system.interrupts import exit_code, listened_to, tell
+from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce, finish
 from crossgrad_core.system.tables import table_bytes, write_table
@@ -115,6 +115,7 @@ __all__ = [
     "take_steps",
     "tell",
     "view_gradients",
+    "way_on",
     "with_steps",
     "write_atomically",
     "write_mapping",

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Final
 import typer
 
 from crossgrad_core.cli.resuming import refuse_beside_resume
-from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS
+from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCENE
+from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.startup import announce
 
@@ -62,6 +63,14 @@ _RESUMING: Final = (
     ),
 )
 _LAST: Final = (
+    _own(
+        "prepare",
+        bool,
+        "--prepare",
+        heading=SCENE,
+        help="SCENE is a folder of photos alone: finds their cameras first, as `crossgrad prepare` "
+        "does, into SCENE-scene.",
+    ),
     _own(
         "dry_run",
         bool,
@@ -131,6 +140,8 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     from crossgrad_core.run.settings import merged
 
     settings = {option.name: given[option.name] for option in OPTIONS}
+    if given["prepare"]:
+        settings["reader"] = settings["reader"] or PREPARING_READER
     wanted = merged(given["config"], settings, given["assignments"] or [])
 
     from crossgrad_core.run import app

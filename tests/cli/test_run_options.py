@@ -15,7 +15,10 @@ from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.run.settings import merged
 
 #: What is no setting: asked of one start of the command.
-OWN = {"config", "assignments", "resume", "accept_scene", "dry_run", "check", "quiet", "verbose"}
+OWN = {
+    *("config", "assignments", "resume", "accept_scene", "prepare"),
+    *("dry_run", "check", "quiet", "verbose"),
+}
 PARAMETERS = {each.name: each for each in get_command(app).commands["run"].params}
 
 

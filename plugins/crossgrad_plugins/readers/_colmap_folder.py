@@ -113,9 +113,9 @@ def _no_model(scene: Path) -> UserError:
         expected="images/ with the photos and sparse/0/ with cameras, images and points3D, as .bin "
         "or .txt",
         found=", ".join(below[:8]) or "an empty folder",
-        todo="name the folder that holds sparse/, or estimate the poses with pycolmap, which is "
-        "installed with crossgrad: extract_features, match_exhaustive, incremental_mapping "
-        "(docs/photos.md has the lines); docs/readers.md lists the other formats of poses",
+        todo="name the folder that holds sparse/; of photos alone `crossgrad prepare PHOTOS SCENE` "
+        "makes a scene, and `crossgrad run PHOTOS --prepare` trains on it at once "
+        "(docs/prepare.md); docs/readers.md lists the other formats of poses",
     )
 
 

@@ -1,0 +1,1 @@
+"""`crossgrad prepare`: from a folder of photos to a scene that `crossgrad run` reads."""

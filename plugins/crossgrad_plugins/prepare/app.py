@@ -1,0 +1,106 @@
+"""From photos to a scene, stage by stage; each goes on where it was interrupted."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from time import monotonic
+from typing import TypeVar
+
+from crossgrad_core.commands import (
+    Progress,
+    available_cores,
+    disk_errors,
+    locked,
+    way_on,
+    write_atomically,
+)
+from crossgrad_plugins.prepare import mapping, matching
+from crossgrad_plugins.prepare.features import found_features
+from crossgrad_plugins.prepare.layout import Layout, check_ours
+from crossgrad_plugins.prepare.photos import find_photos
+from crossgrad_plugins.prepare.picture import draw
+from crossgrad_plugins.prepare.plan import Plan, Settings, agreed
+from crossgrad_plugins.prepare.report import Report, data_of, page_of, summary_lines
+from crossgrad_plugins.prepare.results import placed
+from crossgrad_plugins.prepare.undistortion import write_scene
+
+T = TypeVar("T")
+_PAUSE = 5.0
+
+
+def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | None) -> None:
+    """Makes a scene of a folder of photos, and prints what was found.
+
+    Raises:
+        UserError: As `prepared`.
+    """
+    report = prepared(photos, scene, settings, threads)
+    for line in summary_lines(report):
+        print(line)  # noqa: T201 - the result of the command
+    print(f"scene in {scene}; the report is {scene / 'report.md'}")  # noqa: T201
+    print(f"next: crossgrad run {scene}")  # noqa: T201
+
+
+def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:
+    """Makes a scene of a folder of photos, or what is missing of it.
+
+    Args:
+        photos: Folder of the photos.
+        scene: Folder of the scene.
+        settings: What the user chose.
+        threads: CPU threads; None for all there are.
+
+    Raises:
+        UserError: There are no photos, the folder of the scene is something else's, nothing fits
+            together, or the disk is full.
+    """
+    layout = Layout(scene)
+    check_ours(layout, photos)
+    plan = _planned(photos, settings)
+    with disk_errors(layout.work):
+        layout.work.mkdir(parents=True, exist_ok=True)
+    with locked(scene, "preparing"), way_on("the same command goes on where this one ended"):
+        return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))
+
+
+def _planned(photos: Path, settings: Settings) -> Plan:
+    """The photos and what their files say."""
+    progress = Progress(_PAUSE)
+    used, left_out = find_photos(
+        photos, settings, lambda done, of: progress.tell(f"looking at photos: {done} of {of}")
+    )
+    root = str(photos.resolve())
+    return Plan(photos=root, settings=settings, used=used, left_out=left_out)
+
+
+def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
+    """All stages."""
+    features = _timed("features", lambda: found_features(layout, plan, threads))
+    links = _timed("matches", lambda: matching.found_links(layout, plan, threads))
+    models = _timed("poses", lambda: mapping.found_models(layout, plan, threads))
+    result = _timed("place", lambda: placed(layout, plan, models))
+    ways = matching.way_of(plan), mapping.way_of(plan)
+    report = Report(plan, features, links, result, ways)
+    _timed("photos", lambda: write_scene(layout, plan, threads))
+    _write_report(layout, report)
+    return report
+
+
+def _timed(what: str, stage: Callable[[], T]) -> T:
+    begun = monotonic()
+    found = stage()
+    Progress().tell(f"{what}: {monotonic() - begun:.0f} s")
+    return found
+
+
+def _write_report(layout: Layout, report: Report) -> None:
+    """Writes what else is in the scene's folder; the data last, which says that all is there."""
+    import pycolmap
+
+    if report.result.georef is not None:
+        content = json.dumps(report.result.georef, indent=1)
+        write_atomically(layout.georef, content.encode())
+    picture = draw(report, pycolmap.Reconstruction(layout.placed))
+    write_atomically(layout.scene / "report.png", picture)
+    write_atomically(layout.scene / "report.md", page_of(report).encode())
+    write_atomically(layout.report, json.dumps(data_of(report), indent=1).encode())

@@ -1,0 +1,148 @@
+"""Features of all photos, in COLMAP's database."""
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.commands import available_memory, write_atomically
+from crossgrad_plugins.prepare.earth import local_positions
+from crossgrad_plugins.prepare.layout import Layout
+from crossgrad_plugins.prepare.plan import Photo, Plan
+from crossgrad_plugins.prepare.waiting import quiet, rows_of, waited
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Features are found in photos with their longest side reduced to so many pixels (COLMAP).
+LONGEST: Final = 3200
+#: Bytes that SIFT takes for a pixel of the photo, which it looks at at twice its size: measured
+#: 290 (docs/prepare.md). And the share of the free memory that all threads together may take.
+_BYTES_PER_PIXEL, _SHARE = 320, 0.6
+
+
+def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
+    """How many features each photo has, found and kept in the database; 0 where it was unreadable.
+
+    Photos that are done are not looked at again.
+
+    Raises:
+        UserError: The disk is full, or pycolmap failed.
+    """
+    if layout.features.is_file():
+        return dict(json.loads(layout.features.read_bytes()))
+    import pycolmap
+
+    if not layout.database.is_file():
+        _make_database(layout, plan)
+    total = len(plan.used)
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = min(plan.settings.max_size or LONGEST, LONGEST)
+    options.num_threads = _threads(plan.used, options.max_image_size, threads)
+    options.sift.max_num_features = plan.settings.max_features
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = plan.settings.lens
+    names = [photo.name for photo in plan.used]
+    waited(
+        "finding features",
+        lambda token: pycolmap.extract_features(
+            layout.database, Path(plan.photos), names, reader_options=reading,
+            extraction_options=options, device=pycolmap.Device.cpu, cancellation_token=token,
+        ),
+        lambda: f"{rows_of(layout.database, 'descriptors')} of {total} photos",
+    )  # fmt: skip
+    counts = _counts(layout.database)
+    found = {name: counts.get(name, 0) for name in names}
+    write_atomically(layout.features, json.dumps(found, indent=1).encode())
+    return found
+
+
+def _threads(photos: Sequence[Photo], longest: int, threads: int) -> int:
+    """How many photos are looked at at once, such that memory suffices."""
+    pixels = max(_pixels(photo, longest) for photo in photos)
+    free = available_memory()
+    if free is None:
+        return threads
+    return max(1, min(threads, int(_SHARE * free / (_BYTES_PER_PIXEL * pixels))))
+
+
+def _pixels(photo: Photo, longest: int) -> float:
+    scale = min(1.0, longest / max(photo.width, photo.height))
+    return photo.width * photo.height * scale**2
+
+
+def _make_database(layout: Layout, plan: Plan) -> None:
+    """The database with the cameras, the photos and where they were taken, but no features."""
+    import pycolmap
+
+    scratch = layout.database.with_name(f".{layout.database.name}.tmp")
+    scratch.unlink(missing_ok=True)
+    shared: Mapping[str, list[Photo]] = defaultdict(list)
+    for photo in plan.used:
+        shared[photo.camera].append(photo)
+    positions = local_positions(plan)
+    with quiet():
+        database = pycolmap.Database.open(scratch)
+        with pycolmap.DatabaseTransaction(database):
+            for photos in shared.values():
+                _write_camera(database, plan, photos, positions)
+        database.close()
+    scratch.replace(layout.database)
+
+
+def _write_camera(
+    database: "pycolmap.Database",
+    plan: Plan,
+    photos: Sequence[Photo],
+    positions: Mapping[str, NDArray[np.float64]],
+) -> None:
+    """Writes photos that share a calibration."""
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = plan.settings.lens
+    camera = pycolmap.infer_camera_from_image(Path(plan.photos) / photos[0].name, reading)
+    camera_id = database.write_camera(camera)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera_id))
+    rig_id = database.write_rig(rig)
+    for photo in photos:
+        image_id = database.write_image(pycolmap.Image(name=photo.name, camera_id=camera_id))
+        data = database.read_image(image_id).data_id
+        frame = pycolmap.Frame()
+        frame.rig_id = rig_id
+        frame.add_data_id(data)
+        database.write_frame(frame)
+        if photo.name in positions:
+            _write_position(database, data, positions[photo.name])
+
+
+def _write_position(
+    database: "pycolmap.Database", data: "pycolmap.data_t", position: NDArray[np.float64]
+) -> None:
+    """Writes a place in the local frame, east, north, up: large coordinates lose digits."""
+    import pycolmap
+
+    system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+    database.write_pose_prior(
+        pycolmap.PosePrior(corr_data_id=data, position=position, coordinate_system=system)
+    )
+
+
+def _counts(path: Path) -> dict[str, int]:
+    """Features of each photo that has any."""
+    import pycolmap
+
+    with quiet():
+        database = pycolmap.Database.open(path)
+        try:
+            return {
+                image.name: database.num_keypoints_for_image(image.image_id)
+                for image in database.read_all_images()
+            }
+        finally:
+            database.close()

@@ -1,0 +1,134 @@
+"""The folder of a scene that is prepared: what is where, and whose folder it is."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.commands import UserError, check_folder, disk_errors
+
+#: The folder of what is needed on the way, and the file that says that `prepare` made it.
+WORK: Final = "prepare"
+PLAN: Final = "plan.json"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything is; each thing has its name only when it is complete.
+
+    Attributes:
+        scene: The scene's folder.
+    """
+
+    scene: Path
+
+    @property
+    def work(self) -> Path:
+        """What is needed on the way."""
+        return self.scene / WORK
+
+    @property
+    def plan(self) -> Path:
+        """The photos and settings; says that the folder is ours."""
+        return self.work / PLAN
+
+    @property
+    def database(self) -> Path:
+        """Cameras, features and matches, in COLMAP's form."""
+        return self.work / "database.db"
+
+    @property
+    def features(self) -> Path:
+        """How many features each photo has; there when all are found."""
+        return self.work / "features.json"
+
+    @property
+    def links(self) -> Path:
+        """The pairs of photos with verified matches; there when all pairs are compared."""
+        return self.work / "links.json"
+
+    @property
+    def models(self) -> Path:
+        """One folder for each model, distorted as the photos are; there when mapping is done."""
+        return self.work / "models"
+
+    @property
+    def placed(self) -> Path:
+        """The model of the scene, in its place on Earth where that is known."""
+        return self.work / "placed"
+
+    @property
+    def images(self) -> Path:
+        """The undistorted photos."""
+        return self.scene / "images"
+
+    @property
+    def masks(self) -> Path:
+        """The undistorted masks."""
+        return self.scene / "masks"
+
+    @property
+    def model(self) -> Path:
+        """The model of the undistorted photos; there when the scene is complete."""
+        return self.scene / "sparse" / "0"
+
+    @property
+    def georef(self) -> Path:
+        """The scene's place on Earth."""
+        return self.scene / "georef.json"
+
+    @property
+    def report(self) -> Path:
+        """The report as data; written last."""
+        return self.scene / "report.json"
+
+
+def check_ours(layout: Layout, photos: Path) -> None:
+    """Refuses a folder that `prepare` did not make, and one that lies where the photos are.
+
+    Raises:
+        UserError: What is in the way, and what to do.
+    """
+    scene = layout.scene
+    check_folder(scene)
+    inside = scene.resolve()
+    if inside == photos.resolve() or photos.resolve() in inside.parents:
+        raise UserError(
+            "the scene would lie among the photos",
+            where=scene,
+            expected=f"a folder outside {photos}",
+            todo=f"name another one, such as {photos.resolve()}-scene",
+        )
+    if layout.plan.is_file() or not scene.is_dir():
+        return
+    # Only the lock, and what a process that was killed at once left of the plan.
+    left = [path for path in scene.iterdir() if path.name not in {WORK, "run.lock"}]
+    if left or (layout.work.is_dir() and any(not _is_hidden(p) for p in layout.work.iterdir())):
+        raise UserError(
+            "the folder holds something else than a scene of crossgrad prepare",
+            where=scene,
+            expected="a new folder, an empty one, or one that prepare made",
+            found=", ".join(sorted(path.name for path in scene.iterdir())[:5]),
+            todo="choose another folder, or remove it",
+        )
+
+
+def _is_hidden(path: Path) -> bool:
+    return path.name.startswith(".")
+
+
+def emptied(folder: Path) -> Path:
+    """The folder, new and empty.
+
+    Raises:
+        UserError: The disk is full, or the folder may not be written to.
+    """
+    with disk_errors(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    return folder
+
+
+def scratch_of(path: Path) -> Path:
+    """Where a folder is made before it gets its name."""
+    return path.with_name(f".{path.name}.tmp")

@@ -1,0 +1,109 @@
+"""From matches to poses and points: one model, or several where photos cannot be joined."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
+from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.waiting import quiet, waited
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: From so many photos on all poses are found at once.
+MANY: Final = 100
+#: A model of fewer photos is none.
+_SMALLEST: Final = 3
+
+Models = Mapping[int, "pycolmap.Reconstruction"]
+
+
+def way_of(plan: Plan) -> str:
+    """How poses are found."""
+    if plan.settings.mapper != "auto":
+        return plan.settings.mapper
+    return "incremental" if len(plan.used) < MANY else "global"
+
+
+def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Reconstruction]":
+    """The models, that with most photos first.
+
+    Raises:
+        UserError: No two photos could be brought together, or pycolmap failed.
+    """
+    if not layout.models.is_dir():
+        scratch = emptied(scratch_of(layout.models))
+        below = emptied(scratch / "found")
+        waited_for = _incremental if way_of(plan) == "incremental" else _global
+        models = waited_for(layout, plan, threads, below)
+        if not models:
+            raise _nothing(layout, plan)
+        ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
+        with quiet():
+            for number, model in enumerate(ordered):
+                place = emptied(scratch / str(number))
+                model.write(place)
+        for path in sorted(below.rglob("*"), reverse=True):
+            path.rmdir() if path.is_dir() else path.unlink()
+        below.rmdir()
+        scratch.replace(layout.models)
+    return [model for _, model in read_models(layout.models)]
+
+
+def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]":
+    """The models of a folder in the order of their numbers."""
+    import pycolmap
+
+    for path in sorted(folder.iterdir(), key=lambda path: int(path.name)):
+        with quiet():
+            yield path, pycolmap.Reconstruction(path)
+
+
+def _incremental(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.min_model_size = _SMALLEST
+    posed = itertools.count(2)
+    latest = [2]
+
+    def one_more() -> None:
+        latest[0] = next(posed)
+
+    return waited(
+        "finding cameras",
+        lambda token: dict(pycolmap.incremental_mapping(
+            layout.database, Path(plan.photos), out, options=options,
+            next_image_callback=one_more, cancellation_token=token,
+        )),
+        lambda: f"{latest[0]} of {len(plan.used)} photos",
+    )  # fmt: skip
+
+
+def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.mapper.num_threads, options.mapper.random_seed = threads, 0
+    options.min_model_size = _SMALLEST
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    call: Callable[[object], Models] = lambda _: dict(  # noqa: E731 - it cannot be cancelled
+        pycolmap.global_mapping(layout.database, Path(plan.photos), out, options=options)
+    )
+    return waited("finding cameras", call, lambda: f"{len(plan.used)} photos at once")
+
+
+def _nothing(layout: Layout, plan: Plan) -> UserError:
+    return UserError(
+        "no camera could be found: no photos fit together",
+        where=plan.photos,
+        expected="photos that overlap by more than half, taken from different places",
+        found=f"{len(plan.used)} photos; the pairs that match are in {layout.links}",
+        todo="add photos between those that there are, or choose another --lens or --matching",
+    )

@@ -1,0 +1,171 @@
+"""Which photos show the same: pairs with matches that one epipolar geometry explains."""
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from crossgrad_core.commands import write_atomically
+from crossgrad_plugins.prepare.layout import Layout
+from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.retrieval import index_of
+from crossgrad_plugins.prepare.waiting import quiet, rows_of, waited
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Up to so many photos all pairs are compared; without GPS, up to the second.
+_FEW, _SOME = 60, 100
+#: Share of the photos that need GPS for neighbours to be told by it.
+_MOST_LOCATED: Final = 0.9
+#: Photos that each one is compared with: the nearest by GPS, the most alike, the next by name.
+_NEAREST, _ALIKE, _NEXT = 40, 40, 5
+#: Next by name where nothing else tells neighbours.
+_NEXT_ALONE: Final = 20
+#: Neighbours by GPS are not farther away, in metres: GPS that is wrong finds none.
+_FARTHEST: Final = 500.0
+#: Features of a photo by which others like it are looked up, at most.
+_LOOKED_UP: Final = 2000
+#: How photos to compare are chosen -> pycolmap's ways that this takes.
+_WAYS: Final = {
+    "exhaustive": ("exhaustive",),
+    "spatial": ("spatial", "sequential"),
+    "retrieval": ("vocabtree", "sequential"),
+    "sequential": ("sequential",),
+}
+
+
+@dataclass(frozen=True)
+class Link:
+    """Two photos that show the same.
+
+    Attributes:
+        first: Name of one.
+        second: Name of the other.
+        matches: Matches that their epipolar geometry explains.
+    """
+
+    first: str
+    second: str
+    matches: int
+
+
+def way_of(plan: Plan) -> str:
+    """How photos to compare are chosen."""
+    chosen, photos = plan.settings.matching, len(plan.used)
+    if chosen != "auto":
+        return chosen
+    if photos <= _FEW:
+        return "exhaustive"
+    if len(plan.located) >= _MOST_LOCATED * photos:
+        return "spatial"
+    return "exhaustive" if photos <= _SOME else "retrieval"
+
+
+def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
+    """The pairs with verified matches; pairs that are done are not compared again.
+
+    Raises:
+        UserError: The disk is full, or pycolmap failed.
+    """
+    if layout.links.is_file():
+        return tuple(Link(*row) for row in json.loads(layout.links.read_bytes()))
+    way = way_of(plan)
+    pairings = {each: _pairing(each, layout, way, threads) for each in _WAYS[way]}
+    total = _pairs(layout, pairings)
+    for each, pairing in pairings.items():
+        waited(
+            "comparing photos",
+            lambda token, each=each, pairing=pairing: _match(  # type: ignore[misc]
+                layout, each, pairing, threads, token
+            ),
+            lambda: f"{rows_of(layout.database, 'two_view_geometries')}{total} pairs ({way})",
+        )
+    links = _read(layout)
+    rows = [[link.first, link.second, link.matches] for link in links]
+    write_atomically(layout.links, json.dumps(rows).encode())
+    return links
+
+
+def _match(
+    layout: Layout,
+    way: str,
+    pairing: object,
+    threads: int,
+    token: "pycolmap.CancellationToken",
+) -> None:
+    import pycolmap
+
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads = threads
+    # Each pair by itself: the same in whatever order, and after whatever interruption.
+    verification.ransac.random_seed = 0
+    compare = getattr(pycolmap, f"match_{way}")
+    compare(
+        layout.database, matching_options=matching, pairing_options=pairing,
+        verification_options=verification, device=pycolmap.Device.cpu, cancellation_token=token,
+    )  # fmt: skip
+
+
+def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
+    """Pycolmap's options for one of its ways to choose pairs."""
+    import pycolmap
+
+    options: Any
+    if each == "spatial":
+        options = pycolmap.SpatialPairingOptions()
+        # Photos from the ground are neighbours of those from above them.
+        options.ignore_z = True
+        options.max_num_neighbors, options.max_distance = _NEAREST, _FARTHEST
+    elif each == "vocabtree":
+        options = pycolmap.VocabTreePairingOptions()
+        options.vocab_tree_path = index_of(layout, threads)
+        options.num_images, options.max_num_features = _ALIKE, _LOOKED_UP
+        options.num_threads = threads
+    elif each == "sequential":
+        options = pycolmap.SequentialPairingOptions()
+        options.overlap = _NEXT_ALONE if way == "sequential" else _NEXT
+    else:
+        options = pycolmap.ExhaustivePairingOptions()
+    return options
+
+
+def _pairs(layout: Layout, pairings: dict[str, object]) -> str:
+    """How many pairs will be compared, as " of 378"; empty where it takes long to know."""
+    import pycolmap
+
+    kinds: dict[str, Any] = {
+        "exhaustive": pycolmap.ExhaustivePairGenerator,
+        "spatial": pycolmap.SpatialPairGenerator,
+        "sequential": pycolmap.SequentialPairGenerator,
+    }
+    if not pairings.keys() <= kinds.keys():
+        return ""
+    with quiet():
+        database = pycolmap.Database.open(layout.database)
+        try:
+            pairs = [
+                tuple(sorted(pair))
+                for way, pairing in pairings.items()
+                for pair in kinds[way](pairing, database).all_pairs()
+            ]
+        finally:
+            database.close()
+    return f" of {len({pair for pair in pairs if pair[0] != pair[1]})}"
+
+
+def _read(layout: Layout) -> tuple[Link, ...]:
+    import pycolmap
+
+    with quiet():
+        database = pycolmap.Database.open(layout.database)
+        try:
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            pairs, counts = database.read_two_view_geometry_num_inliers()
+        finally:
+            database.close()
+    found = []
+    for pair, count in zip(pairs, counts, strict=True):
+        one, other = sorted(names[each] for each in pycolmap.pair_id_to_image_pair(pair))
+        if count:
+            found.append(Link(one, other, int(count)))
+    return tuple(sorted(found, key=lambda link: (link.first, link.second)))

@@ -1,0 +1,201 @@
+"""The report on a prepared scene: as data, in words, and as a picture."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, Final
+
+from crossgrad_core.commands import VERSION
+from crossgrad_plugins.prepare.findings import (
+    Bridge,
+    Join,
+    Lost,
+    bridges_of,
+    joins_of,
+    lost_photos,
+    parts_of,
+)
+from crossgrad_plugins.prepare.matching import Link
+from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.results import Result
+
+#: Version of report.json.
+FORMAT: Final = 1
+#: How many lines of one kind are printed; the files have all of them.
+_SHOWN: Final = 8
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is known of a prepared scene.
+
+    Attributes:
+        plan: Photos and settings.
+        features: Name -> number of features.
+        links: Pairs with verified matches.
+        result: What is in the scene.
+        ways: How photos were compared, and how poses were found.
+    """
+
+    plan: Plan
+    features: Mapping[str, int]
+    links: Sequence[Link]
+    result: Result
+    ways: tuple[str, str]
+
+    @property
+    def posed(self) -> frozenset[str]:
+        """Names of the photos in the scene."""
+        return frozenset().union(*(part.photos for part in self.result.parts if part.joined))
+
+    @property
+    def lost(self) -> tuple[Lost, ...]:
+        """The photos that are not in the scene."""
+        return lost_photos(self.plan, self.features, self.links, self.posed)
+
+    @property
+    def joins(self) -> tuple[Join, ...]:
+        """What joins the folders."""
+        return joins_of(self.plan, self.links)
+
+    @property
+    def bridges(self) -> tuple[Bridge, ...]:
+        """Where photos are missing."""
+        parts = parts_of(self.plan, [frozenset(part.photos) for part in self.result.parts])
+        return bridges_of(self.plan, self.links, parts, self.heights)
+
+    @property
+    def heights(self) -> dict[str, float]:
+        """Name -> metres above ground, where that is known."""
+        return {
+            name: height
+            for part in reversed(self.result.parts)
+            for name, height in part.heights.items()
+        }
+
+
+def data_of(report: Report) -> dict[str, Any]:
+    """The report as data."""
+    plan, posed = report.plan, report.posed
+    found = report.result.figures
+    parts = [
+        {"photos": len(part.photos), "points": part.points, "reprojection_error_px": part.error,
+         "in_the_scene": part.joined, "not_on_earth_because": part.unplaced}
+        for part in report.result.parts
+    ]  # fmt: skip
+    return {
+        "format": FORMAT,
+        "crossgrad": VERSION,
+        "photos": plan.photos,
+        "settings": plan.settings.model_dump(),
+        "matching": report.ways[0],
+        "mapper": report.ways[1],
+        "used": len(plan.used),
+        "registered": len(posed),
+        "left_out": [each.model_dump() for each in plan.left_out],
+        "unregistered": [asdict(each) for each in report.lost],
+        "model": found,
+        "models": parts,
+        "folders": [_folder(report, name) for name in plan.folders],
+        "joins": [asdict(each) for each in report.joins],
+        "bridges": [asdict(each) for each in report.bridges],
+        "gps": None if report.result.georef is None else report.result.georef["residuals_m"],
+        "gps_photos": len(plan.located),
+    }
+
+
+def _folder(report: Report, name: str) -> dict[str, Any]:
+    photos = [photo.name for photo in report.plan.used if photo.folder == name]
+    heights = [report.heights[each] for each in photos if each in report.heights]
+    return {
+        "folder": name,
+        "photos": len(photos),
+        "registered": sum(each in report.posed for each in photos),
+        "features": median(report.features[each] for each in photos),
+        "height_m": median(heights) if heights else None,
+    }
+
+
+def summary_lines(report: Report) -> list[str]:
+    """What is printed when the scene is ready."""
+    return [*_in_short(report), *_missing(report, _SHOWN)]
+
+
+def _in_short(report: Report) -> Iterator[str]:
+    figures = report.result.figures
+    yield (
+        f"{len(report.posed)} of {len(report.plan.used)} photos have a pose; "
+        f"{figures['points']:,.0f} points, mean reprojection error "
+        f"{figures['reprojection_error_px']:.2f} pixels"
+    )
+    for name in report.plan.folders if len(report.plan.folders) > 1 else ():
+        row = _folder(report, name)
+        height = "" if row["height_m"] is None else f", {row['height_m']:.0f} m above ground"
+        yield f"  {name or '(no folder)'}: {row['registered']} of {row['photos']}{height}"
+    yield from _gps(report)
+
+
+def _gps(report: Report) -> Iterator[str]:
+    georef, located = report.result.georef, len(report.plan.located)
+    if georef is not None:
+        found = georef["residuals_m"]
+        yield (
+            f"GPS: {found['photos']} photos, {found['agreeing']} agree; residuals "
+            f"{found['rms_horizontal']:.2f} m horizontally and {found['rms_vertical']:.2f} m "
+            f"vertically (root mean square), at most {found['max']:.2f} m"
+        )
+    elif located:
+        yield f"GPS: {located} photos have it, but {report.result.parts[0].unplaced}"
+    else:
+        yield "GPS: no photo has it; scale and direction of the scene are arbitrary"
+
+
+def _missing(report: Report, most: int) -> Iterator[str]:
+    parts = report.result.parts
+    others = [part for part in parts[1:] if not part.joined]
+    joined = [part for part in parts[1:] if part.joined]
+    if joined:
+        yield (
+            f"{len(joined) + 1} models are joined by GPS alone: expect them to be off by as much "
+            "as GPS is, and take photos between them for more"
+        )
+    if others:
+        sizes = ", ".join(str(len(part.photos)) for part in others)
+        yield f"not joined to the scene: {len(others)} other models of {sizes} photos"
+    for bridge in report.bridges:
+        yield f"a bridge is missing ({bridge.pairs} pairs match across): {bridge.advice}"
+    yield from _some([f"no pose: {each.name}: {each.why}" for each in report.lost], most)
+    yield from _some([f"left out: {e.name}: {e.why}" for e in report.plan.left_out], most)
+
+
+def _some(lines: Sequence[str], most: int) -> Iterator[str]:
+    yield from lines[:most]
+    if len(lines) > most:
+        yield f"... and {len(lines) - most} more of these, in report.md"
+
+
+def page_of(report: Report) -> str:
+    """The report in words, as Markdown."""
+    plan = report.plan
+    everything = len(plan.used) + len(plan.left_out)
+    lines = ["# From photos to a scene", "", f"Photos: `{plan.photos}`. Compared: {report.ways[0]}."
+             f" Poses: {report.ways[1]}.", "", *(f"- {line}" for line in _in_short(report)),
+             *(f"- {line}" for line in _missing(report, everything)), "",
+             "![Where the photos were taken](report.png)", "", "## Folders", "",
+             "| folder | photos | with a pose | features (median) | metres above ground |",
+             "|---|---|---|---|---|"]  # fmt: skip
+    for name in plan.folders:
+        row = _folder(report, name)
+        height = "" if row["height_m"] is None else f"{row['height_m']:.1f}"
+        lines.append(f"| {name or '(no folder)'} | {row['photos']} | {row['registered']} | "
+                     f"{row['features']:.0f} | {height} |")  # fmt: skip
+    lines += [
+        "",
+        "## Verified matches",
+        "",
+        "| between | and | pairs | matches |",
+        "|---|---|---|---|",
+    ]
+    lines += [f"| {join.first or '(no folder)'} | {join.second or '(no folder)'} | {join.pairs} | "
+              f"{join.matches} |" for join in report.joins]  # fmt: skip
+    return "\n".join([*lines, ""])

@@ -1,0 +1,154 @@
+"""The model that becomes the scene: chosen, placed on Earth, joined with others where GPS can."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.commands import write_atomically
+from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
+from crossgrad_plugins.prepare.placing import Placement, centers_of, merged, placement_of
+from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.waiting import quiet
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_FILE: Final = "placed.json"
+#: The ground is where so many of all points lie below, in percent.
+_GROUND: Final = 5.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """A model as mapping found it.
+
+    Attributes:
+        photos: Names of its photos.
+        points: Number of its points.
+        error: Mean reprojection error in pixels.
+        unplaced: Why it has no place on Earth; empty where it has one.
+        joined: Whether it is in the scene: the largest is, and those that GPS joins to it.
+        heights: Name -> metres above ground; empty where it has no place on Earth.
+    """
+
+    photos: tuple[str, ...]
+    points: int
+    error: float
+    unplaced: str
+    joined: bool
+    heights: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is in the scene.
+
+    Attributes:
+        parts: The models, the largest first.
+        georef: Where the scene lies on Earth, as in georef.json; None where that is not known.
+        figures: Registered photos, points, observations, errors of the scene's model.
+    """
+
+    parts: tuple[Part, ...]
+    georef: dict[str, Any] | None
+    figures: dict[str, float]
+
+
+def placed(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> Result:
+    """Places the models, joins those that can be, and writes the model of the scene.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    if not layout.placed.is_dir():
+        _place(layout, plan, models)
+    found = json.loads((layout.placed / _FILE).read_bytes())
+    return Result(tuple(Part(**part) for part in found["parts"]), found["georef"], found["figures"])
+
+
+def _place(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> None:
+    positions = local_positions(plan)
+    found = [placement_of(model, positions) for model in models]
+    for model, (placement, _) in zip(models, found, strict=True):
+        if placement is not None:
+            model.transform(placement.similarity)
+    on_earth = found[0][0] is not None
+    joined = [i == 0 or (on_earth and each is not None) for i, (each, _) in enumerate(found)]
+    others = [model for model, inside in zip(models[1:], joined[1:], strict=True) if inside]
+    whole = merged(models[0], others) if others else models[0]
+    whole.update_point_3d_errors()
+    parts = [
+        _part(model, placement, why, inside)
+        for model, (placement, why), inside in zip(models, found, joined, strict=True)
+    ]
+    placements = [each for (each, _), inside in zip(found, joined, strict=True) if inside and each]
+    result = {
+        "parts": [vars(part) for part in parts],
+        "georef": _georef(plan, placements) if on_earth else None,
+        "figures": _figures(whole),
+    }
+    scratch = emptied(scratch_of(layout.placed))
+    with quiet():
+        whole.write(scratch)
+    write_atomically(scratch / _FILE, json.dumps(result).encode())
+    scratch.replace(layout.placed)
+
+
+def _part(
+    model: "pycolmap.Reconstruction", placement: Placement | None, why: str, joined: bool
+) -> Part:
+    names = tuple(sorted(model.image(number).name for number in model.reg_image_ids()))
+    error = float(model.compute_mean_reprojection_error())
+    heights = {} if placement is None else _heights(model)
+    return Part(names, model.num_points3D(), error, why, joined, heights)
+
+
+def _heights(model: "pycolmap.Reconstruction") -> dict[str, float]:
+    """Name -> metres above ground of each photo of a model in a frame whose z is up."""
+    points: NDArray[np.float64] = np.array([point.xyz for point in model.points3D.values()])
+    if not len(points):
+        return {}
+    ground = float(np.percentile(points[:, 2], _GROUND))
+    return {name: float(center[2]) - ground for name, center in centers_of(model).items()}
+
+
+def _figures(model: "pycolmap.Reconstruction") -> dict[str, float]:
+    return {
+        "registered": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "track_length": float(model.compute_mean_track_length()),
+        "reprojection_error_px": float(model.compute_mean_reprojection_error()),
+    }
+
+
+def _georef(plan: Plan, placements: Sequence[Placement]) -> dict[str, Any]:
+    """The scene's place on Earth: its frame is east, north, up of the origin, in metres."""
+    origin = origin_of(plan)
+    assert origin is not None
+    residuals = {name: each for found in placements for name, each in found.residuals.items()}
+    lengths = np.array([np.linalg.norm(each) for each in residuals.values()])
+    level = np.array([np.linalg.norm(each[:2]) for each in residuals.values()])
+    height = np.array([abs(each[2]) for each in residuals.values()])
+    agreeing = frozenset[str]().union(*(found.agreeing for found in placements))
+    return {
+        "origin": origin.model_dump(),
+        "transform": np.eye(4).tolist(),
+        "frame": "scene -> metres east, north, up of the origin (WGS 84)",
+        "residuals_m": {
+            "photos": len(lengths),
+            "agreeing": len(agreeing),
+            "median": float(np.median(lengths)),
+            "rms": float(np.sqrt(np.mean(lengths**2))),
+            "max": float(lengths.max()),
+            "rms_horizontal": float(np.sqrt(np.mean(level**2))),
+            "rms_vertical": float(np.sqrt(np.mean(height**2))),
+            "per_photo": {name: [round(float(v), 3) for v in each]
+                          for name, each in sorted(residuals.items())},
+        },
+    }  # fmt: skip

@@ -1,0 +1,117 @@
+"""Photos, masks and the model without lens distortion: the scene as `crossgrad run` reads it."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crossgrad_core.commands import disk_errors
+from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
+from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.waiting import quiet, waited
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Photos that are undistorted between two looks at what is done.
+_BATCH: Final = 32
+_QUALITY: Final = 95
+_HALF: Final = 128
+
+
+def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
+    """Writes the undistorted photos, their masks and, when all are there, the model.
+
+    Raises:
+        UserError: The disk is full, or pycolmap failed.
+    """
+    if layout.model.is_dir():
+        return
+    import pycolmap
+
+    with quiet():
+        model = pycolmap.Reconstruction(layout.placed)
+    images = [model.image(number) for number in model.reg_image_ids()]
+    names = sorted(image.name for image in images)
+    work = scratch_of(layout.work / "undistorted")
+    done = [name for name in names if (layout.images / name).is_file()]
+    left = [name for name in names if name not in set(done)]
+    for start in range(0, max(1, len(left)), _BATCH):
+        batch = left[start : start + _BATCH] or names[:1]
+        _undistort(layout, plan, batch, threads, f"{len(done) + start} of {len(names)} photos")
+        for name in batch:
+            _moved(work / "images" / name, layout.images / name)
+    _write_masks(layout, plan, model)
+    layout.model.parent.mkdir(exist_ok=True)
+    with disk_errors(layout.model):
+        (work / "sparse").replace(layout.model)
+    shutil.rmtree(work)
+
+
+def _undistort(layout: Layout, plan: Plan, names: Sequence[str], threads: int, far: str) -> None:
+    """Writes some photos and the model of all to the scratch folder."""
+    import pycolmap
+
+    work = emptied(scratch_of(layout.work / "undistorted"))
+    waited(
+        "undistorting photos",
+        lambda token: pycolmap.undistort_images(
+            work, layout.placed, Path(plan.photos), list(names), undistort_options=_options(plan),
+            jpeg_quality=_QUALITY, num_threads=threads, cancellation_token=token,
+        ),
+        lambda: far,
+    )  # fmt: skip
+
+
+def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
+    import pycolmap
+
+    options = pycolmap.UndistortCameraOptions()
+    if plan.settings.max_size is not None:
+        options.max_image_size = plan.settings.max_size
+    return options
+
+
+def _moved(here: Path, there: Path) -> None:
+    with disk_errors(there):
+        there.parent.mkdir(parents=True, exist_ok=True)
+        here.replace(there)
+
+
+def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -> None:
+    """Writes the masks of the photos that have one, undistorted as these are."""
+    import pycolmap
+
+    masks = {photo.name: photo.mask for photo in plan.used if photo.mask is not None}
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        place = layout.masks / f"{image.name}.png"
+        if image.name not in masks or place.is_file():
+            continue
+        camera = model.camera(image.camera_id)
+        grey = read_mask(Path(masks[image.name]), camera.width, camera.height)
+        with quiet():
+            bitmap = pycolmap.Bitmap.from_array(grey)
+            bitmap, _ = pycolmap.undistort_image(_options(plan), bitmap, camera)
+        kept = np.where(bitmap.to_array() >= _HALF, 255, 0).astype(np.uint8)
+        scratch = place.with_name(f".{place.name}.tmp.png")
+        with disk_errors(place):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            pycolmap.Bitmap.from_array(kept).write(scratch)
+            scratch.replace(place)
+
+
+def read_mask(path: Path, width: int, height: int) -> "np.typing.NDArray[np.uint8]":
+    """[H, W] a mask in the size of its photo, 255 where a pixel counts.
+
+    Raises:
+        UserError: It cannot be decoded.
+    """
+    from PIL import Image
+
+    from crossgrad_core.scene.decode import decode_mask
+
+    mask = Image.fromarray(decode_mask(path))
+    return np.asarray(mask.resize((width, height), Image.Resampling.NEAREST))

@@ -1,0 +1,82 @@
+"""Long calls of pycolmap: with progress, ended by signals and by Ctrl-C, and quiet."""
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from crossgrad_core.commands import Progress, UserError
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+
+if TYPE_CHECKING:
+    import pycolmap
+
+T = TypeVar("T")
+#: Seconds between two looks at how far a call is, and between two lines about it.
+_LOOK, _PAUSE = 0.1, 5.0
+#: Glog's level of errors: pycolmap's notes and warnings do not concern the user.
+_ERRORS: Final = 2
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Pycolmap says nothing but errors inside the block."""
+    guard_pycolmap()
+    import pycolmap
+
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _ERRORS
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def waited(
+    what: str, call: "Callable[[pycolmap.CancellationToken], T]", far: Callable[[], str]
+) -> T:
+    """What a long call answers; it runs in another thread, so that signals are heard meanwhile.
+
+    Args:
+        what: What is done, for people.
+        call: The call, with a token by which it can be cancelled.
+        far: How far it is, in words; asked every few seconds.
+
+    Raises:
+        UserError: Pycolmap cannot do it; says why.
+    """
+    guard_pycolmap()
+    import pycolmap
+
+    progress, begun, token = Progress(_PAUSE), monotonic(), pycolmap.CancellationToken()
+    with quiet(), ThreadPoolExecutor(1, thread_name_prefix="crossgrad-prepare") as pool:
+        future = pool.submit(call, token)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=_LOOK)
+                except TimeoutError:
+                    if progress.due:
+                        told = ", ".join(filter(None, [far(), f"{monotonic() - begun:.0f} s"]))
+                        progress.tell(f"{what}: {told}")
+        except (RuntimeError, ValueError) as error:
+            raise UserError(
+                f"pycolmap failed: {what}",
+                found=str(error),
+                todo="run the same command again; it goes on from the last complete stage",
+            ) from error
+        except BaseException:
+            token.cancel()
+            raise
+
+
+def rows_of(database: Path, table: str) -> int:
+    """How many rows a table of COLMAP's database has, as far as it can be told now."""
+    try:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as open_:
+            (found,) = open_.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+    except sqlite3.Error:  # It is busy, or not made yet.
+        return 0
+    return int(found)

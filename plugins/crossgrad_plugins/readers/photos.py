@@ -1,0 +1,39 @@
+"""Reads folders of photos alone: finds their cameras first, as `crossgrad prepare` does."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_plugins.readers.colmap import ColmapReader
+
+
+class PhotosReader(Reader):
+    """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
+
+    The prepared scene stays in a folder beside the photos, where `crossgrad prepare` finds it
+    again, and so does a run that is resumed. By itself no folder is read this way.
+    """
+
+    scene: Path | None = Field(
+        None, description="folder of the prepared scene; None: beside the photos, with -scene"
+    )
+
+    @override
+    def accepts(self, path: Path) -> bool:
+        return False
+
+    @override
+    def read(self, path: Path, options: SceneOptions) -> Scene:
+        from crossgrad_plugins.prepare.app import prepared
+        from crossgrad_plugins.prepare.plan import Settings
+        from crossgrad_plugins.prepare.report import summary_lines
+
+        photos = path.resolve()
+        place = self.scene or photos.with_name(f"{photos.name}-scene")
+        report = prepared(photos, place, Settings())
+        scene = ColmapReader().read(place, options)
+        lines = (f"the photos were prepared into {place}", *summary_lines(report))
+        return replace(scene, notes=(*(f"prepare: {line}" for line in lines), *scene.notes))

@@ -1,0 +1,109 @@
+"""What the report concludes: bridges that are missing, and why photos were lost."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crossgrad_plugins.prepare.findings import (
+    bridges_of,
+    joins_of,
+    lost_photos,
+    parts_of,
+    rungs,
+)
+from crossgrad_plugins.prepare.matching import Link
+from crossgrad_plugins.prepare.plan import Photo, Plan, Settings
+
+
+def photo(name, **changed):
+    plain = {
+        "name": name, "folder": name.rpartition("/")[0], "width": 100, "height": 80, "camera": "",
+        "position": None, "mask": None, "brightness": 120.0, "sharpness": 50.0, "bytes": 1,
+        "sha256": name,
+    }  # fmt: skip
+    return Photo(**{**plain, **changed})
+
+
+def plan_of(*photos):
+    return Plan(photos="photos", settings=Settings(), used=photos, left_out=())
+
+
+AERIAL = [f"aerial/{n}" for n in range(4)]
+STREET = [f"street/{n}" for n in range(3)]
+PLAN = plan_of(*map(photo, AERIAL + STREET))
+MODELS = [frozenset(AERIAL), frozenset(STREET)]
+
+
+def test_a_ramp_is_asked_for_between_the_heights_of_two_models():
+    heights = dict.fromkeys(AERIAL, 40.0) | dict.fromkeys(STREET, 5.0)
+    (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), heights)
+    assert "fly a ramp from 5 to 40 m here" in bridge.advice
+    assert (bridge.first, bridge.second, bridge.photos) == ("aerial", "street", 3)
+    assert bridge.heights == (5.0, 40.0)
+
+
+def test_without_heights_it_is_told_in_ratios():
+    (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), {})
+    assert "between aerial and street" in bridge.advice
+    assert bridge.heights is None
+
+
+def test_at_like_heights_overlap_is_asked_for():
+    heights = dict.fromkeys(AERIAL, 12.0) | dict.fromkeys(STREET, 10.0)
+    (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), heights)
+    assert "overlap with both" in bridge.advice
+
+
+def test_a_folder_in_no_model_needs_a_bridge_and_one_model_of_all_needs_none():
+    (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS[:1]), {})
+    assert bridge.second == "street"
+    assert not bridges_of(PLAN, [], parts_of(PLAN, [frozenset(AERIAL + STREET)]), {})
+    assert not bridges_of(PLAN, [], [], {})
+
+
+def test_pairs_across_are_counted():
+    links = [Link("aerial/0", "street/1", 20), Link("aerial/0", "aerial/1", 300)]
+    (bridge,) = bridges_of(PLAN, links, parts_of(PLAN, MODELS), {})
+    assert bridge.pairs == 1
+    joins = {
+        (join.first, join.second): (join.pairs, join.matches) for join in joins_of(PLAN, links)
+    }
+    assert joins == {
+        ("aerial", "aerial"): (1, 300),
+        ("street", "street"): (0, 0),
+        ("aerial", "street"): (1, 20),
+    }
+
+
+@given(st.floats(1.0, 50.0), st.floats(1.5, 60.0))
+def test_rungs_lead_from_end_to_end_in_equal_factors(low, factor):
+    found = rungs(low, low * factor)
+    assert found[0] == pytest.approx(low)
+    assert found[-1] == pytest.approx(low * factor)
+    steps = [after / before for before, after in itertools.pairwise(found)]
+    assert max(steps) <= 1.4 + 1e-9 or len(steps) == 12
+    assert max(steps) == pytest.approx(min(steps))
+
+
+@pytest.mark.parametrize(
+    ("changed", "features", "links", "why"),
+    [
+        ({"brightness": 5.0}, 900, 2, "dark"),
+        ({"brightness": 250.0}, 900, 2, "overexposed"),
+        ({"sharpness": 1.0}, 900, 2, "blurred"),
+        ({}, 30, 0, "few features (30"),
+        ({}, 0, 0, "no feature"),
+        ({}, 900, 0, "no verified matches"),
+        ({}, 900, 2, "matches with 2 photos"),
+    ],
+)
+def test_reasons_why_a_photo_is_lost(changed, features, links, why):
+    bad = photo("bad", **changed)
+    plan = plan_of(*map(photo, AERIAL), bad)
+    found = [Link("bad", name, 20) for name in AERIAL[:links]]
+    counts = dict.fromkeys(AERIAL, 1000) | {"bad": features}
+    (lost,) = lost_photos(plan, counts, found, AERIAL)
+    assert lost.name == "bad"
+    assert why in lost.why

@@ -1,0 +1,99 @@
+"""Models on Earth: similarities from GPS with outliers, and models that GPS joins."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from crossgrad_plugins.prepare.placing import centers_of, merged, placement_of
+
+
+def synthetic(frames=12, seed=0):
+    """A model of pycolmap's own making; no photo belongs to it."""
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 2, frames // 2, 60
+    return pycolmap.synthesize_dataset(options)
+
+
+def similarity(rng):
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    matrix = np.column_stack([rng.uniform(5.0, 50.0) * turn, rng.normal(size=3) * 100.0])
+    return pycolmap.Sim3d(matrix)
+
+
+def moved(similarity, points):
+    return {
+        name: similarity.matrix()[:, :3] @ point + similarity.matrix()[:, 3]
+        for name, point in points.items()
+    }
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_similarity_is_found_beside_wrong_gps(seed):
+    rng, model = np.random.default_rng(seed), synthetic()
+    centers, wanted = centers_of(model), similarity(np.random.default_rng(seed))
+    gps = moved(wanted, centers)
+    wrong = sorted(gps)[: len(gps) // 4]
+    for name in sorted(gps):
+        gps[name] = gps[name] + rng.normal(size=3) * (400.0 if name in wrong else 0.05)
+    placement, why = placement_of(model, gps)
+    assert not why
+    assert placement.agreeing.isdisjoint(wrong)
+    assert placement.rms < 0.5
+    found = placement.similarity
+    assert found.scale == pytest.approx(wanted.scale, rel=0.01)
+    exact = moved(wanted, centers)
+    for name, place in moved(found, centers).items():
+        assert np.linalg.norm(place - exact[name]) < 0.5
+
+
+def test_gps_on_a_line_places_nothing():
+    model = synthetic()
+    names = sorted(centers_of(model))
+    gps = {name: np.array([10.0 * i, 0.0, 0.0]) for i, name in enumerate(names)}
+    assert placement_of(model, gps)[0] is None
+
+
+def test_gps_coarser_than_the_scene_places_nothing():
+    rng, model = np.random.default_rng(0), synthetic()
+    gps = {name: rng.normal(size=3) * 0.5 for name in centers_of(model)}
+    placement, why = placement_of(model, gps)
+    assert placement is None
+    assert "GPS" in why
+
+
+def test_too_little_gps_places_nothing():
+    model = synthetic()
+    gps = dict(list(moved(similarity(np.random.default_rng(0)), centers_of(model)).items())[:2])
+    assert placement_of(model, gps)[1] == "2 of its photos have GPS, and 3 are needed"
+
+
+def part_of(model, keep, folder):
+    """A model of some of the photos of another, as mapping leaves it: read from its files."""
+    part = pycolmap.Reconstruction(model)
+    for number in list(part.reg_image_ids()):
+        if number not in keep:
+            part.deregister_frame(part.image(number).frame_id)
+    folder.mkdir()
+    part.write(folder)
+    return pycolmap.Reconstruction(folder)
+
+
+def test_two_halves_make_the_whole_again(tmp_path):
+    """Photos, poses and points: those that one half alone has are in it, each photo once."""
+    model = synthetic()
+    numbers = sorted(model.reg_image_ids())
+    parts = {"one": set(numbers[:7]), "other": set(numbers[5:])}
+    halves = [part_of(model, keep, tmp_path / name) for name, keep in parts.items()]
+    whole = merged(halves[0], halves[1:])
+    whole.write(tmp_path)
+    read = pycolmap.Reconstruction(tmp_path)
+    assert sorted(read.reg_image_ids()) == numbers
+    before, after = centers_of(model), centers_of(read)
+    assert before.keys() == after.keys()
+    for name, center in before.items():
+        assert np.allclose(after[name], center)
+    assert read.is_valid()
+    assert read.compute_mean_reprojection_error() < 1e-3
+    assert read.num_points3D() >= halves[0].num_points3D()

@@ -1,0 +1,256 @@
+"""`crossgrad prepare` on a handful of photos, some of them of no use: the scene, the report."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from support.commands import ended
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import read_scene
+from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_plugins.prepare import matching
+from crossgrad_plugins.prepare.app import prepared
+from crossgrad_plugins.prepare.plan import Plan, Settings
+from crossgrad_plugins.prepare.report import data_of, summary_lines
+from crossgrad_plugins.readers.colmap import ColmapReader
+
+#: Metres of a unit of the bundled scene, for GPS, and a place in the south and the west.
+METRES, PLACE = 20.0, (-33.0, -70.0, 500.0)
+COUNT = 7
+
+
+def with_gps(source, target, place):
+    """A copy of a photo that says where it was taken."""
+    exif = Image.Exif()
+    latitude, longitude, altitude = place
+    exif[0x8825] = {
+        1: "S" if latitude < 0 else "N",
+        2: sexagesimal(abs(latitude)),
+        3: "W" if longitude < 0 else "E",
+        4: sexagesimal(abs(longitude)),
+        5: b"\0",
+        6: altitude,
+    }
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with Image.open(source) as image:
+        image.save(target, quality=95, exif=exif)
+
+
+def sexagesimal(degrees):
+    minutes = 60.0 * (degrees % 1.0)
+    return float(int(degrees)), float(int(minutes)), 60.0 * (minutes % 1.0)
+
+
+def true_centers():
+    """Name -> centre of the first photos of the bundled scene, in metres of a made-up frame."""
+    model = pycolmap.Reconstruction(bundled_scene() / "sparse" / "0")
+    images = sorted(model.images.values(), key=lambda image: image.name)[:COUNT]
+    # The scene's y is down; z of east, north, up is up.
+    turn = np.diag([1.0, -1.0, -1.0])
+    return {image.name: METRES * turn @ image.projection_center() for image in images}
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return true_centers()
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory, truth):
+    """Seven good photos in two folders, a mask, and five files that are of no use."""
+    folder = tmp_path_factory.mktemp("prepare") / "photos"
+    places = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84).enu_to_ellipsoid(
+        np.array(list(truth.values())), *PLACE
+    )
+    images = bundled_scene() / "images"
+    for number, (name, place) in enumerate(zip(truth, places, strict=True)):
+        with_gps(images / name, folder / ("kite" if number % 2 else "mast") / name, place)
+    first = folder / "mast" / next(iter(truth))
+    mask = np.full((298, 400), 255, np.uint8)
+    mask[:100] = 0
+    (folder / "masks" / "mast").mkdir(parents=True)
+    Image.fromarray(mask).save(folder / "masks" / "mast" / f"{first.name}.png")
+    shutil.copy(first, folder / "mast" / "z.jpg")
+    (folder / "kite" / "cut.jpg").write_bytes(first.read_bytes()[:9000])
+    (folder / "phone.HEIC").write_bytes(b"heic")
+    Image.new("RGB", (20, 20)).save(folder / "kite" / "icon.png")
+    noise = np.random.default_rng(0).integers(0, 8, (298, 400, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(folder / "kite" / "night.png")
+    (folder / "notes.txt").write_text("no photo")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(photos):
+    return photos.with_name("photos-scene")
+
+
+@pytest.fixture(scope="module")
+def report(photos, scene):
+    return prepared(photos, scene, Settings())
+
+
+def content(folder):
+    """Path -> bytes of all files of a scene but those in use."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path): path.read_bytes() for path in paths if path.suffix not in {".db", ".lock"}}
+
+
+def test_all_good_photos_have_a_pose(report, scene, truth):
+    assert {Path(name).name for name in report.posed} == set(truth)
+    found = ColmapReader().read(scene, SceneOptions())
+    assert len(found.views) == COUNT
+    assert len(found.points) > 100
+    assert {view.regime for view in found.views} == {"kite", "mast"}
+
+
+def test_the_scene_lies_where_gps_says(report, scene, truth):
+    """Within the noise that is left: cameras lie at their GPS, in metres east, north, up."""
+    georef = json.loads((scene / "georef.json").read_text())
+    origin = [georef["origin"][key] for key in ("latitude", "longitude", "altitude")]
+    assert origin[0] == pytest.approx(PLACE[0], abs=1e-3)
+    assert origin[1] == pytest.approx(PLACE[1], abs=1e-3)
+    assert georef["transform"] == np.eye(4).tolist()
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    extent = np.ptp(np.array(list(truth.values())), axis=0).max()
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    found = {Path(i.name).name: i.projection_center() for i in model.images.values()}
+    on_earth = transform.enu_to_ellipsoid(np.array([found[name] for name in truth]), *origin)
+    there = transform.ellipsoid_to_enu(on_earth, *PLACE)
+    off = np.linalg.norm(there - np.array(list(truth.values())), axis=1)
+    assert off.max() < 0.02 * extent
+    assert georef["residuals_m"]["max"] == pytest.approx(off.max(), abs=0.1)
+    assert any("residuals" in line for line in summary_lines(report))
+
+
+def test_what_is_of_no_use_is_named_with_the_reason(report):
+    why = {each.name: each.why for each in report.plan.left_out}
+    assert set(why) == {"kite/cut.jpg", "phone.HEIC", "kite/icon.png", "mast/z.jpg"}
+    assert "the same file as mast/" in why["mast/z.jpg"]
+    assert "cut short" in why["kite/cut.jpg"]
+    assert "save as JPEG" in why["phone.HEIC"]
+    assert "too small" in why["kite/icon.png"]
+    (lost,) = report.lost
+    assert lost.name == "kite/night.png"
+    assert "dark" in lost.why
+
+
+def test_the_report_is_there_in_all_forms(report, scene):
+    data = json.loads((scene / "report.json").read_text())
+    assert data == json.loads(json.dumps(data_of(report)))
+    assert (data["used"], data["registered"]) == (COUNT + 1, COUNT)
+    assert {row["folder"] for row in data["folders"]} == {"kite", "mast"}
+    (across,) = (row for row in data["joins"] if row["first"] != row["second"])
+    assert across["pairs"] > 0 and across["matches"] >= 15 * across["pairs"]
+    page = (scene / "report.md").read_text()
+    assert "kite/night.png" in page and "phone.HEIC" in page
+    with Image.open(scene / "report.png") as picture:
+        assert picture.width > 500
+
+
+def test_masks_are_undistorted_with_their_photos(report, scene):
+    (mask,) = (scene / "masks").rglob("*.png")
+    photo = scene / "images" / mask.relative_to(scene / "masks").with_suffix("")
+    with Image.open(mask) as kept, Image.open(photo) as image:
+        assert kept.size == image.size
+        shares = (np.asarray(kept) > 0).mean(axis=1)
+    assert shares[:80].max() == 0.0
+    assert shares[-100:].min() == 1.0
+
+
+def test_again_it_changes_nothing(report, photos, scene):
+    before = content(scene)
+    again = prepared(photos, scene, Settings())
+    assert data_of(again) == data_of(report)
+    assert content(scene) == before
+
+
+def test_without_its_last_stages_it_comes_out_the_same(report, photos, scene):
+    """What a kill may have left undone is done again, with the same result."""
+    before = content(scene)
+    (scene / "report.json").unlink()
+    shutil.rmtree(scene / "sparse")
+    for path in sorted((scene / "images").rglob("*.jpg"))[::2]:
+        path.unlink()
+    shutil.rmtree(scene / "prepare" / "placed")
+    prepared(photos, scene, Settings())
+    assert content(scene).keys() == before.keys()
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    assert model.num_reg_images() == COUNT
+
+
+def test_another_plan_is_refused(report, photos, scene):
+    before = content(scene)
+    with pytest.raises(UserError, match="begun otherwise") as caught:
+        prepared(photos, scene, Settings(max_size=200))
+    assert "max_size was None, now 200" in caught.value.found
+    assert content(scene) == before
+
+
+def test_a_run_prepares_photos_where_it_is_told_to(report, photos, capsys):
+    assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
+    told = capsys.readouterr().out
+    assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
+    read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos"}), photos)
+    assert (name, len(read.views)) == ("photos", COUNT)
+
+
+def test_a_run_of_photos_says_what_to_do(photos, capsys):
+    assert ended("run", photos) == 2
+    told = capsys.readouterr().err
+    assert "crossgrad prepare PHOTOS SCENE" in told and "--prepare" in told
+
+
+@pytest.mark.parametrize(
+    ("photos_at", "scene_at", "what"),
+    [
+        ("gone", "scene", "there is no such folder"),
+        ("file", "scene", "photos are in a folder"),
+        ("empty", "scene", "no photos in the folder"),
+        ("one", "scene", "too few photos"),
+        ("one", "other", "something else than a scene"),
+        ("one", "one/scene", "among the photos"),
+        ("one", "file", "cannot make this folder"),
+    ],
+)
+def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_at, scene_at, what):
+    for name in ("empty", "one", "other"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "file").write_text("")
+    Image.new("RGB", (100, 100)).save(tmp_path / "one" / "a.jpg")
+    (tmp_path / "other" / "thesis.tex").write_text("")
+    before = sorted(tmp_path.rglob("*"))
+    assert ended("prepare", tmp_path / photos_at, tmp_path / scene_at) == 2
+    assert what in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("option", ["features", "matching", "mapper", "cameras"])
+def test_unknown_choices_are_refused(option, tmp_path, capsys):
+    assert ended("prepare", tmp_path, tmp_path / "scene", f"--{option}", "magic") == 2
+    assert f"--{option}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("count", "located", "way"),
+    [
+        (60, 60, "exhaustive"),
+        (61, 61, "spatial"),
+        (61, 50, "exhaustive"),
+        (101, 90, "retrieval"),
+        (2000, 0, "retrieval"),
+        (2000, 2000, "spatial"),
+    ],
+)
+def test_pairs_are_chosen_by_number_and_gps(report, count, located, way):
+    with_place = next(photo for photo in report.plan.used if photo.position is not None)
+    without = with_place.model_copy(update={"position": None})
+    used = (with_place,) * located + (without,) * (count - located)
+    assert matching.way_of(Plan(photos="", settings=Settings(), used=used, left_out=())) == way
