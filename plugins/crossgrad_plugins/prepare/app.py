@@ -8,15 +8,17 @@ from typing import TypeVar
 
 from crossgrad_core.commands import (
     Progress,
+    UserError,
     available_cores,
     disk_errors,
     locked,
     way_on,
     write_atomically,
 )
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.features import found_features
-from crossgrad_plugins.prepare.layout import Layout, check_ours
+from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_leftovers
 from crossgrad_plugins.prepare.photos import find_photos
 from crossgrad_plugins.prepare.picture import draw
 from crossgrad_plugins.prepare.plan import Plan, Settings, agreed
@@ -56,11 +58,29 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     """
     layout = Layout(scene)
     check_ours(layout, photos)
+    _check_lens(settings.lens)
     plan = _planned(photos, settings)
+    matching.check_gps(plan)
     with disk_errors(layout.work):
         layout.work.mkdir(parents=True, exist_ok=True)
     with locked(scene, "preparing"), way_on("the same command goes on where this one ended"):
+        clear_leftovers(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))
+
+
+def _check_lens(name: str) -> None:
+    guard_pycolmap()
+    import pycolmap
+
+    known = [each for each in pycolmap.CameraModelId.__members__ if each != "INVALID"]
+    if name not in known:
+        raise UserError(
+            "there is no such camera model",
+            where="--lens",
+            expected=", ".join(known),
+            found=name,
+            todo="leave it out for SIMPLE_RADIAL",
+        )
 
 
 def _planned(photos: Path, settings: Settings) -> Plan:

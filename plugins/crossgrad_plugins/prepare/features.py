@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.commands import available_memory, write_atomically
+from crossgrad_core.commands import UserError, available_memory, write_atomically
 from crossgrad_plugins.prepare.earth import local_positions
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Photo, Plan
@@ -23,6 +23,8 @@ LONGEST: Final = 3200
 #: Bytes that SIFT takes for a pixel of the photo, which it looks at at twice its size: measured
 #: 290 (docs/prepare.md). And the share of the free memory that all threads together may take.
 _BYTES_PER_PIXEL, _SHARE = 320, 0.6
+#: Photos of a camera that are tried until one can be read.
+_TRIED: Final = 5
 
 
 def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
@@ -38,7 +40,7 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     import pycolmap
 
     if not layout.database.is_file():
-        _make_database(layout, plan)
+        waited("reading cameras", lambda _: _make_database(layout, plan), lambda: "")
     total = len(plan.used)
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = min(plan.settings.max_size or LONGEST, LONGEST)
@@ -57,6 +59,13 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     )  # fmt: skip
     counts = _counts(layout.database)
     found = {name: counts.get(name, 0) for name in names}
+    if not any(found.values()):
+        raise UserError(
+            "no features could be found in any photo",
+            where=plan.photos,
+            expected="photos of something with texture, sharp and neither black nor white",
+            todo="look at the photos, or name another folder",
+        )
     write_atomically(layout.features, json.dumps(found, indent=1).encode())
     return found
 
@@ -103,10 +112,7 @@ def _write_camera(
     """Writes photos that share a calibration."""
     import pycolmap
 
-    reading = pycolmap.ImageReaderOptions()
-    reading.camera_model = plan.settings.lens
-    camera = pycolmap.infer_camera_from_image(Path(plan.photos) / photos[0].name, reading)
-    camera_id = database.write_camera(camera)
+    camera_id = database.write_camera(_camera(plan, photos))
     rig = pycolmap.Rig()
     rig.add_ref_sensor(pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera_id))
     rig_id = database.write_rig(rig)
@@ -119,6 +125,25 @@ def _write_camera(
         database.write_frame(frame)
         if photo.name in positions:
             _write_position(database, data, positions[photo.name])
+
+
+def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
+    """The calibration to begin with: the focal length by EXIF, else 1.2 times the longer side."""
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = plan.settings.lens
+    for photo in photos[:_TRIED]:
+        try:
+            return pycolmap.infer_camera_from_image(Path(plan.photos) / photo.name, reading)
+        except (
+            RuntimeError,
+            ValueError,
+        ):  # Pillow read it and pycolmap cannot: it has no features.
+            continue
+    width, height = photos[0].width, photos[0].height
+    focal = reading.default_focal_length_factor * max(width, height)
+    return pycolmap.Camera.create_from_model_name(0, plan.settings.lens, focal, width, height)
 
 
 def _write_position(

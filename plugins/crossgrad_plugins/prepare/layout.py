@@ -129,6 +129,15 @@ def emptied(folder: Path) -> Path:
     return folder
 
 
+def clear_leftovers(layout: Layout) -> None:
+    """Deletes what a killed process left half-made; only one process works in the folder."""
+    for folder in (layout.work, layout.scene):
+        for path in folder.glob(".*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for path in layout.masks.rglob(".*.tmp.png"):
+        path.unlink()
+
+
 def scratch_of(path: Path) -> Path:
     """Where a folder is made before it gets its name."""
     return path.with_name(f".{path.name}.tmp")

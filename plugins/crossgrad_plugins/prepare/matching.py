@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from crossgrad_core.commands import write_atomically
+from crossgrad_core.commands import UserError, write_atomically
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.retrieval import index_of
@@ -59,6 +59,21 @@ def way_of(plan: Plan) -> str:
     if len(plan.located) >= _MOST_LOCATED * photos:
         return "spatial"
     return "exhaustive" if photos <= _SOME else "retrieval"
+
+
+def check_gps(plan: Plan) -> None:
+    """Refuses to tell neighbours by GPS where photos have none.
+
+    Raises:
+        UserError: Fewer than two photos have GPS.
+    """
+    if plan.settings.matching == "spatial" and len(plan.located) < 2:  # noqa: PLR2004 - a pair
+        raise UserError(
+            "the photos have no GPS to tell neighbours by",
+            where="--matching spatial",
+            found=f"{len(plan.located)} of {len(plan.used)} photos with GPS",
+            todo="leave --matching out, or use --matching retrieval",
+        )
 
 
 def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crossgrad_core.commands import disk_errors
+from crossgrad_core.commands import UserError, disk_errors
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.waiting import quiet, waited
@@ -75,6 +75,12 @@ def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
 
 
 def _moved(here: Path, there: Path) -> None:
+    if not here.is_file():  # Pycolmap does not say why.
+        raise UserError(
+            "the undistorted photo could not be written",
+            where=there,
+            todo="check that the disk has room, and run the same command again",
+        )
     with disk_errors(there):
         there.parent.mkdir(parents=True, exist_ok=True)
         here.replace(there)

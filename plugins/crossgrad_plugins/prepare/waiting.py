@@ -1,9 +1,10 @@
 """Long calls of pycolmap: with progress, ended by signals and by Ctrl-C, and quiet."""
 
-import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -16,7 +17,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: Seconds between two looks at how far a call is, and between two lines about it.
-_LOOK, _PAUSE = 0.1, 5.0
+_LOOK, _PAUSE = 0.1, 10.0
+#: Counts the rows of a table, for which it waits so many seconds.
+_COUNT: Final = (
+    "import sqlite3, sys; found = sqlite3.connect(sys.argv[1] + '?mode=ro', uri=True);"
+    "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
+)
+_PATIENCE: Final = 5.0
 #: Glog's level of errors: pycolmap's notes and warnings do not concern the user.
 _ERRORS: Final = 2
 
@@ -73,10 +80,14 @@ def waited(
 
 
 def rows_of(database: Path, table: str) -> int:
-    """How many rows a table of COLMAP's database has, as far as it can be told now."""
+    """How many rows a table of COLMAP's database has, as far as it can be told now.
+
+    Another process looks: Python's SQLite and that of pycolmap in one process take each other's
+    locks away, and the database breaks (https://sqlite.org/howtocorrupt.html, section 2.2.1).
+    """
+    program = [sys.executable, "-I", "-S", "-c", _COUNT, database.absolute().as_uri(), table]
     try:
-        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as open_:
-            (found,) = open_.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
-    except sqlite3.Error:  # It is busy, or not made yet.
+        done = subprocess.run(program, capture_output=True, timeout=_PATIENCE, check=True)
+        return int(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError):  # It is busy, or not made yet.
         return 0
-    return int(found)

@@ -19,6 +19,7 @@ from crossgrad_plugins.prepare import matching
 from crossgrad_plugins.prepare.app import prepared
 from crossgrad_plugins.prepare.plan import Plan, Settings
 from crossgrad_plugins.prepare.report import data_of, summary_lines
+from crossgrad_plugins.prepare.waiting import rows_of
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 #: Metres of a unit of the bundled scene, for GPS, and a place in the south and the west.
@@ -236,6 +237,36 @@ def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_
 def test_unknown_choices_are_refused(option, tmp_path, capsys):
     assert ended("prepare", tmp_path, tmp_path / "scene", f"--{option}", "magic") == 2
     assert f"--{option}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (("--lens", "monocle"), "no such camera model"),
+        (("--matching", "spatial"), "no GPS"),
+        (("--masks", "gone"), "mask folder is not there"),
+        ((), "no features"),
+    ],
+)
+def test_what_cannot_work_is_refused(options, what, tmp_path, capsys):
+    for number in range(2):
+        photo = tmp_path / "photos" / f"{number}.png"
+        photo.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (80, 80), (number,) * 3).save(photo)
+    assert ended("prepare", tmp_path / "photos", tmp_path / "scene", *options) == 2
+    assert what in capsys.readouterr().err
+
+
+def test_progress_is_counted_beside_the_database_s_writer(tmp_path):
+    path = tmp_path / "a b.db"
+    assert rows_of(path, "cameras") == 0
+    database = pycolmap.Database.open(path)
+    camera = pycolmap.Camera.create_from_model_name(0, "PINHOLE", 100.0, 80, 60)
+    for number in range(3):
+        assert rows_of(path, "cameras") == number
+        database.write_camera(camera)
+    database.close()
+    assert rows_of(path, "cameras") == 3
 
 
 @pytest.mark.parametrize(
