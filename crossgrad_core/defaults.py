@@ -25,7 +25,7 @@ DENSIFIER: Final = "adc"
 #: The reader that says what is missing in a folder that no reader accepts.
 READER: Final = "colmap"
 #: The reader of `--prepare`, which finds the cameras of a folder of photos.
-PREPARING_READER: Final = "photos"
+PREPARING_READER: Final = "photos-alone"
 #: The operator that runs the links of `--operator a+b`.
 CHAIN: Final = "chain"
 #: The observer that every run has.

@@ -1,4 +1,4 @@
-"""What the EXIF header of a photo says about its camera and about where it was taken."""
+"""EXIF headers: the camera of a photo, and the place where it was taken."""
 
 from collections.abc import Mapping
 from math import isfinite

@@ -1,4 +1,4 @@
-"""What was found: folders, what joins them, and photos that are missing or were lost."""
+"""Findings of a report: folders and their joins, photos that are missing or were lost."""
 
 import math
 from collections import Counter, defaultdict
@@ -41,7 +41,7 @@ class Lost:
 
 @dataclass(frozen=True)
 class Join:
-    """What joins two folders, or a folder in itself.
+    """The matches between two folders, or within one.
 
     Attributes:
         first: One folder.

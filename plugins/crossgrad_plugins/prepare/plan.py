@@ -17,7 +17,7 @@ class _Fixed(BaseModel):
 
 
 class Settings(_Fixed):
-    """What the user chose.
+    """The choices of the user.
 
     Attributes:
         features: Kind of features.

@@ -27,7 +27,7 @@ _SHOWN: Final = 8
 
 @dataclass(frozen=True)
 class Report:
-    """What is known of a prepared scene.
+    """The facts about a prepared scene.
 
     Attributes:
         plan: Photos and settings.

@@ -46,7 +46,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Result:
-    """What is in the scene.
+    """The content of the scene.
 
     Attributes:
         parts: The models, the largest first.

@@ -199,8 +199,8 @@ def test_a_run_prepares_photos_where_it_is_told_to(report, photos, capsys):
     assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
     told = capsys.readouterr().out
     assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
-    read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos"}), photos)
-    assert (name, len(read.views)) == ("photos", COUNT)
+    read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos-alone"}), photos)
+    assert (name, len(read.views)) == ("photos-alone", COUNT)
 
 
 def test_a_run_of_photos_says_what_to_do(photos, capsys):

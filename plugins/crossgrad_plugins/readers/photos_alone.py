@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 
-class PhotosReader(Reader):
+class PhotosAloneReader(Reader):
     """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
 
     The prepared scene stays in a folder beside the photos, where `crossgrad prepare` finds it
