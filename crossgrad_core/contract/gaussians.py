@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 Response = Literal["plain", "antialiased", "analytic"]
+_FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,13 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def floats(self) -> list[Tensor]:
+        """The floating-point tensors that are given, in the order of the fields."""
+        return [t for t in (getattr(self, name) for name in _FLOATS) if t is not None]
+
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
         """The same Gaussians with `function` applied to every floating-point tensor."""
-        names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
-        tensors = {name: getattr(self, name) for name in names}
+        tensors = {name: getattr(self, name) for name in _FLOATS}
         mapped: dict[str, Any] = {n: function(t) for n, t in tensors.items() if t is not None}
         return replace(self, **mapped)
 

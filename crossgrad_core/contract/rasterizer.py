@@ -23,12 +23,17 @@ class Rasterizer(Component):
             `count`.
         responses: Pixel responses that it draws.
         devices: Torch device types it runs on.
+        together: Whether `render_views` is faster than one view after the other. The views of a
+            step are then drawn in one call, with the graphs of all of them alive.
+        repeatable: Whether the same input gives the same bits.
     """
 
     slot: ClassVar[str] = "rasterizers"
     provides: ClassVar[frozenset[str]] = frozenset()
     responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
+    together: ClassVar[bool] = False
+    repeatable: ClassVar[bool] = True
 
     max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
     near: float = Field(1e-3, gt=0.0, description="near plane, local units")
@@ -45,6 +50,16 @@ class Rasterizer(Component):
             device: Torch device type.
         """
         return 0.0
+
+    def burn_in(self, device: str) -> None:
+        """Finds out before a run trains whether this machine draws rightly; by default does not.
+
+        Args:
+            device: Torch device.
+
+        Raises:
+            UserError: It does not.
+        """
 
     @abstractmethod
     def render(
@@ -63,11 +78,15 @@ class Rasterizer(Component):
     def render_views(
         self,
         views: Sequence[tuple[Gaussians, Camera]],
-        background: Tensor,
+        backgrounds: Sequence[Tensor],
         outputs: frozenset[str] = frozenset(),
     ) -> list[Render]:
-        """Draws several views, each with its own Gaussians; by default one after the other.
+        """Draws several views, each with its own Gaussians and background [3].
 
-        The renders are those of `render`; a rasterizer for a GPU may draw them together.
+        The renders are those of `render`. By default they are drawn one after the other; a
+        rasterizer for a GPU may draw them together. One backward pass goes through all of them.
         """
-        return [self.render(gaussians, camera, background, outputs) for gaussians, camera in views]
+        return [
+            self.render(gaussians, camera, background, outputs)
+            for (gaussians, camera), background in zip(views, backgrounds, strict=True)
+        ]

@@ -1,5 +1,6 @@
 """Whether tensors are finite, and whether anything is in them, in one pass over each."""
 
+from math import inf, isfinite
 from typing import Final
 
 import numpy as np
@@ -7,6 +8,14 @@ import torch
 from torch import Tensor
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
+
+
+def largest(tensor: Tensor) -> Tensor:
+    """The largest magnitude, a scalar on the tensor's device; NaN where an element is."""
+    if not tensor.numel():
+        return tensor.new_zeros(())
+    size: Tensor = torch.linalg.vector_norm(tensor, inf)
+    return size
 
 
 def is_finite(tensor: Tensor) -> bool:
@@ -19,9 +28,12 @@ def finite_and_present(tensor: Tensor | None) -> tuple[bool, bool]:
     if tensor is None:
         return True, False
     tensor = tensor.detach()
+    if not tensor.is_cpu and tensor.is_floating_point():
+        value = float(largest(tensor))  # One pass, waited for once.
+        return isfinite(value), value > 0.0
     if tensor.dtype != torch.float32 or not tensor.is_cpu or not tensor.is_contiguous():
         return bool(torch.isfinite(tensor).all()), bool(tensor.any())
     from crossgrad_core.gradients.numba_kernels.largest import largest_bits
 
-    largest = int(largest_bits(tensor.view(-1).numpy().view(np.uint32)))
-    return largest < _INFINITY, largest > 0
+    bits = int(largest_bits(tensor.view(-1).numpy().view(np.uint32)))
+    return bits < _INFINITY, bits > 0

@@ -40,7 +40,7 @@ from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.scaled_photos import ScaledPhotos
+from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on as at_the_end
@@ -177,8 +177,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         schedule=schedule_of(config, selection.densifier, steps, counting),
         device=choose_device(config.device),
         notes=tuple(notes),
-        # At half the size photos take a quarter of the memory.
-        scaled_photos=ScaledPhotos(config.reading.cache_mib // 4),
+        scaled_photos=_photos(config),
     )
     # The length of a run within a budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()
@@ -190,6 +189,14 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         *timed,
     )
     return replace(setup, notes=(*setup.notes, *added))
+
+
+def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
+    """Where photos are kept besides those that were decoded last."""
+    mib, device = config.reading.cache_mib, choose_device(config.device)
+    # At half the size photos take a quarter of the memory.
+    scaled = ScaledPhotos(mib // 4)
+    return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
 
 
 def _with_first_degree(config: RunConfig) -> RunConfig:

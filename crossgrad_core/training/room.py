@@ -79,6 +79,6 @@ def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
         views=len(rendered.records),
         separate=setup.separate,
         watched=bool(setup.watchers),
-        joint=setup.joint,
+        joint=setup.joint or setup.rasterizer.together,
         averaged=average_of(setup.config) > 0.0,
     )

@@ -54,6 +54,48 @@ class ScaledPhotos:
         return pair
 
 
+class DevicePhotos:
+    """Photos on a GPU, as uint8: of each view the size that was asked for last.
+
+    Args:
+        scaled: Makes the photos, in the machine's memory.
+        device: The GPU.
+        mib: Its memory for them in MiB; what does not fit is copied there again for each step.
+    """
+
+    def __init__(self, scaled: ScaledPhotos, device: torch.device, mib: int) -> None:
+        self._scaled, self._device = scaled, device
+        self._room = mib * 2**20
+        self._kept: dict[str, tuple[_Size, Pair]] = {}
+
+    def holds(self, view: View, camera: Camera) -> bool:
+        """See `ScaledPhotos.holds`."""
+        held = self._kept.get(view.name)
+        here = held is not None and held[0] == (camera.width, camera.height)
+        return here or self._scaled.holds(view, camera)
+
+    def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
+        """See `ScaledPhotos.get`; `full` gives the photo in the machine's memory."""
+        size = camera.width, camera.height
+        held = self._kept.get(view.name)
+        if held is not None and held[0] == size:
+            return held[1]
+        if held is not None:
+            del self._kept[view.name]
+            self._room += _bytes({size: held[1]})
+        pair = on_device(self._scaled.get(view, camera, full), self._device)
+        if _bytes({size: pair}) <= self._room:
+            self._kept[view.name] = size, pair
+            self._room -= _bytes({size: pair})
+        return pair
+
+
+def on_device(pair: Pair, device: torch.device) -> Pair:
+    """A photo and its mask on a device."""
+    image, mask = pair
+    return image.to(device), None if mask is None else mask.to(device)
+
+
 def _sizes(full: Camera, wanted: Camera) -> list[_Size]:
     """The sizes from the full one, left out, down to the wanted one.
 

@@ -22,7 +22,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.scene.photos_ahead import PhotosAhead
 from crossgrad_core.training.operator_scale import OperatorScale
-from crossgrad_core.training.scaled_photos import ScaledPhotos
+from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Setup:
         schedule: The schedule.
         device: Where tensors live.
         notes: What was chosen or left out, and why.
-        scaled_photos: Where photos of smaller sizes are kept.
+        scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
         photos_ahead: The threads that decode photos beside the steps.
         pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
@@ -53,7 +53,7 @@ class Setup:
     schedule: Schedule
     device: torch.device
     notes: tuple[str, ...]
-    scaled_photos: ScaledPhotos
+    scaled_photos: ScaledPhotos | DevicePhotos
     photos_ahead: PhotosAhead = field(default_factory=PhotosAhead)
     pixel_share: float = 0.6
 

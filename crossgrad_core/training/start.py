@@ -79,9 +79,13 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
 
     Returns:
         The seconds that it took.
+
+    Raises:
+        UserError: The rasterizer does not draw rightly on this machine.
     """
     _LOG.info("loading kernels")
     start = perf_counter()
+    setup.rasterizer.burn_in(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
     steps = [1, *(schedule.step_of(schedule.sh_interval * degree) for degree in (1, 2, 3))]
     if setup.densifier.needs:

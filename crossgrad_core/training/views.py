@@ -1,9 +1,9 @@
 """Rendering the K views of a step and running their backward passes."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial, reduce
-from math import isfinite
+from math import isfinite, nan
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -19,16 +19,18 @@ from crossgrad_core.contract.contexts import (
     Scaled,
     ViewRecord,
 )
-from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.gaussians import Gaussians, Render
 from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import Leaves, leaves_of
+from crossgrad_core.training.scaled_photos import Pair, on_device
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -56,8 +58,18 @@ class Rendered:
 
 
 @dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A view that is about to be drawn."""
+
+    slot: int
+    target: "Target"
+    background: Tensor
+    gaussians: Gaussians
+
+
+@dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A view with its graph still alive."""
+    """A view with its graph still alive. Its record does not know the loss yet."""
 
     record: ViewRecord
     gaussians: Gaussians
@@ -91,27 +103,109 @@ def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[f
     regular: TensorGradients = {}
     if setup.joint:
         return _render_jointly(setup, state, draw, scales, regular)
-    records, per_view, photos = [], [], []
-    total = SummedGradients.empty(setup.trained_blocks, len(draw.views))
+    records, losses, per_view, photos = [], [], [], []
+    total = _sums(setup, len(draw.views))
+    way = _together if setup.rasterizer.together and len(draw.views) > 1 else _one_by_one
+    for drawn, gradients in way(setup, state, draw, scales, regular):
+        records.append(drawn.record)
+        losses.append(drawn.loss.detach())
+        photos.append((drawn.record.index, drawn.leaves))
+        if setup.separate:
+            per_view.append(gradients)
+        else:
+            total.add(gradients)
+        state.laps.lap("backward")
+    known = _with_losses(state, records, losses)
+    state.counters.backward_passes += len(records)
+    if not setup.separate:
+        return Rendered(known, total, regular, tuple(photos))
+    # Single views are not needed after they are combined, unless a plugin says so.
+    apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
+    return Rendered(known, apart, regular, tuple(photos))
+
+
+def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
+    """No gradient yet, of `views` to come."""
+    if setup.device.type == "cpu":
+        return SummedGradients.empty(setup.trained_blocks, views)
+    return DeferredSums(setup.trained_blocks, views)
+
+
+def _one_by_one(
+    setup: Setup,
+    state: TrainState,
+    draw: Draw,
+    scales: Sequence[float],
+    regular: TensorGradients,
+) -> Iterator[tuple[_Drawn, TensorGradients]]:
+    """Each view with its gradients, drawn and taken back before the next one."""
     _clear(state.parameters)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot, scales[slot])
         _regularize_view(setup, state, drawn, regular)
         state.laps.lap("loss")
         _backward(drawn.loss)
-        records.append(drawn.record)
-        photos.append((drawn.record.index, drawn.leaves))
-        if setup.separate:
-            per_view.append(_take(state.parameters))
-        else:
-            total.add(_take(state.parameters))
-        state.laps.lap("backward")
-    state.counters.backward_passes += len(records)
-    if not setup.separate:
-        return Rendered(tuple(records), total, regular, tuple(photos))
-    # Single views are not needed after they are combined, unless a plugin says so.
-    apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
-    return Rendered(tuple(records), apart, regular, tuple(photos))
+        yield drawn, _take(state.parameters)
+
+
+def _together(
+    setup: Setup,
+    state: TrainState,
+    draw: Draw,
+    scales: Sequence[float],
+    regular: TensorGradients,
+) -> Iterator[tuple[_Drawn, TensorGradients]]:
+    """Each view with its gradients, all drawn in one call and taken back in one backward pass.
+
+    That pass ends at copies of what was decoded, which are each view's own; from there every view
+    goes back to the parameters by itself.
+    """
+    _clear(state.parameters)
+    slots = range(len(draw.views))
+    prepared = [_prepare(setup, state, draw, slot, scales[slot]) for slot in slots]
+    copies = [view.gaussians.mapped(_leaf) for view in prepared]
+    renders = setup.rasterizer.render_views(
+        [(copy, view.target.camera) for copy, view in zip(copies, prepared, strict=True)],
+        [view.background for view in prepared],
+        _outputs(setup, state),
+    )
+    state.laps.lap("render")
+    pairs = zip(prepared, renders, strict=True)
+    drawn = [_compare(setup, state, draw, view, render) for view, render in pairs]
+    for each in drawn:
+        _regularize_view(setup, state, each, regular)
+    state.laps.lap("loss")
+    _backward(torch.stack([each.loss for each in drawn]).sum())
+    for each, copy in zip(drawn, copies, strict=True):
+        _pass_back(each.gaussians, copy)
+        yield each, _take(state.parameters)
+
+
+def _leaf(tensor: Tensor) -> Tensor:
+    return tensor.detach().requires_grad_(tensor.requires_grad)
+
+
+def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
+    """Takes the gradients of the copy of what was decoded back to the parameters."""
+    # Of a tensor that needs no gradient the copy has none.
+    pairs = [(t, c.grad) for t, c in zip(decoded.floats(), copy.floats(), strict=True)]
+    given = [(tensor, gradient) for tensor, gradient in pairs if gradient is not None]
+    torch.autograd.backward([t for t, _ in given], [g for _, g in given])
+
+
+def _with_losses(
+    state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
+) -> tuple[ViewRecord, ...]:
+    """The records with their losses, which are read together: a GPU is waited for once.
+
+    Raises:
+        NonFiniteError: A loss is not finite.
+    """
+    values = torch.stack(list(losses)).tolist()
+    for record, value in zip(records, values, strict=True):
+        if not isfinite(value):
+            raise NonFiniteError(state.step, (record.view.name,), "the photometric loss")
+    return tuple(replace(r, loss=value) for r, value in zip(records, values, strict=True))
 
 
 def _render_jointly(
@@ -120,55 +214,69 @@ def _render_jointly(
     """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
     _clear(state.parameters)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
+    losses = [view.loss.detach() for view in drawn]
+    records = _with_losses(state, [view.record for view in drawn], losses)
     for view in drawn:
         _regularize_view(setup, state, view, regular)
     state.laps.lap("loss")
     _backward(torch.stack([view.loss for view in drawn]).sum())
     state.laps.lap("backward")
     state.counters.backward_passes += 1
-    records = tuple(view.record for view in drawn)
     total = SummedGradients(_take(state.parameters), setup.trained_blocks, len(records))
     photos = tuple((view.record.index, view.leaves) for view in drawn)
     return Rendered(records, total, regular, photos)
 
 
-def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Drawn:
-    index = draw.views[slot]
-    view = setup.train_views[index]
-    target = target_at(setup, state, index, scale)
+def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Prepared:
+    """The photo of a view of the draw, and what is decoded for it."""
+    target = target_at(setup, state, draw.views[slot], scale)
     background = background_of(setup, state)
     state.laps.lap("photos")
     gaussians = setup.backbone.decode(
         state.parameters, target.camera, setup.phase(state.step, training=True)
     )
     state.laps.lap("decode")
-    # The optional statistics are not needed once density control is over, and some cost much.
-    wanted = setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
-    render = setup.rasterizer.render(gaussians, target.camera, background, wanted)
+    return _Prepared(slot, target, background, gaussians)
+
+
+def _outputs(setup: Setup, state: TrainState) -> frozenset[str]:
+    """The optional statistics, not needed once density control is over; some cost much."""
+    return setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
+
+
+def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Drawn:
+    view, wanted = _prepare(setup, state, draw, slot, scale), _outputs(setup, state)
+    camera = view.target.camera
+    render = setup.rasterizer.render(view.gaussians, camera, view.background, wanted)
     state.laps.lap("render")
+    return _compare(setup, state, draw, view, render)
+
+
+def _compare(
+    setup: Setup, state: TrainState, draw: Draw, view: _Prepared, render: Render
+) -> _Drawn:
+    """The render of a view beside its photo."""
+    index, target = draw.views[view.slot], view.target
     leaves = leaves_of(setup, state, index)
     image = setup.exposure.exposed(render.image, leaves)
     weights = weights_of(setup, state, index, target)
     loss = setup.loss.loss(image, target.photo, target.mask, weights)
     state.counters.views += 1
-    value = float(loss.detach())
-    if not isfinite(value):
-        raise NonFiniteError(state.step, (view.name,), "the photometric loss")
     record = ViewRecord(
         index=index,
-        view=view,
-        label=draw.labels[slot] if draw.labels is not None else None,
-        loss=value,
-        gaussians=gaussians.detached(),
+        view=setup.train_views[index],
+        label=draw.labels[view.slot] if draw.labels is not None else None,
+        loss=nan,
+        gaussians=view.gaussians.detached(),
         screen=render.screen,
-        background=background,
+        background=view.background,
         camera=target.camera,
-        scale=scale,
+        scale=target.scale,
         image=image.detach(),
         photo=target.photo,
         mask=target.mask,
     )
-    return _Drawn(record, gaussians, loss, leaves)
+    return _Drawn(record, view.gaussians, loss, leaves)
 
 
 def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:
@@ -181,9 +289,10 @@ def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> V
     state.laps.lap("loss")
     _backward(drawn.loss)
     _clear(state.parameters)
+    record = _with_losses(state, [drawn.record], [drawn.loss.detach()])[0]
     state.counters.backward_passes += 1
     state.laps.lap("backward")
-    return drawn.record
+    return record
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +316,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> Targ
     """Camera and photo of a training view at a scale in (0, 1]."""
     view = setup.train_views[index]
     camera = camera_at(view.camera, scale)
-    photo, mask = setup.scaled_photos.get(view, camera, partial(photo_of, setup, state))
+    photo, mask = setup.scaled_photos.get(view, camera, partial(_decoded, state))
     return Target(camera, scale, photo, mask)
 
 
@@ -249,12 +358,15 @@ def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, An
     }
 
 
-def photo_of(setup: Setup, state: TrainState, view: View) -> tuple[Tensor, Tensor | None]:
+def photo_of(setup: Setup, state: TrainState, view: View) -> Pair:
     """The decoded photo and mask of a view on the run's device; decoding counts as loading."""
+    return on_device(_decoded(state, view), setup.device)
+
+
+def _decoded(state: TrainState, view: View) -> Pair:
+    """The decoded photo and mask of a view in the machine's memory, where they are decoded."""
     start, cpu = perf_counter(), thread_time()
     image, mask = view.photo.image(), view.photo.mask()
-    image = image.to(setup.device)
-    mask = None if mask is None else mask.to(setup.device)
     seconds = perf_counter() - start
     state.clock.load += seconds
     state.laps.leave_out(seconds, thread_time() - cpu)

@@ -17,8 +17,9 @@ from support.pairwise import Row
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.registry.entries import build, offers
+from crossgrad_core.registry.entries import build, load, offers
 from crossgrad_core.run.assemble import reasons_against, select
 from crossgrad_core.testing.fixtures import sample_scene
 
@@ -45,9 +46,18 @@ Refused: TypeAlias = Mapping[Row, Collection[str]]
 
 @cache
 def every_combination(distribution: str = "crossgrad") -> tuple[Row, ...]:
-    """One name per slot of `SLOTS`, all there are of one distribution, in alphabetical order."""
-    names = ((e.name for e in offers(f"{s}s") if e.distribution == distribution) for s in SLOTS)
-    return tuple(product(*map(sorted, names)))
+    """One name per slot of `SLOTS`, all there are of one distribution, in alphabetical order.
+
+    Of the rasterizers those that run on a CPU: the others are refused here, whatever else is named.
+    """
+    return tuple(product(*(sorted(_names(slot, distribution)) for slot in SLOTS)))
+
+
+def _names(slot: str, distribution: str) -> list[str]:
+    names = [entry.name for entry in offers(f"{slot}s") if entry.distribution == distribution]
+    if slot != "rasterizer":
+        return names
+    return [name for name in names if "cpu" in load(Rasterizer, name).devices]
 
 
 def config_of(row: Row) -> RunConfig:

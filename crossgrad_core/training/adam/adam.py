@@ -1,11 +1,11 @@
 """Adam on named tensors, in place, without building an optimizer object."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.training.adam.coefficients import (
@@ -59,7 +59,8 @@ def adam_step(
         coefficients = _coefficients(state.steps[name], lrs[name], rule)
         if scales is not None:
             coefficients = replace(coefficients, scale=scales[name])
-        update_tensor(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
+        update = update_on_gpu if param.is_cuda else update_tensor
+        update(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
 
 
 def update_tensor(
@@ -78,6 +79,30 @@ def update_tensor(
             torch.autograd.graph.increment_version(tensor)
     else:
         update_reference(param, grad, exp_avg, exp_avg_sq, step)
+
+
+def update_on_gpu(
+    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
+) -> None:
+    """The same step by torch's fused Adam, which leaves what is subnormal as it is."""
+    grad = (grad if step.scale == 1.0 else grad * step.scale).clamp(-LARGEST, LARGEST)
+    adam(
+        [param],
+        [grad],
+        [exp_avg],
+        [exp_avg_sq],
+        [],
+        # The function adds 1 first.
+        [torch.full((), step.age - 1, dtype=torch.float32, device=param.device)],
+        fused=True,
+        amsgrad=False,
+        beta1=step.beta1,
+        beta2=step.beta2,
+        lr=step.lr,
+        weight_decay=0.0,
+        eps=step.eps,
+        maximize=False,
+    )
 
 
 def update_reference(
@@ -105,10 +130,9 @@ def _coefficients(count: int, lr: float, rule: Rule) -> Coefficients:
     return Coefficients(
         beta1=beta1,
         beta2=beta2,
-        step_size=lr / (1 - beta1**age),
-        root_scale=1 / math.sqrt(1 - beta2**age),
+        lr=lr,
+        age=age,
         eps=rule.eps,
-        square_floor=math.sqrt(SMALLEST_NORMAL / (1 - beta2)),
     )
 
 

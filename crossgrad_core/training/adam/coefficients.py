@@ -62,22 +62,35 @@ class Rule:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The numbers of one tensor's step; bias correction is folded in.
+    """The numbers of one tensor's step.
 
     Attributes:
         beta1: Decay of the first moment.
         beta2: Decay of the second moment.
-        step_size: Learning rate / (1 - beta1^t).
-        root_scale: 1 / sqrt(1 - beta2^t).
+        lr: Learning rate.
+        age: t, steps so far as bias correction counts them, this one included.
         eps: Added to the root of the corrected second moment.
-        square_floor: Gradients below it would give a subnormal contribution to the second moment.
         scale: What the gradient is multiplied by.
     """
 
     beta1: float
     beta2: float
-    step_size: float
-    root_scale: float
+    lr: float
+    age: float
     eps: float
-    square_floor: float
     scale: float = 1.0
+
+    @property
+    def step_size(self) -> float:
+        """Learning rate / (1 - beta1^t)."""
+        return self.lr / float(1 - self.beta1**self.age)
+
+    @property
+    def root_scale(self) -> float:
+        """1 / sqrt(1 - beta2^t)."""
+        return 1 / sqrt(1 - self.beta2**self.age)
+
+    @property
+    def square_floor(self) -> float:
+        """Gradients below it would give a subnormal contribution to the second moment."""
+        return sqrt(SMALLEST_NORMAL / (1 - self.beta2))

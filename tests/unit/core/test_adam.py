@@ -1,11 +1,18 @@
 """Adam's fused kernel, its torch reference and torch.optim.Adam against one another."""
 
+from dataclasses import replace
+
 import numba
 import pytest
 import torch
 
 from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.training.adam.adam import adam_step, update_reference, update_tensor
+from crossgrad_core.training.adam.adam import (
+    adam_step,
+    update_on_gpu,
+    update_reference,
+    update_tensor,
+)
 from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients, Rule
 
 SHAPES = {"means": (50, 3), "f_rest": (50, 15, 3), "opacities": (50,), "empty": (0, 3)}
@@ -21,14 +28,7 @@ def tensors(seed, scale=1.0, dtype=torch.float32):
 
 
 def coefficients(step=3, lr=1e-2, eps=1e-15):
-    return Coefficients(
-        beta1=0.9,
-        beta2=0.999,
-        step_size=lr / (1 - 0.9**step),
-        root_scale=(1 - 0.999**step) ** -0.5,
-        eps=eps,
-        square_floor=(2.0**-126 / 1e-3) ** 0.5,
-    )
+    return Coefficients(beta1=0.9, beta2=0.999, lr=lr, age=step, eps=eps)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-7, 1e-12, 1e12])
@@ -83,6 +83,25 @@ def test_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
     for mine, reference, tolerance in zip(ours, theirs, (1e-8, 0, 0), strict=True):
         assert torch.isfinite(mine).all()
         torch.testing.assert_close(mine, reference, rtol=2e-6, atol=tolerance)
+
+
+@pytest.mark.parametrize("magnitude", [1e-12, 1e-6, 1.0, 1e15, 1e30])
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_the_update_of_a_gpu_agrees_with_the_reference(magnitude, scale):
+    """Torch's fused Adam, which also runs here; ages need not be whole."""
+    generator = torch.Generator().manual_seed(4)
+    param = torch.randn(3000, generator=generator)
+    ours = [param.clone(), torch.zeros(3000), torch.zeros(3000)]
+    theirs = [tensor.clone() for tensor in ours]
+    for step in range(1, 5):
+        grad = magnitude * torch.randn(3000, generator=generator)
+        numbers = replace(coefficients(0.75 * step), scale=scale)
+        update_on_gpu(ours[0], grad, ours[1], ours[2], numbers)
+        update_reference(theirs[0], grad, theirs[1], theirs[2], numbers)
+    for mine, reference in zip(ours, theirs, strict=True):
+        assert torch.isfinite(mine).all()
+        rounding = 1e-6 * float(reference.abs().max())
+        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=rounding)
 
 
 def test_no_gradient_leaves_everything_alone():

@@ -10,6 +10,7 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.entries import build
@@ -397,3 +398,37 @@ def test_aggregation_is_what_operators_do_by_default():
     )
     direct, _ = aggregate_by_gramians(Symmetric(), "block", context, EMPTY_STATE)
     assert all(torch.equal(found.gradients[n], direct.gradients[n]) for n in SHAPES)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("bad", [None, "first", "middle", "last", "all"])
+def test_sums_that_are_read_late_are_those_that_are_read_at_once(count, bad):
+    """What is left out, what is counted as present, and the sum and the mean that remain."""
+    views = make_views(count)
+    views[0]["scales"].zero_()
+    views[-1]["opacities"] = None
+    hit = {None: [], "first": [0], "middle": [count // 2], "last": [-1], "all": range(count)}[bad]
+    for k in hit:
+        views[k]["mlp.1"][2] = torch.nan
+        views[k]["means"][3, 1] = torch.inf
+    now, late = accumulation(views), DeferredSums(BLOCKS, count)
+    for view in views:
+        late.add(copied(view))
+    assert late.views == count
+    np.testing.assert_array_equal(late.finite(), now.finite())
+    np.testing.assert_array_equal(late.present(), now.present())
+    for divisor in (1, count):
+        expected, found = accumulation(views).total(divisor), late.total(divisor)
+        assert set(found) == set(SHAPES)
+        for name, tensor in found.items():
+            other = expected.get(name)
+            assert (tensor is None) == (other is None), name
+            if tensor is not None:
+                torch.testing.assert_close(tensor, other, rtol=1e-6, atol=1e-6)
+
+
+def test_sums_that_are_read_late_take_no_more_views_than_were_to_come():
+    late = DeferredSums(BLOCKS, 1)
+    late.add(make_views(1)[0])
+    with pytest.raises(RuntimeError, match="one view more than the 1"):
+        late.add(make_views(1)[0])

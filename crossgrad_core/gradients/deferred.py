@@ -1,0 +1,109 @@
+"""The running sum of the gradients of K views on a GPU, which is not waited for before it is read.
+
+`SummedGradients` looks at each view's gradients as they come, which on a GPU would stop the host K
+times for each tensor.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contract.blocks import Block
+from crossgrad_core.contract.gradients import Gradients
+from crossgrad_core.gradients.finite import largest
+
+
+class DeferredSums(Gradients):
+    """The sum of K views' gradients in the order of the views; single views are not kept.
+
+    What is not finite is left out on the device. `finite`, `present` and `total` read the largest
+    magnitudes of all views and tensors, in one transfer; the last view waits for that.
+
+    Args:
+        blocks: The blocks.
+        views: K, the views to come.
+    """
+
+    def __init__(self, blocks: Sequence[Block], views: int) -> None:
+        self._blocks = tuple(blocks)
+        self._names = tuple(name for block in blocks for name in block.tensors)
+        self._expected = views
+        self._sum: dict[str, Tensor] = {}
+        self._last: dict[str, Tensor] = {}
+        self._largest: list[dict[str, Tensor]] = []
+
+    def add(self, view: Mapping[str, Tensor | None]) -> None:
+        """Adds the gradients of one more view, and takes them over: they are written to.
+
+        Raises:
+            RuntimeError: All views that were to come are there.
+        """
+        if len(self._largest) == self._expected:
+            raise RuntimeError(f"one view more than the {self._expected} that were to come")
+        if self._largest:
+            self._fold({name: self._kept(name) for name in self._last})
+        given = {name: view.get(name) for name in self._names}
+        self._last = {n: g.detach().contiguous() for n, g in given.items() if g is not None}
+        self._largest.append({name: largest(g) for name, g in self._last.items()})
+
+    @property
+    @override
+    def views(self) -> int:
+        return len(self._largest)
+
+    @override
+    def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
+        finite = self.finite()
+        if self._last:
+            kept = self._tensors_of(finite[:, -1])
+            self._fold({name: g for name, g in self._last.items() if name in kept})
+            self._last = {}
+        some = self._tensors_of(np.asarray(finite.any(axis=1)))
+        sums = {name: self._sum.get(name) if name in some else None for name in self._names}
+        return {n: g if g is None or divisor == 1 else g / divisor for n, g in sums.items()}
+
+    @override
+    def finite(self) -> NDArray[np.bool_]:
+        return self._read[0]
+
+    @override
+    def present(self) -> NDArray[np.bool_]:
+        return self._read[1]
+
+    def _tensors_of(self, chosen: NDArray[np.bool_]) -> set[str]:
+        """The tensors of the chosen blocks [B]."""
+        blocks = zip(self._blocks, chosen.tolist(), strict=True)
+        return {name for block, is_chosen in blocks if is_chosen for name in block.tensors}
+
+    def _kept(self, name: str) -> Tensor:
+        """The last view's gradient, 0 where its block is not finite."""
+        block = next(block for block in self._blocks if name in block.tensors)
+        sizes = [self._largest[-1][other] for other in block.tensors if other in self._last]
+        gradient = self._last[name]
+        kept = torch.stack(sizes).isfinite().all()
+        return torch.where(kept, gradient, torch.zeros_like(gradient))
+
+    def _fold(self, gradients: Mapping[str, Tensor]) -> None:
+        for name, gradient in gradients.items():
+            held = self._sum.get(name)
+            self._sum[name] = gradient if held is None else held.add_(gradient)
+
+    @cached_property
+    def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """[B, K] whether each view is finite, and whether it is also not zero; waits for it."""
+        found = [size for view in self._largest for size in view.values()]
+        values = iter(torch.stack(found).tolist() if found else ())
+        sizes = [{name: next(values) for name in view} for view in self._largest]
+        finite = np.ones((len(self._blocks), self.views), np.bool_)
+        present = np.zeros_like(finite)
+        for b, block in enumerate(self._blocks):
+            for k, view in enumerate(sizes):
+                of_block = np.array([view.get(name, 0.0) for name in block.tensors])
+                finite[b, k] = np.isfinite(of_block).all()
+                present[b, k] = finite[b, k] and of_block.any()
+        return finite, present

@@ -1,0 +1,125 @@
+"""A known scene, drawn before a run trains on a GPU: image, loss and gradients as they must be.
+
+Others have trained a first process on a fresh machine to 14 dB without any error (gsplat issue
+872), and drawn memory that nobody had written (gsplat issue 1031).
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, UserError
+from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
+
+#: Largest difference of a pixel: a few Gaussians at the edge of their footprint, 1/255 each.
+PIXEL: Final = 0.02
+#: Largest mean difference of pixels, and relative difference of the loss.
+MEAN: Final = 5e-4
+#: Largest relative difference of the gradients of a tensor.
+GRADIENT: Final = 2e-2
+_SIZE: Final = (70, 50)
+_NUMBER: Final = 200
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a rasterizer makes of the known scene, on the CPU.
+
+    Attributes:
+        image: [H, W, 3].
+        loss: Mean squared difference from a ramp of greys.
+        gradients: Tensor name -> its gradient.
+    """
+
+    image: Tensor
+    loss: float
+    gradients: dict[str, Tensor]
+
+
+def burn_in(rasterizer: Rasterizer, device: str) -> None:
+    """Draws the known scene twice, since it is the first process and the first call that fail.
+
+    Raises:
+        UserError: The rasterizer raises something, or draws something else than `torch` does.
+    """
+    expected = look_at(_reference(rasterizer), "cpu")
+    for _ in range(2):
+        try:
+            found = look_at(rasterizer, device)
+        except UserError:
+            raise
+        except Exception as error:
+            raise _refused(rasterizer, "cannot draw", f"{type(error).__name__}: {error}") from error
+        if wrong := difference(found, expected):
+            raise _refused(rasterizer, "draws a known scene wrongly", wrong)
+
+
+def known_scene(device: str) -> tuple[Gaussians, Camera]:
+    """Gaussians of a few pixels, some outside the image, and a camera off their axis."""
+    random = torch.Generator().manual_seed(872)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        values = torch.rand((_NUMBER, *shape), generator=random) * (high - low) + low
+        return values.to(device).requires_grad_()
+
+    gaussians = Gaussians(
+        means=uniform(-1.0, 1.0, 3),
+        quats=uniform(-1.0, 1.0, 4),
+        scales=uniform(0.03, 0.12, 3),
+        opacities=uniform(0.1, 0.9),
+        colors=uniform(0.0, 1.0, 3),
+    )
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([0.1, -0.1, 2.5])
+    width, height = _SIZE
+    return gaussians, Camera(width, height, 60.0, 62.0, 36.0, 24.0, pose)
+
+
+def look_at(rasterizer: Rasterizer, device: str) -> Look:
+    """What a rasterizer makes of the known scene."""
+    gaussians, camera = known_scene(device)
+    background = torch.tensor([0.2, 0.4, 0.6], device=device)
+    image = rasterizer.render(gaussians, camera, background).image
+    ramp = torch.linspace(0.0, 1.0, image.numel(), device=device).view(image.shape)
+    loss = (image - ramp).square().mean()
+    loss.backward()  # type: ignore[no-untyped-call]
+    names = ("means", "quats", "scales", "opacities", "colors")
+    gradients = {name: getattr(gaussians, name).grad for name in names}
+    known = {name: g.cpu() for name, g in gradients.items() if g is not None}
+    return Look(image.detach().cpu(), float(loss.detach()), known)
+
+
+def difference(found: Look, expected: Look) -> str:
+    """What is wrong with a look; empty where nothing is."""
+    error = (found.image - expected.image).abs()
+    if not (error.max() < PIXEL and error.mean() < MEAN):
+        return (
+            f"pixels are up to {float(error.max()):.2g} off, {float(error.mean()):.2g} on average"
+        )
+    if not abs(found.loss - expected.loss) < MEAN * expected.loss:
+        return f"the loss is {found.loss:.6g}, not {expected.loss:.6g}"
+    for name, gradient in expected.gradients.items():
+        other = found.gradients.get(name, torch.zeros_like(gradient))
+        share = float((other - gradient).norm() / gradient.norm())
+        if not share < GRADIENT:
+            return f"the gradient of the {name} is {share:.2g} of its length off"
+    return ""
+
+
+def _reference(rasterizer: Rasterizer) -> TorchRasterizer:
+    shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
+    footprint = getattr(rasterizer, "footprint", "alpha")
+    return TorchRasterizer(**shared, footprint=footprint)
+
+
+def _refused(rasterizer: Rasterizer, what: str, found: str) -> UserError:
+    return UserError(
+        f"{type(rasterizer).__name__} {what} on this machine",
+        where="--rasterizer, before the first step",
+        expected="the image, loss and gradients of rasterizer torch",
+        found=found,
+        todo="run the command once more, as first processes on a fresh machine are known to fail; "
+        "if it stays, install packages that fit torch's CUDA version, or use --rasterizer torch",
+    )

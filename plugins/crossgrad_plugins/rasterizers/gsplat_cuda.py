@@ -1,0 +1,170 @@
+"""gsplat's rasterizer: CUDA, several views of one size in one call."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    Camera,
+    Gaussians,
+    Rasterizer,
+    Render,
+    Response,
+    Screen,
+    Selection,
+    hookimpl,
+)
+from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
+from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
+from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
+from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
+
+_PACKAGE = "gsplat"
+_GEOMETRY = ("means", "quats", "scales", "opacities")
+
+
+class GsplatRasterizer(Rasterizer):
+    """Draws with the package gsplat (Apache-2); docs/rasterizers.md has how its rules differ.
+
+    Source: Ye et al. 2024 (gsplat, arXiv 2409.06765).
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"depth", "abs_gradient"})
+    responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
+    devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
+    together: ClassVar[bool] = True
+    repeatable: ClassVar[bool] = False
+
+    max_alpha: float = Field(
+        0.999, ge=0.999, le=0.999, description="cap of a Gaussian's alpha; gsplat 1.5 has no other"
+    )
+
+    @classmethod
+    @override
+    def speed(cls, device: str) -> float:
+        return 100.0 if device in cls.devices and not _missing() else 0.0
+
+    @hookimpl
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Objects where the package, or what it compiles its kernels with, is not there."""
+        missing = _missing() if selection.device in self.devices else None
+        return [missing] if missing else []
+
+    @override
+    def burn_in(self, device: str) -> None:
+        burn_in(self, device)
+
+    @override
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        return self.render_views([(gaussians, camera)], [background], outputs)[0]
+
+    @override
+    def render_views(
+        self,
+        views: Sequence[tuple[Gaussians, Camera]],
+        backgrounds: Sequence[Tensor],
+        outputs: frozenset[str] = frozenset(),
+    ) -> list[Render]:
+        alike: dict[tuple[object, ...], list[int]] = defaultdict(list)
+        for slot, (gaussians, camera) in enumerate(views):
+            size = (camera.width, camera.height, len(gaussians))
+            alike[*size, gaussians.dilation, gaussians.response].append(slot)
+        renders: dict[int, Render] = {}
+        for slots in alike.values():
+            some, behind = [views[s] for s in slots], [backgrounds[s] for s in slots]
+            renders.update(zip(slots, self._drawn(some, behind, outputs), strict=True))
+        return [renders[slot] for slot in range(len(views))]
+
+    def _drawn(
+        self,
+        views: Sequence[tuple[Gaussians, Camera]],
+        backgrounds: Sequence[Tensor],
+        outputs: frozenset[str],
+    ) -> list[Render]:
+        """K views of one size, with N Gaussians each, in one call of gsplat."""
+        gaussians, camera = views[0]
+        screens = [
+            Screen(torch.zeros(len(each), dtype=torch.int32, device=each.means.device))
+            for each, _ in views
+        ]
+        # The Gaussians of each view are a batch of their own, so that gradients stay apart.
+        tensors = [_batch([getattr(each, name) for each, _ in views]) for name in _GEOMETRY]
+        tensors.append(_batch([view_colors(each, _center(each, c)) for each, c in views]))
+        settings = {
+            "width": camera.width,
+            "height": camera.height,
+            "near_plane": self.near,
+            "eps2d": self.dilation if gaussians.dilation is None else gaussians.dilation,
+            "packed": False,
+            "backgrounds": _batch(backgrounds)[:, None],
+            "render_mode": "RGB+D" if "depth" in outputs else "RGB",
+            "absgrad": "abs_gradient" in outputs,
+            "rasterize_mode": "antialiased" if gaussians.response == "antialiased" else "classic",
+            **_cameras([camera for _, camera in views], gaussians.means),
+        }
+        call = Call(partial(_draw, screens, settings), partial(_observe, screens))
+        channels, alpha = drawn(call, tensors)
+        return [
+            Render(
+                image=channels[view, ..., :3],
+                alpha=alpha[view, ..., 0],
+                screen=screen,
+                depth=channels[view, ..., 3] if "depth" in outputs else None,
+            )
+            for view, screen in enumerate(screens)
+        ]
+
+
+def _missing() -> str | None:
+    return package_missing(_PACKAGE) or compiler_missing(_PACKAGE)
+
+
+def _batch(tensors: Sequence[Tensor]) -> Tensor:
+    """[K, ...] of K tensors; no copy of a single one."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def _center(gaussians: Gaussians, camera: Camera) -> Tensor:
+    return camera.center.to(gaussians.means)
+
+
+def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
+    """Poses [K, 1, 4, 4] and calibrations [K, 1, 3, 3], copied to the device in one piece."""
+    poses = torch.stack([camera.world_to_camera.reshape(-1) for camera in cameras])
+    matrices = torch.stack([camera.matrix.reshape(-1) for camera in cameras])
+    both = torch.cat([poses, matrices], 1).to(like)
+    count = len(cameras)
+    return {"viewmats": both[:, :16].view(count, 1, 4, 4), "Ks": both[:, 16:].view(count, 1, 3, 3)}
+
+
+def _draw(
+    screens: Sequence[Screen], settings: Mapping[str, Any], tensors: Sequence[Tensor]
+) -> Drawing:
+    from gsplat import rasterization
+
+    means, quats, scales, opacities, colors = tensors
+    channels, alpha, meta = rasterization(means, quats, scales, opacities, colors, **settings)
+    for screen, radii in zip(screens, meta["radii"], strict=True):
+        screen.radii = radii[0].amax(-1)
+    return Drawing((channels[:, 0], alpha[:, 0]), meta["means2d"])
+
+
+def _observe(screens: Sequence[Screen], centers: Tensor, gradient: Tensor) -> None:
+    """Notes the gradients [K, 1, N, 2] by the projected means."""
+    absolute = getattr(centers, "absgrad", None)
+    for view, screen in enumerate(screens):
+        screen.mean_gradient = gradient[view, 0]
+        if absolute is not None:
+            screen.abs_gradient = absolute[view, 0]

@@ -1,0 +1,155 @@
+"""gswarp's rasterizer: NVIDIA Warp, which brings its own compiler, so that a driver is enough."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import normalize
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    Camera,
+    Gaussians,
+    Rasterizer,
+    Render,
+    Screen,
+    Selection,
+    hookimpl,
+)
+from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
+from crossgrad_plugins.rasterizers.gpu.missing import package_missing
+from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
+from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
+
+_PACKAGE = "gswarp"
+#: Depth up to which gswarp draws nothing, in the units that it is given.
+_NEAR = 0.2
+
+
+class GswarpRasterizer(Rasterizer):
+    """Draws with the package gswarp (Apache-2); docs/rasterizers.md has how its rules differ.
+
+    gswarp's near plane is fixed. What it is given is scaled so that the plane is where `near` says.
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"depth"})
+    devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
+    repeatable: ClassVar[bool] = False
+
+    max_alpha: float = Field(
+        0.99, ge=0.99, le=0.99, description="cap of a Gaussian's alpha; gswarp has no other"
+    )
+    dilation: float = Field(
+        0.3, ge=0.3, le=0.3, description="dilation of the 2-D covariance, px^2; gswarp has no other"
+    )
+    footprint: Literal["3-sigma"] = Field(
+        "3-sigma", description="as the original code; gswarp has no other"
+    )
+
+    @classmethod
+    @override
+    def speed(cls, device: str) -> float:
+        return 80.0 if device in cls.devices and not package_missing(_PACKAGE) else 0.0
+
+    @hookimpl
+    def crossgrad_objections(self, selection: Selection) -> list[str]:
+        """Objects where the package is not there, and to backbones with a dilation of their own."""
+        if selection.device not in self.devices:
+            return []
+        reasons = []
+        if missing := package_missing(_PACKAGE):
+            reasons.append(missing)
+        if selection.backbone.own_dilation and selection.backbone.response in self.responses:
+            name = selection.names["backbone"]
+            reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")
+        return reasons
+
+    @override
+    def burn_in(self, device: str) -> None:
+        burn_in(self, device)
+
+    @override
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: Tensor,
+        outputs: frozenset[str] = frozenset(),
+    ) -> Render:
+        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32).to(gaussians.means.device))
+        if not len(gaussians):
+            blank = background.expand(camera.height, camera.width, 3)
+            return Render(blank, torch.zeros_like(blank[..., 0]), screen)
+        enlarged = _NEAR / self.near
+        size = (camera.width / 2, camera.height / 2)
+        call = Call(
+            partial(_draw, screen, settings_of(camera, background, enlarged)),
+            partial(_observe, screen, gaussians.means.new_tensor(size)),
+        )
+        tensors = [
+            gaussians.means * enlarged,
+            normalize(gaussians.quats, dim=-1),
+            gaussians.scales * enlarged,
+            gaussians.opacities[:, None],
+            view_colors(gaussians, camera.center.to(gaussians.means)),
+        ]
+        image, alpha, depth = drawn(call, tensors)
+        return Render(
+            image=image.permute(1, 2, 0),
+            alpha=alpha[0],
+            screen=screen,
+            depth=depth[0] / enlarged if "depth" in outputs else None,
+        )
+
+
+def settings_of(camera: Camera, background: Tensor, enlarged: float) -> dict[str, Any]:
+    """The fields of gswarp's settings for a camera of a scene that is `enlarged` times as large.
+
+    Its matrices are transposed; the projection maps the image to [-1, 1], with the principal point.
+    """
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] *= enlarged
+    width, height = camera.width, camera.height
+    projection = torch.zeros(4, 4, dtype=torch.float64)
+    projection[0, 0], projection[0, 2] = 2 * camera.fx / width, 2 * camera.cx / width - 1
+    projection[1, 1], projection[1, 2] = 2 * camera.fy / height, 2 * camera.cy / height - 1
+    projection[2, 2] = projection[3, 2] = 1.0
+    matrices = torch.stack([pose.T, (projection @ pose).T]).to(background)
+    return {
+        "image_height": height,
+        "image_width": width,
+        "tanfovx": width / (2 * camera.fx),
+        "tanfovy": height / (2 * camera.fy),
+        "bg": background,
+        "scale_modifier": 1.0,
+        "viewmatrix": matrices[0],
+        "projmatrix": matrices[1],
+        "sh_degree": 0,
+        "campos": background.new_zeros(3),  # For harmonics, which are ours.
+        "prefiltered": False,
+        "auto_tune_verbose": False,
+    }
+
+
+def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -> Drawing:
+    from gswarp import GaussianRasterizationSettings, GaussianRasterizer
+
+    means, quats, scales, opacities, colors = tensors
+    centers = torch.zeros_like(means).requires_grad_()
+    image, screen.radii, meta = GaussianRasterizer(GaussianRasterizationSettings(**settings))(
+        means3D=means,
+        means2D=centers,
+        opacities=opacities,
+        colors_precomp=colors,
+        scales=scales,
+        rotations=quats,
+    )
+    return Drawing((image, meta.alpha, meta.depth), centers)
+
+
+def _observe(screen: Screen, half: Tensor, _centers: Tensor, gradient: Tensor) -> None:
+    """Notes the gradient [N, 3] by the projected means, which gswarp gives in NDC units."""
+    screen.mean_gradient = gradient[:, :2] / half

@@ -1,0 +1,160 @@
+"""What a rasterizer of another package lacks is told before training, with a way out."""
+
+import sys
+
+import pytest
+import torch
+from support.distributions import write_distribution
+from support.selections import selection_of
+
+from crossgrad_core.contract.objections import objections_to
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_plugins.rasterizers.gpu import missing
+from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
+from crossgrad_plugins.rasterizers.gswarp_cuda import GswarpRasterizer
+
+CUDA = Wanted("cuda", "plain")
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    """A machine with these packages, a torch for this CUDA, and an nvcc that says its version."""
+
+    def of(*packages, cuda="12.8", nvcc=None):
+        found = {name: object() for name in packages}
+        monkeypatch.setattr(missing, "find_spec", found.get)
+        monkeypatch.setattr(torch.version, "cuda", cuda)
+        for name in ("CUDA_HOME", "CUDA_PATH"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr(missing.shutil, "which", lambda name: f"/usr/bin/{name}")
+        compiler = tmp_path / "bin" / "nvcc"
+        if nvcc is None:
+            monkeypatch.setattr(missing, "find_nvcc", lambda: None)
+        else:
+            compiler.parent.mkdir()
+            compiler.write_text(f"#!/bin/sh\necho 'Cuda compilation tools, release {nvcc}, V1'\n")
+            compiler.chmod(0o755)
+            monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+
+    return of
+
+
+def objections(rasterizer, device="cuda", **more):
+    selection = selection_of(rasterizer=rasterizer, device=device, **more)
+    return rasterizer.crossgrad_objections(selection)
+
+
+def test_a_package_that_is_not_there_is_named_with_its_extra(machine):
+    machine()
+    for rasterizer, package in ((GsplatRasterizer(), "gsplat"), (GswarpRasterizer(), "gswarp")):
+        (reason,) = objections(rasterizer)
+        assert f"pip install 'crossgrad[{package}]'" in reason
+
+
+@pytest.mark.parametrize(
+    ("nvcc", "reason"),
+    [
+        (None, "there is no nvcc: install the CUDA toolkit 12.8"),
+        ("13.0", "is of CUDA 13.0, torch"),
+        ("12.4", None),
+    ],
+)
+def test_gsplat_needs_a_compiler_for_the_cuda_of_torch(machine, nvcc, reason):
+    machine("gsplat", nvcc=nvcc)
+    found = objections(GsplatRasterizer())
+    assert (found == []) == (reason is None)
+    assert reason is None or reason in found[0]
+
+
+def test_gsplat_with_its_kernels_compiled_needs_no_compiler(machine):
+    machine("gsplat", "gsplat.csrc")
+    assert objections(GsplatRasterizer()) == []
+
+
+def test_gsplat_needs_a_compiler_for_the_host(machine, monkeypatch):
+    machine("gsplat", nvcc="12.8")
+    monkeypatch.setattr(missing.shutil, "which", lambda _name: None)
+    assert "no C++ compiler" in objections(GsplatRasterizer())[0]
+
+
+def test_an_nvcc_that_says_nothing_is_not_held_against_anybody(machine, tmp_path):
+    machine("gsplat", nvcc="12.8")
+    (tmp_path / "bin" / "nvcc").write_text("#!/bin/sh\nexit 1\n")
+    missing.nvcc_version.cache_clear()
+    assert objections(GsplatRasterizer()) == []
+
+
+def test_on_a_cpu_the_device_alone_is_objected_to(machine):
+    machine()
+    for name, rasterizer in (("gsplat", GsplatRasterizer()), ("gswarp", GswarpRasterizer())):
+        assert objections(rasterizer, device="cpu") == []
+        selection = selection_of(rasterizer=rasterizer, names={"rasterizer": name})
+        assert objections_to(selection) == [f"rasterizer {name} does not run on device cpu"]
+
+
+@pytest.mark.parametrize(
+    ("slot", "name", "rasterizer", "reason"),
+    [
+        ("densifier", "pixel", "gsplat", "needs the screen statistics pixels"),
+        ("densifier", "dc4gs", "gsplat", "needs the screen statistics directions"),
+        ("densifier", "multiview", "gsplat", "needs the screen statistics count"),
+        ("densifier", "absgrad", "gswarp", "needs the screen statistics abs_gradient"),
+        ("backbone", "analytic", "gsplat", "does not draw the pixel response analytic"),
+        ("backbone", "mip", "gswarp", "does not draw the pixel response antialiased"),
+    ],
+)
+def test_what_a_rasterizer_does_not_give_is_refused_before_training(slot, name, rasterizer, reason):
+    chosen = {slot: build(f"{slot}s", name, {}), "rasterizer": build("rasterizers", rasterizer, {})}
+    selection = selection_of(device="cuda", names={slot: name, "rasterizer": rasterizer}, **chosen)
+    assert any(reason in objection for objection in objections_to(selection))
+
+
+def test_gswarp_refuses_a_dilation_of_ones_own(machine):
+    machine("gswarp")
+
+    class Own(type(build("backbones", "vanilla", {}))):
+        own_dilation = True
+
+    assert "by its own" in objections(GswarpRasterizer(), backbone=Own())[0]
+
+
+def test_the_fastest_that_is_there_and_can_is_taken(machine):
+    machine("gsplat", "gswarp", nvcc="12.8")
+    assert choose_rasterizer("auto", CUDA)[0] == "gsplat"
+    counting = Wanted("cuda", "plain", frozenset({"count"}))
+    assert choose_rasterizer("auto", counting)[0] == "torch"
+    inria = Wanted("cuda", "plain", options=frozenset({"footprint"}))
+    assert choose_rasterizer("auto", inria)[0] == "gswarp"
+    assert choose_rasterizer("auto", Wanted("cuda", "antialiased"))[0] == "gsplat"
+    assert choose_rasterizer("auto", Wanted("cpu", "plain"))[0] == "numba"
+
+
+def test_without_a_compiler_gswarp_is_taken_and_without_both_the_reference(machine):
+    machine("gsplat", "gswarp")
+    assert choose_rasterizer("auto", CUDA)[0] == "gswarp"
+    machine()
+    assert choose_rasterizer("auto", CUDA)[0] == "torch"
+
+
+def test_a_third_partys_is_asked_too(machine, tmp_path, monkeypatch):
+    machine("gsplat", nvcc="12.8")
+    source = """
+from crossgrad_core.plugin import Rasterizer
+
+class Faster(Rasterizer):
+    devices = frozenset({"cuda"})
+
+    @classmethod
+    def speed(cls, device):
+        return 200.0 if device == "cuda" else 0.0
+
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        raise NotImplementedError
+"""
+    entry = {"faster": "made_up_gpu:Faster"}
+    write_distribution(tmp_path, "made-up-gpu", {"rasterizers": entry}, {"made_up_gpu": source})
+    monkeypatch.syspath_prepend(tmp_path)
+    assert choose_rasterizer("auto", CUDA)[0] == "faster"
+    assert choose_rasterizer("auto", Wanted("cpu", "plain"))[0] == "numba"
+    sys.modules.pop("made_up_gpu", None)
