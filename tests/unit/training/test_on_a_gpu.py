@@ -82,7 +82,7 @@ def moved(setup, rasterizer, device):
     selection = replace(setup.selection, rasterizer=rasterizer, device=device.type)
     manager = make_manager(selection.components)
     photos = DevicePhotos(ScaledPhotos(64), device, 64)
-    return replace(setup, selection=selection, manager=manager, device=device, photos=photos)
+    return replace(setup, selection=selection, manager=manager, device=device, scaled_photos=photos)
 
 
 def steps(setup, count):
@@ -132,9 +132,9 @@ def test_the_device_notes_what_is_read_back():
             lambda: float(one.sum()),
             lambda: bool((one > 0).any()),
             lambda: one[one > 0],
-            lambda: one.cpu(),
-            lambda: one.tolist(),
-            lambda: one.nonzero(),
+            one.cpu,
+            one.tolist,
+            one.nonzero,
         ):
             reads.found.clear()
             read()

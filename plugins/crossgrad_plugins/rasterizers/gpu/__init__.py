@@ -1,1 +1,1 @@
-"""What rasterizers from other packages that run on a GPU have in common."""
+"""Common parts of rasterizers that draw on a GPU with another package."""

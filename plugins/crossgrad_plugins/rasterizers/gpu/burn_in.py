@@ -25,7 +25,7 @@ _NUMBER: Final = 200
 
 @dataclass(frozen=True)
 class Look:
-    """What a rasterizer makes of the known scene, on the CPU.
+    """The known scene as a rasterizer drew it, on the CPU.
 
     Attributes:
         image: [H, W, 3].

@@ -1,4 +1,4 @@
-"""What a rasterizer from another package lacks on this machine, and what to do about it."""
+"""Packages and compilers that a rasterizer lacks on this machine, and the way out."""
 
 import os
 import re

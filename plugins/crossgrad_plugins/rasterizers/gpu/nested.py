@@ -11,7 +11,7 @@ from typing_extensions import override
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What another package drew.
+    """The results of another package.
 
     Attributes:
         outputs: Differentiable results.

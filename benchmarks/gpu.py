@@ -1,0 +1,267 @@
+"""Step times and quality on a GPU, as one table; what is there already is not measured again.
+
+    python benchmarks/gpu.py SCENE                                 # all of it
+    python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
+
+Every rasterizer that runs on the GPU trains SCENE with every backbone, K and operator for a few
+hundred steps without density control, then for 30,000 steps as published. With the folder of
+gsplat's examples, gsplat's own trainer takes as many steps on the same scene. Runs, gpu.csv, the
+curves of the long runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the
+same command goes on. Without a GPU it ends with exit code 2.
+"""
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from _machine import code, facts
+
+from crossgrad_core.run.results.reading import read_run
+
+#: The last one is the readable reference: it takes part where K is 1, for comparison.
+RASTERIZERS = ("gsplat", "gswarp", "torch")
+BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
+VIEWS = (1, 2, 4, 8)
+OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
+COLUMNS = (
+    "part", "rasterizer", "backbone", "views", "operator", "steps", "ms_per_step",
+    "views_per_second", "train_seconds", "psnr", "primitives", "peak_mib", "note", "gpu", "torch",
+    "code", "date",
+)  # fmt: skip
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run.
+
+    Attributes:
+        part: `steps` or `long`.
+        rasterizer: Its name.
+        backbone: Its name.
+        views: K.
+        operator: Its name.
+        steps: How many it takes.
+    """
+
+    part: str
+    rasterizer: str
+    backbone: str
+    views: int
+    operator: str
+    steps: int
+
+    @property
+    def name(self) -> str:
+        """The folder of its runs."""
+        return "-".join(map(str, vars(self).values()))
+
+    def command(self, scene: Path, out: Path) -> list[str]:
+        """The command that trains it."""
+        options = {
+            "--device": "cuda",
+            "--rasterizer": self.rasterizer,
+            "--backbone": self.backbone,
+            "--sampler": "random",
+            "--views": self.views,
+            "--operator": self.operator,
+            "--steps": self.steps,
+            "--metrics": "psnr",
+            "--out": out,
+        }
+        if self.part == "steps":
+            options |= {"--densifier": "none", "--eval-every": self.steps}
+        else:
+            options |= {"--schedule": "absolute", "--eval-every": max(1, self.steps // 30)}
+        given = [str(part) for pair in options.items() for part in pair]
+        return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
+
+
+def cases(steps: int, long: int) -> Iterator[Case]:
+    """All runs, the short ones first."""
+    for rasterizer in RASTERIZERS:
+        for backbone in BACKBONES:
+            yield Case("steps", rasterizer, backbone, 1, "sum", steps)
+    for rasterizer in RASTERIZERS[:-1]:
+        for views in VIEWS[1:]:
+            for operator in OPERATORS:
+                yield Case("steps", rasterizer, "vanilla", views, operator, steps)
+    for rasterizer in RASTERIZERS[:-1]:
+        for views in VIEWS[:2]:
+            yield Case("long", rasterizer, "vanilla", views, "sum", long)
+
+
+def finished(folder: Path) -> Path | None:
+    """The finished run of a case, if there is one."""
+    for summary in sorted(folder.glob("*/summary.json")):
+        if json.loads(summary.read_text(encoding="utf-8")).get("status") == "finished":
+            return summary.parent
+    return None
+
+
+def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
+    """The folder of the case's finished run, trained now if need be; else None and why."""
+    folder = out / "runs" / case.name
+    if (run := finished(folder)) is not None:
+        return run, ""
+    refused = folder / "refused.txt"
+    if refused.is_file():
+        return None, refused.read_text(encoding="utf-8")
+    place = folder / str(len(list(folder.glob("*"))) + 1)
+    ended = subprocess.run(case.command(scene, place), capture_output=True, text=True, check=False)
+    if ended.returncode == 0:
+        return place, ""
+    why = " ".join(ended.stderr.split())
+    if ended.returncode == 2:
+        # Bad input stays so; what failed for another reason is tried again by the next command.
+        folder.mkdir(parents=True, exist_ok=True)
+        refused.write_text(why, encoding="utf-8")
+    return None, why
+
+
+def row_of(case: Case, run: Path | None, why: str) -> Row:
+    """The figures of a case, or why it has none."""
+    row: Row = {**dict.fromkeys(COLUMNS, ""), **vars(case), "note": why[:300]}
+    if run is None:
+        return row
+    results = read_run(run)
+    summary: Mapping[str, Any] = results.summary or {}
+    environment = summary["environment"]
+    seconds = float(summary["train_seconds"])
+    return row | {
+        "ms_per_step": round(1e3 * seconds / case.steps, 2),
+        "views_per_second": round(case.steps * case.views / seconds, 1),
+        "train_seconds": round(seconds, 2),
+        "psnr": _rounded(results.figure("psnr")),
+        "primitives": summary["primitives"],
+        "peak_mib": _rounded(summary.get("peak_memory_mib")),
+        "gpu": environment["gpu"],
+        "torch": environment["packages"]["torch"],
+        "code": environment["commit"] or environment["crossgrad"],
+        "date": _written(run / "summary.json"),
+    }
+
+
+def theirs(examples: Path, scene: Path, out: Path, steps: int) -> Row:
+    """Gsplat's own trainer on the same scene: its step time, PSNR and number of Gaussians."""
+    folder = out / "runs" / f"gsplat-trainer-{steps}"
+    row: Row = {**dict.fromkeys(COLUMNS, ""), "part": "long", "backbone": "vanilla", "views": 1}
+    row |= {"rasterizer": "gsplat's trainer", "operator": "sum", "steps": steps}
+    trained = folder / "stats" / f"train_step{steps - 1}_rank0.json"
+    if not trained.is_file():
+        options = ["--data_dir", scene, "--data_factor", 1, "--result_dir", folder]
+        options += ["--max_steps", steps, "--eval_steps", steps, "--save_steps", steps]
+        command = [sys.executable, "simple_trainer.py", "default", "--disable_viewer", *options]
+        ended = subprocess.run(
+            list(map(str, command)), cwd=examples, capture_output=True, text=True, check=False
+        )
+        if not trained.is_file():
+            return row | {"note": " ".join(ended.stderr.split())[-300:]}
+    training = json.loads(trained.read_text(encoding="utf-8"))
+    held_out = folder / "stats" / f"val_step{steps - 1}.json"
+    shown = json.loads(held_out.read_text(encoding="utf-8")) if held_out.is_file() else {}
+    seconds = float(training["ellipse_time"])
+    return row | {
+        "ms_per_step": round(1e3 * seconds / steps, 2),
+        "views_per_second": round(steps / seconds, 1),
+        "train_seconds": round(seconds, 2),
+        "psnr": _rounded(shown.get("psnr")),
+        "primitives": training["num_GS"],
+        "peak_mib": round(1024 * float(training["mem"]), 1),
+        "note": "its photos, split and loss; seconds as it counts them",
+        "date": _written(trained),
+    }
+
+
+def curve_rows(case: Case, run: Path) -> Iterator[Row]:
+    """Step, training seconds and PSNR of every evaluation of a long run."""
+    for step, seconds, psnr in (
+        (row["step"], row["train_seconds"], row.get("psnr")) for row in read_run(run).rows
+    ):
+        yield {"run": case.name, "step": step, "train_seconds": seconds, "psnr": psnr}
+
+
+def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
+    """Writes a table."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(columns))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def as_markdown(rows: Iterable[Row], machine: str) -> str:
+    """The table for people."""
+    shown = COLUMNS[: COLUMNS.index("gpu")]
+    lines = [
+        "# On a GPU",
+        "",
+        f"`python benchmarks/gpu.py`, {machine}.",
+        "",
+        f"| {' | '.join(name.replace('_', ' ') for name in shown)} |",
+        f"|{'---|' * len(shown)}",
+    ]
+    cells = ([str(row[name]).replace("|", "/") for name in shown] for row in rows)
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in cells), ""])
+
+
+def _written(path: Path) -> str:
+    """When a file was written, UTC."""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
+
+
+def _rounded(value: float | None) -> float | str:
+    return "" if value is None else round(float(value), 3)
+
+
+def run_all(arguments: argparse.Namespace, gpu: str) -> None:
+    """Measures what is missing, and writes the tables after every run."""
+    out, scene = arguments.out.resolve(), arguments.scene.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    curves: list[Row] = []
+    machine = facts()
+    versions = f"torch {machine['torch']}, {machine['date']}, commit {code()}"
+    described = f"{gpu}, {machine['cpu']}, {versions}"
+
+    def write(row: Row) -> None:
+        rows.append(row)
+        print(json.dumps({name: value for name, value in row.items() if value != ""}), flush=True)
+        write_csv(out / "gpu.csv", COLUMNS, rows)
+        write_csv(out / "gpu_curves.csv", ("run", "step", "train_seconds", "psnr"), curves)
+        (out / "gpu.md").write_text(as_markdown(rows, described), encoding="utf-8")
+
+    for case in cases(arguments.steps, arguments.long):
+        run, why = measured(case, scene, out)
+        if run is not None and case.part == "long":
+            curves.extend(curve_rows(case, run))
+        write(row_of(case, run, why))
+    if arguments.gsplat_examples is not None:
+        write(theirs(arguments.gsplat_examples.resolve(), scene, out, arguments.long))
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--long", type=int, default=30_000)
+    parser.add_argument("--out", type=Path, default=Path("gpu"))
+    parser.add_argument("--gsplat-examples", type=Path)
+    arguments = parser.parse_args()
+    import torch
+
+    if not torch.cuda.is_available():
+        print(f"torch {torch.__version__} sees no GPU: nothing is measured", file=sys.stderr)
+        sys.exit(2)
+    run_all(arguments, torch.cuda.get_device_name())
+
+
+if __name__ == "__main__":
+    main()
