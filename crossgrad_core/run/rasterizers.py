@@ -7,6 +7,7 @@ from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries, load
+from crossgrad_core.wording import listed
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,14 @@ class Wanted:
     outputs: frozenset[str] = frozenset()
     options: frozenset[str] = frozenset()
 
-    def given_by(self, rasterizer: type[Rasterizer]) -> bool:
-        """Whether a rasterizer can do all of it."""
-        return (
-            self.response in rasterizer.responses
-            and self.outputs <= rasterizer.provides
-            and self.options <= rasterizer.model_fields.keys()
+    def lacking(self, rasterizer: type[Rasterizer]) -> tuple[str, ...]:
+        """What of it a rasterizer cannot do."""
+        return tuple(
+            sorted(
+                ({self.response} - rasterizer.responses)
+                | (self.outputs - rasterizer.provides)
+                | (self.options - rasterizer.model_fields.keys())
+            )
         )
 
 
@@ -75,6 +78,8 @@ def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:
             continue
         if (speed := rasterizer.speed(wanted.device)) > 0.0:
             running[name] = speed
-            if wanted.given_by(rasterizer):
+            if lacks := wanted.lacking(rasterizer):
+                notes.append(f"rasterizer {name} left out: this run needs {listed(lacks)}")
+            else:
                 able[name] = speed
     return able or running, tuple(notes)

@@ -1,4 +1,4 @@
-"""benchmarks/gpu.py on a machine without a GPU: it says so, and its tables come from run folders."""
+"""benchmarks/gpu.py without a GPU: it says so, and its tables come from the folders of runs."""
 
 import csv
 import json

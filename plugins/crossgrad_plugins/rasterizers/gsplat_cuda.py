@@ -23,6 +23,7 @@ from crossgrad_core.plugin import (
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
 from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
+from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 
 _PACKAGE = "gsplat"
@@ -95,6 +96,8 @@ class GsplatRasterizer(Rasterizer):
     ) -> list[Render]:
         """K views of one size, with N Gaussians each, in one call of gsplat."""
         gaussians, camera = views[0]
+        if not len(gaussians):
+            return [nothing_drawn(camera, background, outputs) for background in backgrounds]
         screens = [
             Screen(torch.zeros(len(each), dtype=torch.int32, device=each.means.device))
             for each, _ in views

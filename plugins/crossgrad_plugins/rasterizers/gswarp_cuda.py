@@ -22,6 +22,7 @@ from crossgrad_core.plugin import (
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
 from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
+from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 
 _PACKAGE = "gswarp"
@@ -79,10 +80,9 @@ class GswarpRasterizer(Rasterizer):
         background: Tensor,
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
-        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32).to(gaussians.means.device))
         if not len(gaussians):
-            blank = background.expand(camera.height, camera.width, 3)
-            return Render(blank, torch.zeros_like(blank[..., 0]), screen)
+            return nothing_drawn(camera, background, outputs)
+        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32).to(gaussians.means.device))
         enlarged = _NEAR / self.near
         size = (camera.width / 2, camera.height / 2)
         call = Call(

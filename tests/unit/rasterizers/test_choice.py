@@ -49,7 +49,8 @@ SOUND = FAST.partition("class Broken")[0]
 
 def test_ours_are_chosen_by_device():
     assert choose_rasterizer("auto", PLAIN)[0] == "numba"
-    assert choose_rasterizer("auto", Wanted("cuda", "plain"))[0] == "torch"
+    # Those that were made for it have tests of their own, and may not be installed here.
+    assert choose_rasterizer("auto", Wanted("cuda", "analytic"))[0] == "torch"
 
 
 def test_a_name_is_taken_as_it_is():

@@ -171,6 +171,16 @@ def test_views_together_are_the_views_one_by_one(gsplat):
             torch.testing.assert_close(a.grad, b.grad, rtol=1e-4, atol=1e-5)
 
 
+def test_no_gaussians_give_the_background(gsplat):
+    camera, none = CAMERAS["middle"], leaves(random_gaussians(0, CAMERAS["middle"]))
+    some = leaves(random_gaussians(5, camera))
+    grey, white = torch.full((3,), 0.5), torch.ones(3)
+    first, second = gsplat.render_views([(none, camera), (some, camera)], [grey, white], OUTPUTS)
+    assert (first.image == 0.5).all() and first.image.shape == (28, 40, 3)
+    assert not first.alpha.any() and not first.depth.any() and not len(first.screen.radii)
+    assert second.alpha.any()
+
+
 @pytest.mark.parametrize("taken_back", [False, True])
 def test_nothing_is_kept_of_a_render_that_is_gone(gsplat, monkeypatch, taken_back):
     centers = []

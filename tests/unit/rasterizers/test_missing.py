@@ -1,6 +1,7 @@
 """What a rasterizer of another package lacks is told before training, with a way out."""
 
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,8 +23,8 @@ def machine(monkeypatch, tmp_path):
     """A machine with these packages, a torch for this CUDA, and an nvcc that says its version."""
 
     def of(*packages, cuda="12.8", nvcc=None):
-        found = {name: object() for name in packages}
-        monkeypatch.setattr(missing, "find_spec", found.get)
+        places = SimpleNamespace(submodule_search_locations=[str(tmp_path / "package")])
+        monkeypatch.setattr(missing, "find_spec", dict.fromkeys(packages, places).get)
         monkeypatch.setattr(torch.version, "cuda", cuda)
         for name in ("CUDA_HOME", "CUDA_PATH"):
             monkeypatch.delenv(name, raising=False)
@@ -67,8 +68,11 @@ def test_gsplat_needs_a_compiler_for_the_cuda_of_torch(machine, nvcc, reason):
     assert reason is None or reason in found[0]
 
 
-def test_gsplat_with_its_kernels_compiled_needs_no_compiler(machine):
-    machine("gsplat", "gsplat.csrc")
+def test_gsplat_with_its_kernels_compiled_needs_no_compiler(machine, tmp_path):
+    machine("gsplat")
+    assert objections(GsplatRasterizer())
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
     assert objections(GsplatRasterizer()) == []
 
 
@@ -123,7 +127,9 @@ def test_the_fastest_that_is_there_and_can_is_taken(machine):
     machine("gsplat", "gswarp", nvcc="12.8")
     assert choose_rasterizer("auto", CUDA)[0] == "gsplat"
     counting = Wanted("cuda", "plain", frozenset({"count"}))
-    assert choose_rasterizer("auto", counting)[0] == "torch"
+    chosen, notes = choose_rasterizer("auto", counting)
+    assert chosen == "torch"
+    assert "rasterizer gsplat left out: this run needs count" in notes
     inria = Wanted("cuda", "plain", options=frozenset({"footprint"}))
     assert choose_rasterizer("auto", inria)[0] == "gswarp"
     assert choose_rasterizer("auto", Wanted("cuda", "antialiased"))[0] == "gsplat"

@@ -4,6 +4,9 @@ A device that notes what is read back from it stands for the GPU, and for its ra
 draws each Gaussian in each pixel.
 """
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from typing import ClassVar
@@ -28,7 +31,27 @@ from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import project
 from crossgrad_plugins.rasterizers.reference.responses import shape
 
-needs_device = pytest.mark.skipif(counted.REGISTER is None, reason="torch has no Python backends")
+#: Set in the process that has the device: torch has to know it before the first backward pass.
+FRESH = "CROSSGRAD_COUNTED_DEVICE"
+needs_device = pytest.mark.skipif(FRESH not in os.environ, reason="run in a process of their own")
+
+
+@pytest.mark.skipif(counted.REGISTER is None, reason="this torch has no backends in Python")
+def test_in_a_process_of_their_own(request):
+    """Runs the tests of this file that need the device."""
+    config = request.config
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    command += ["-c", str(config.inipath), "--rootdir", str(config.rootpath), __file__]
+    ended = subprocess.run(
+        [*command, "-k", "not own and not together_train"],
+        env={**os.environ, FRESH: "1"},
+        cwd=config.rootpath,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout
+    assert "skipped" not in ended.stdout
 
 
 class Dense(Rasterizer):

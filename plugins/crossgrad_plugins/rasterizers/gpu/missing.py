@@ -23,7 +23,7 @@ def package_missing(package: str) -> str | None:
 
 def compiler_missing(package: str) -> str | None:
     """Why a package cannot compile its kernels at first use; None where it can, or has them."""
-    if find_spec(f"{package}.csrc") is not None:
+    if is_compiled(package):
         return None
     nvcc, wanted = find_nvcc(), torch.version.cuda
     if nvcc is None:
@@ -42,6 +42,13 @@ def compiler_missing(package: str) -> str | None:
             "version and set CUDA_HOME, or the torch that was built for this one"
         )
     return None
+
+
+def is_compiled(package: str) -> bool:
+    """Whether a package was installed with its kernels compiled; does not import it."""
+    spec = find_spec(package)
+    places = [] if spec is None else spec.submodule_search_locations or []
+    return any(path for place in places for path in Path(place).glob("csrc.*"))
 
 
 def find_nvcc() -> Path | None:
