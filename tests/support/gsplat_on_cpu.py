@@ -26,6 +26,7 @@ def install(monkeypatch: Any) -> None:
     monkeypatch.setattr(rendering, "isect_tiles", tiles)
     monkeypatch.setattr(rendering, "isect_offset_encode", reference._isect_offset_encode)
     monkeypatch.setattr(rendering, "rasterize_to_pixels", composited)
+    monkeypatch.setattr("gsplat.rasterize_to_indices_in_range", listed)
 
 
 def projected(means, covars, quats, scales, viewmats, Ks, width, height, **options) -> Any:
@@ -108,18 +109,8 @@ def composited(
     if absolute is not None:
         means2d.absgrad = absolute
     flat = [t.reshape(-1, t.shape[-1]) for t in (means2d, conics, colors, opacities[..., None])]
-    starts = offsets.reshape(-1, *offsets.shape[-2:])
-    ends = torch.cat([starts.reshape(-1), torch.tensor([len(ids)])])[1:].view(starts.shape)
-    for image, row, column in torch.cartesian_prod(*map(torch.arange, starts.shape)).tolist():
-        rows = ids[starts[image, row, column] : ends[image, row, column]].long()
-        if not len(rows):
-            continue
-        ys = slice(row * tile_size, min((row + 1) * tile_size, height))
-        xs = slice(column * tile_size, min((column + 1) * tile_size, width))
-        pixels = torch.cartesian_prod(
-            torch.arange(ys.start, ys.stop), torch.arange(xs.start, xs.stop)
-        )
-        places = pixels.flip(-1).to(means2d) + 0.5
+    for image, rows, ys, xs in _lists(offsets, ids, (width, height), tile_size):
+        places = _places(ys, xs)
         blend = _tile(places, [t[rows] for t in flat], rows, absolute)
         shape = (ys.stop - ys.start, xs.stop - xs.start, -1)
         color, alpha = blend[:, :-1], blend[:, -1:]
@@ -129,16 +120,58 @@ def composited(
     return images.view(*dims, height, width, channels), alphas.view(*dims, height, width, 1)
 
 
+def _lists(offsets, ids, size, tile_size) -> Any:
+    """Image, rows of Gaussians, and slices of the pixels of every tile that has some."""
+    starts = offsets.reshape(-1, *offsets.shape[-2:])
+    ends = torch.cat([starts.reshape(-1), torch.tensor([len(ids)])])[1:].view(starts.shape)
+    for image, row, column in torch.cartesian_prod(*map(torch.arange, starts.shape)).tolist():
+        rows = ids[starts[image, row, column] : ends[image, row, column]].long()
+        if len(rows):
+            ys = slice(row * tile_size, min((row + 1) * tile_size, size[1]))
+            xs = slice(column * tile_size, min((column + 1) * tile_size, size[0]))
+            yield image, rows, ys, xs
+
+
+def _places(ys, xs) -> Tensor:
+    """[P, 2] centres of pixels, x and y."""
+    pixels = torch.cartesian_prod(torch.arange(ys.start, ys.stop), torch.arange(xs.start, xs.stop))
+    return pixels.flip(-1).float() + 0.5
+
+
+def _alphas(centers, conics, opacities, places) -> Tensor:
+    """[P, G] alpha, 0 below the threshold; centres are [P, G, 2]."""
+    a, b, c = conics.unbind(-1)
+    dx, dy = (centers - places[:, None]).unbind(-1)
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (opacities[:, 0] * (-sigma).exp()).clamp(max=CAP)
+    return torch.where((sigma < 0) | (alpha < THRESHOLD), torch.zeros_like(alpha), alpha)
+
+
+@torch.no_grad()
+def listed(
+    first, last, light, means2d, conics, opacities, width, height, tile_size, offsets, ids
+) -> Any:
+    """`rasterize_to_indices_in_range` of all batches (RasterizeToIndices3DGS.cu)."""
+    assert first == 0
+    assert last > len(ids)
+    number, light = means2d.shape[-2], light.reshape(-1, height, width)
+    flat = [t.reshape(-1, t.shape[-1]) for t in (means2d, conics, opacities[..., None])]
+    found = [torch.zeros(0, dtype=torch.int64)]
+    for image, rows, ys, xs in _lists(offsets, ids, (width, height), tile_size):
+        centers, own, peaks = (t[rows] for t in flat)
+        alpha = _alphas(centers, own, peaks, _places(ys, xs))
+        after = light[image, ys, xs].reshape(-1, 1) * (1 - alpha).cumprod(1)
+        blended = (alpha > 0) & (after > STOP)
+        found.append((rows % number).expand(len(alpha), -1)[blended])
+    return torch.cat(found), None, None
+
+
 def _tile(places, splats, rows, absolute) -> Tensor:
     """[P, channels + 1] colour and alpha of the pixels at `places` [P, 2], over nothing."""
     centers, conics, colors, opacities = splats
-    delta = _PerPixel.apply(centers, len(places), rows, absolute) - places[:, None]
-    a, b, c = conics.unbind(-1)
-    dx, dy = delta.unbind(-1)
-    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    raw = opacities[:, 0] * (-sigma).exp()
-    alpha = raw.clamp(max=CAP)
-    alpha = torch.where((sigma < 0) | (alpha < THRESHOLD), torch.zeros_like(alpha), alpha)
+    alpha = _alphas(
+        _PerPixel.apply(centers, len(places), rows, absolute), conics, opacities, places
+    )
     after = (1 - alpha).cumprod(1)
     alpha = torch.where(after > STOP, alpha, torch.zeros_like(alpha))
     after = (1 - alpha).cumprod(1)

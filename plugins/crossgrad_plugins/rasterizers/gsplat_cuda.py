@@ -20,6 +20,7 @@ from crossgrad_core.plugin import (
     Selection,
     hookimpl,
 )
+from crossgrad_plugins.rasterizers.gpu.blended import counter
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
 from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
@@ -36,7 +37,7 @@ class GsplatRasterizer(Rasterizer):
     Source: Ye et al. 2024 (gsplat, arXiv 2409.06765).
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"depth", "abs_gradient"})
+    provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient", "count"})
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
     together: ClassVar[bool] = True
@@ -117,7 +118,7 @@ class GsplatRasterizer(Rasterizer):
             "rasterize_mode": "antialiased" if gaussians.response == "antialiased" else "classic",
             **_cameras([camera for _, camera in views], gaussians.means),
         }
-        call = Call(partial(_draw, screens, settings), partial(_observe, screens))
+        call = Call(partial(_draw, screens, settings, outputs), partial(_observe, screens))
         channels, alpha = drawn(call, tensors)
         return [
             Render(
@@ -153,14 +154,22 @@ def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
 
 
 def _draw(
-    screens: Sequence[Screen], settings: Mapping[str, Any], tensors: Sequence[Tensor]
+    screens: Sequence[Screen],
+    settings: Mapping[str, Any],
+    outputs: frozenset[str],
+    tensors: Sequence[Tensor],
 ) -> Drawing:
     from gsplat import rasterization
 
     means, quats, scales, opacities, colors = tensors
     channels, alpha, meta = rasterization(means, quats, scales, opacities, colors, **settings)
-    for screen, radii in zip(screens, meta["radii"], strict=True):
-        screen.radii = radii[0].amax(-1)
+    for view, screen in enumerate(screens):
+        screen.radii = meta["radii"][view, 0].amax(-1)
+        if "count" in outputs:
+            screen.count = counter(meta, view)
+        if "pixels" in outputs:
+            everywhere = torch.ones_like(alpha[view, 0, ..., 0], dtype=torch.bool)
+            screen.pixels = counter(meta, view)(everywhere)
     return Drawing((channels[:, 0], alpha[:, 0]), meta["means2d"])
 
 

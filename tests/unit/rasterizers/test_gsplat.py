@@ -13,6 +13,7 @@ from support import gsplat_on_cpu
 from support.gaussians import posed_camera, random_gaussians
 
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
+from crossgrad_plugins.rasterizers.gpu import blended
 from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
 from crossgrad_plugins.rasterizers.reference.harmonics import harmonics
 from crossgrad_plugins.rasterizers.reference.projection import project
@@ -20,7 +21,7 @@ from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 reference = pytest.importorskip("gsplat.cuda._torch_impl")
 
-OUTPUTS = frozenset({"depth", "abs_gradient"})
+OUTPUTS = GsplatRasterizer.provides
 CAMERAS = {
     "middle": posed_camera(40, 28, focal=30.0, principal=(0.5, 0.5)),
     "off the axis": posed_camera(40, 28, focal=30.0, principal=(0.3, 0.8)),
@@ -135,6 +136,22 @@ def test_a_cap_of_0_999_is_what_differs(gsplat):
     assert 0.0 < (theirs - ours).max() <= 0.0091
 
 
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("band", [1 << 19, 3 * 37])
+def test_counts_of_pixels_are_ours(gsplat, monkeypatch, camera, band):
+    """Of all pixels and of some, of each of two views, however many are looked at at once."""
+    monkeypatch.setattr(blended, "PIXELS", band)
+    scenes = [leaves(random_gaussians(25, camera, seed=s, opacities=(0.5, 1.0))) for s in (10, 11)]
+    marks = torch.rand(camera.height, camera.width, generator=torch.manual_seed(3)) < 0.3
+    views = [(scene, camera) for scene in scenes]
+    renders = gsplat.render_views(views, [torch.zeros(3)] * 2, OUTPUTS)
+    for scene, render in zip(scenes, renders, strict=True):
+        ours = TorchRasterizer(max_alpha=0.999).render(scene, camera, torch.zeros(3), OUTPUTS)
+        assert torch.equal(render.screen.pixels, ours.screen.pixels)
+        assert torch.equal(render.screen.count(marks), ours.screen.count(marks))
+        assert render.screen.count(marks).dtype == torch.int32
+
+
 @pytest.mark.parametrize(("sigmas", "most"), [((0.8, 4.0), 1e-5), ((0.05, 0.3), 6e-3)])
 def test_antialiasing_differs_far_below_a_pixel(gsplat, sigmas, most):
     camera = CAMERAS["middle"]
@@ -178,6 +195,7 @@ def test_no_gaussians_give_the_background(gsplat):
     first, second = gsplat.render_views([(none, camera), (some, camera)], [grey, white], OUTPUTS)
     assert (first.image == 0.5).all() and first.image.shape == (28, 40, 3)
     assert not first.alpha.any() and not first.depth.any() and not len(first.screen.radii)
+    assert not len(first.screen.count(torch.ones(28, 40, dtype=torch.bool)))
     assert second.alpha.any()
 
 

@@ -100,9 +100,9 @@ def test_on_a_cpu_the_device_alone_is_objected_to(machine):
 @pytest.mark.parametrize(
     ("slot", "name", "rasterizer", "reason"),
     [
-        ("densifier", "pixel", "gsplat", "needs the screen statistics pixels"),
+        ("densifier", "pixel", "gswarp", "needs the screen statistics pixels"),
         ("densifier", "dc4gs", "gsplat", "needs the screen statistics directions"),
-        ("densifier", "multiview", "gsplat", "needs the screen statistics count"),
+        ("densifier", "multiview", "gswarp", "needs the screen statistics abs_gradient, count"),
         ("densifier", "absgrad", "gswarp", "needs the screen statistics abs_gradient"),
         ("backbone", "analytic", "gsplat", "does not draw the pixel response analytic"),
         ("backbone", "mip", "gswarp", "does not draw the pixel response antialiased"),
@@ -126,10 +126,10 @@ def test_gswarp_refuses_a_dilation_of_ones_own(machine):
 def test_the_fastest_that_is_there_and_can_is_taken(machine):
     machine("gsplat", "gswarp", nvcc="12.8")
     assert choose_rasterizer("auto", CUDA)[0] == "gsplat"
-    counting = Wanted("cuda", "plain", frozenset({"count"}))
-    chosen, notes = choose_rasterizer("auto", counting)
+    assert choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"count"})))[0] == "gsplat"
+    chosen, notes = choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"directions"})))
     assert chosen == "torch"
-    assert "rasterizer gsplat left out: this run needs count" in notes
+    assert "rasterizer gsplat left out: this run needs directions" in notes
     inria = Wanted("cuda", "plain", options=frozenset({"footprint"}))
     assert choose_rasterizer("auto", inria)[0] == "gswarp"
     assert choose_rasterizer("auto", Wanted("cuda", "antialiased"))[0] == "gsplat"

@@ -10,5 +10,10 @@ def nothing_drawn(camera: Camera, background: Tensor, outputs: frozenset[str]) -
     """The background, and statistics of no rows."""
     image = background.expand(camera.height, camera.width, 3)
     alpha = torch.zeros_like(image[..., 0])
-    screen = Screen(torch.zeros(0, dtype=torch.int32).to(background.device))
+    none = torch.zeros(0, dtype=torch.int32).to(background.device)
+    screen = Screen(
+        radii=none,
+        pixels=none if "pixels" in outputs else None,
+        count=(lambda _marked: none) if "count" in outputs else None,
+    )
     return Render(image, alpha, screen, alpha if "depth" in outputs else None)
