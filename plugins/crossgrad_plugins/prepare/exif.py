@@ -9,7 +9,8 @@ from crossgrad_plugins.prepare.plan import Position
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_EXIF, _GPS = 0x8769, 0x8825
+_EXIF, _GPS, _ORIENTATION = 0x8769, 0x8825, 0x0112
+_ORIENTATIONS: Final = range(1, 9)
 _MAKE, _MODEL, _FOCAL, _FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _BELOW_SEA: Final = (1, b"\x01")
@@ -24,6 +25,12 @@ def camera_of(image: "Image") -> str:
     parts = [header.get(_MAKE), header.get(_MODEL), _number(details.get(_FOCAL)),
              _number(details.get(_FOCAL_35))]  # fmt: skip
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
+
+
+def orientation_of(image: "Image") -> int:
+    """How the photo is turned when it is shown, 1 to 8; 1 where it does not say."""
+    found = image.getexif().get(_ORIENTATION)
+    return found if isinstance(found, int) and found in _ORIENTATIONS else 1
 
 
 def position_of(image: "Image") -> Position | None:

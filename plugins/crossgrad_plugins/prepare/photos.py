@@ -12,7 +12,7 @@ import numpy as np
 from crossgrad_core.commands import UserError
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.pillow import opened
-from crossgrad_plugins.prepare.exif import camera_of, position_of
+from crossgrad_plugins.prepare.exif import camera_of, orientation_of, position_of
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, Settings
 
 if TYPE_CHECKING:
@@ -131,6 +131,7 @@ def _looked_at(root: Path, name: str, masks: "_Masks", cameras: str) -> Photo | 
             return LeftOut(name=name, why=f"too small: {header.width} x {header.height} pixels")
         with opened(path, "the photo cannot be decoded") as image:
             camera, position = camera_of(image), position_of(image)
+            orientation = orientation_of(image)
             brightness, sharpness = _look(image)
         folder = name.rpartition("/")[0]
         size = f"{header.width} x {header.height}"
@@ -139,6 +140,7 @@ def _looked_at(root: Path, name: str, masks: "_Masks", cameras: str) -> Photo | 
             folder=folder,
             width=header.width,
             height=header.height,
+            orientation=orientation,
             camera=name if cameras == "photo" else f"{folder}: {size} {camera}".strip(),
             position=position,
             mask=masks.of(name),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_plugins.prepare.gravity import levelled
 from crossgrad_plugins.prepare.waiting import quiet
 
 if TYPE_CHECKING:
@@ -18,8 +19,11 @@ FEWEST: Final = 3
 #: which most photos agree is taken.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: The photos have to lie apart, across their main direction, by more than this times the residual.
+#: Photos have to lie apart by so many times what GPS is off: across their main direction, or along
+#: it where they tell which way is up.
 _SPREAD: Final = 3.0
+#: Cameras that lie less across their line than this share of its length have no direction but it.
+_STRAIGHT: Final = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +54,16 @@ def centers_of(model: "pycolmap.Reconstruction") -> dict[str, NDArray[np.float64
 
 
 def placement_of(
-    model: "pycolmap.Reconstruction", positions: Mapping[str, NDArray[np.float64]]
+    model: "pycolmap.Reconstruction",
+    positions: Mapping[str, NDArray[np.float64]],
+    tops: Mapping[str, NDArray[np.float64]],
 ) -> tuple[Placement | None, str]:
     """The place of a model, and why it has none where it has none.
 
     Args:
         model: The model.
         positions: Name -> [3] metres east, north, up, of the photos with GPS.
+        tops: Name -> [3] camera axis towards the top of the photo, of all photos.
     """
     centers = centers_of(model)
     names = sorted(centers.keys() & positions.keys())
@@ -64,22 +71,45 @@ def placement_of(
         return None, f"{len(names)} of its photos have GPS, and {FEWEST} are needed"
     here = np.array([centers[name] for name in names])
     there = np.array([positions[name] for name in names])
-    found = _aligned(here, there)
+    found = _aligned(here, there) or _on_a_line(here, there)
     if found is None:
         return None, "GPS and poses do not agree: no similarity brings most photos within 30 m"
     similarity, agrees = found
-    moved = here @ similarity.matrix()[:, :3].T + similarity.matrix()[:, 3]
-    residuals = dict(zip(names, moved - there, strict=True))
     agreeing = frozenset(name for name, good in zip(names, agrees, strict=True) if good)
+    residuals = dict(zip(names, _moved(similarity, here) - there, strict=True))
     placement = Placement(similarity, residuals, agreeing)
-    spread = np.linalg.svd(there[agrees] - there[agrees].mean(0), compute_uv=False)
-    across = float(spread[1]) / np.sqrt(agrees.sum())
-    if across < _SPREAD * placement.rms:
+    middle, (along, across), direction = _line(_moved(similarity, here[agrees]))
+    if across >= _SPREAD * placement.rms:
+        return placement, ""
+    if along < _SPREAD * placement.rms:
         return None, (
-            f"GPS is not good enough: its photos lie {across:.1f} m apart across their main "
-            f"direction, and GPS is {placement.rms:.1f} m off"
+            f"GPS is not good enough: its photos lie {along:.1f} m apart, and GPS is "
+            f"{placement.rms:.1f} m off"
         )
-    return placement, ""
+    upright = levelled(model, similarity, (middle, direction), tops)
+    if upright is None:
+        return None, "GPS lies on a line, and the photos do not tell which way is up beside it"
+    residuals = dict(zip(names, _moved(upright, here) - there, strict=True))
+    return Placement(upright, residuals, agreeing), ""
+
+
+def _moved(similarity: "pycolmap.Sim3d", points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 3]."""
+    matrix = similarity.matrix()
+    return np.asarray(points @ matrix[:, :3].T + matrix[:, 3])
+
+
+def _line(
+    points: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], tuple[float, float], NDArray[np.float64]]:
+    """Middle [3] of points [N, 3], how far they lie along and across their line, its direction.
+
+    Distances are root mean squares.
+    """
+    middle = points.mean(0)
+    _, sizes, axes = np.linalg.svd(points - middle, full_matrices=False)
+    along, across = (float(size) / len(points) ** 0.5 for size in sizes[:2])
+    return middle, (along, across), axes[0]
 
 
 def _aligned(
@@ -101,6 +131,38 @@ def _aligned(
             continue
         refined = pycolmap.estimate_sim3d(here[agrees], there[agrees])
         return (refined or found["tgt_from_src"]), agrees
+    return None
+
+
+def _on_a_line(
+    here: NDArray[np.float64], there: NDArray[np.float64]
+) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
+    """A similarity of points [N, 3] on a line, with any roll about it, and which agree with it.
+
+    Its scale and direction are the medians of those of all pairs (Theil and Sen).
+    """
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    middle, (along, across), direction = _line(here)
+    if across > _STRAIGHT * along:
+        return None
+    places = (here - middle) @ direction
+    first, second = np.triu_indices(len(places), 1)
+    gaps = places[first] - places[second]
+    apart = np.abs(gaps) > _STRAIGHT * along
+    slopes = (there[first] - there[second])[apart] / gaps[apart, None]
+    slope = np.median(slopes, axis=0)
+    scale = float(np.linalg.norm(slope))
+    start = np.median(there - places[:, None] * slope, axis=0)
+    if scale == 0.0:
+        return None
+    turn = Rotation.align_vectors(slope[None] / scale, direction[None])[0].as_matrix()
+    similarity = pycolmap.Sim3d(np.column_stack([scale * turn, start - scale * turn @ middle]))
+    off = np.linalg.norm(_moved(similarity, here) - there, axis=1)
+    for error in _ERRORS:
+        if (off <= error).sum() >= max(FEWEST, _AGREEING * len(off)):
+            return similarity, off <= error
     return None
 
 

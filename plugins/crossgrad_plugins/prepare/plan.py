@@ -56,6 +56,7 @@ class Photo(_Fixed):
         folder: Its folder; empty for photos that lie in none.
         width: Pixels, as stored.
         height: Likewise.
+        orientation: How it is turned when it is shown (EXIF); 1 where it does not say.
         camera: What photos of one calibration share.
         position: Where its GPS says it was taken.
         mask: Path of its mask; None where it has none.
@@ -69,6 +70,7 @@ class Photo(_Fixed):
     folder: str
     width: int
     height: int
+    orientation: int
     camera: str
     position: Position | None
     mask: str | None

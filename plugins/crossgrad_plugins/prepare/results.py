@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.commands import write_atomically
 from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.gravity import top_of
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.placing import Placement, centers_of, merged, placement_of
 from crossgrad_plugins.prepare.plan import Plan
@@ -73,7 +74,8 @@ def placed(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction
 
 def _place(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> None:
     positions = local_positions(plan)
-    found = [placement_of(model, positions) for model in models]
+    tops = {photo.name: top_of(photo.orientation) for photo in plan.used}
+    found = [placement_of(model, positions, tops) for model in models]
     for model, (placement, _) in zip(models, found, strict=True):
         if placement is not None:
             model.transform(placement.similarity)

@@ -19,9 +19,9 @@ from crossgrad_plugins.prepare.plan import Photo, Plan, Settings
 
 def photo(name, **changed):
     plain = {
-        "name": name, "folder": name.rpartition("/")[0], "width": 100, "height": 80, "camera": "",
-        "position": None, "mask": None, "brightness": 120.0, "sharpness": 50.0, "bytes": 1,
-        "sha256": name,
+        "name": name, "folder": name.rpartition("/")[0], "width": 100, "height": 80,
+        "orientation": 1, "camera": "", "position": None, "mask": None, "brightness": 120.0,
+        "sharpness": 50.0, "bytes": 1, "sha256": name,
     }  # fmt: skip
     return Photo(**{**plain, **changed})
 

@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from crossgrad_plugins.prepare.gravity import top_of
 from crossgrad_plugins.prepare.placing import centers_of, merged, placement_of
 
 
@@ -13,6 +14,10 @@ def synthetic(frames=12, seed=0):
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 2, frames // 2, 60
     return pycolmap.synthesize_dataset(options)
+
+
+def tops_of(model):
+    return {name: top_of(1) for name in centers_of(model)}
 
 
 def similarity(rng):
@@ -37,7 +42,7 @@ def test_the_similarity_is_found_beside_wrong_gps(seed):
     wrong = sorted(gps)[: len(gps) // 4]
     for name in sorted(gps):
         gps[name] = gps[name] + rng.normal(size=3) * (400.0 if name in wrong else 0.05)
-    placement, why = placement_of(model, gps)
+    placement, why = placement_of(model, gps, tops_of(model))
     assert not why
     assert placement.agreeing.isdisjoint(wrong)
     assert placement.rms < 0.5
@@ -52,13 +57,69 @@ def test_gps_on_a_line_places_nothing():
     model = synthetic()
     names = sorted(centers_of(model))
     gps = {name: np.array([10.0 * i, 0.0, 0.0]) for i, name in enumerate(names)}
-    assert placement_of(model, gps)[0] is None
+    assert placement_of(model, gps, tops_of(model))[0] is None
+
+
+def walk(rng, orientation, pitch, count=12):
+    """A model of photos taken on a straight way, and the frame in which z is up.
+
+    Held level, turned as the orientation says, looking anywhere, tilted up by the pitch in degrees.
+    """
+    shown = {1: np.eye(3), 6: np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}[orientation]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 80, 60)
+    )
+    for number in range(1, count + 1):
+        yaw, tilt = rng.uniform(0.0, 2.0 * np.pi), np.deg2rad(pitch)
+        ahead = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)])
+        right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+        upright = np.stack([right, np.cross(ahead, right), ahead])
+        pose = pycolmap.Rotation3d(shown.T @ upright)
+        center = np.array([8.0 * number, 3.0 * number, 0.1 * number])
+        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose, -pose.matrix() @ center))
+    return model
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+@pytest.mark.parametrize("pitch", [-50.0, 0.0, 15.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_straight_way_level_photos_tell_which_way_is_up(orientation, pitch, seed):
+    rng = np.random.default_rng(seed)
+    model = walk(rng, orientation, pitch)
+    gps = {name: at + 0.1 * rng.normal(size=3) for name, at in centers_of(model).items()}
+    wanted = similarity(rng)
+    model.transform(wanted)
+    tops = {name: top_of(orientation) for name in gps}
+    placement, why = placement_of(model, gps, tops)
+    assert not why
+    up = placement.similarity.rotation.matrix() @ wanted.rotation.matrix() @ [0.0, 0.0, 1.0]
+    assert up[2] > np.cos(np.deg2rad(3.0))
+    assert placement.rms < 0.5
+
+
+def test_on_a_straight_way_photos_that_all_look_aside_tell_nothing():
+    rng = np.random.default_rng(0)
+    model = walk(rng, 1, 0.0)
+    gps = {name: at + 0.1 * rng.normal(size=3) for name, at in centers_of(model).items()}
+    # The axis that is level in each photo is that of the way.
+    along = np.array([8.0, 3.0, 0.1]) / np.linalg.norm([8.0, 3.0, 0.1])
+    ahead = np.cross(along, [0.0, 0.0, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    pose = pycolmap.Rotation3d(np.stack([-along, np.cross(ahead, -along), ahead]))
+    for number in model.reg_image_ids():
+        center = model.image(number).projection_center()
+        model.frame(number).rig_from_world = pycolmap.Rigid3d(pose, -pose.matrix() @ center)
+    placement, why = placement_of(model, gps, tops_of(model))
+    assert placement is None
+    assert "which way is up" in why
 
 
 def test_gps_coarser_than_the_scene_places_nothing():
     rng, model = np.random.default_rng(0), synthetic()
     gps = {name: rng.normal(size=3) * 0.5 for name in centers_of(model)}
-    placement, why = placement_of(model, gps)
+    placement, why = placement_of(model, gps, tops_of(model))
     assert placement is None
     assert "GPS" in why
 
@@ -66,7 +127,9 @@ def test_gps_coarser_than_the_scene_places_nothing():
 def test_too_little_gps_places_nothing():
     model = synthetic()
     gps = dict(list(moved(similarity(np.random.default_rng(0)), centers_of(model)).items())[:2])
-    assert placement_of(model, gps)[1] == "2 of its photos have GPS, and 3 are needed"
+    assert (
+        placement_of(model, gps, tops_of(model))[1] == "2 of its photos have GPS, and 3 are needed"
+    )
 
 
 def part_of(model, keep, folder):
