@@ -50,7 +50,7 @@ def prepare(  # noqa: PLR0913, PLR0917 - one parameter per option of the command
         str,
         typer.Option(
             metavar="auto|incremental|global",
-            help="auto is incremental below 100 photos.",
+            help="auto is incremental below 100 photos, and below 1000 in several folders.",
             rich_help_panel=_HOW,
         ),
     ] = "auto",

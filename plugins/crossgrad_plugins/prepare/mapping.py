@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Final
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.soundness import sound_models
 from crossgrad_plugins.prepare.waiting import quiet, waited
 
 if TYPE_CHECKING:
     import pycolmap
 
-#: From so many photos on all poses are found at once.
-MANY: Final = 100
+#: From so many photos on all poses are found at once: those of one folder, and of several, which
+#: may be joined by few matches: global mapping misplaces such parts (docs/prepare.md).
+_MANY, _MANY_OF_FOLDERS = 100, 1000
 #: A model of fewer photos is none.
 _SMALLEST: Final = 3
 
@@ -25,7 +27,8 @@ def way_of(plan: Plan) -> str:
     """How poses are found."""
     if plan.settings.mapper != "auto":
         return plan.settings.mapper
-    return "incremental" if len(plan.used) < MANY else "global"
+    many = _MANY if len(plan.folders) == 1 else _MANY_OF_FOLDERS
+    return "incremental" if len(plan.used) < many else "global"
 
 
 def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Reconstruction]":
@@ -38,10 +41,12 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
         scratch = emptied(scratch_of(layout.models))
         below = emptied(scratch / "found")
         waited_for = _incremental if way_of(plan) == "incremental" else _global
-        models = waited_for(layout, plan, threads, below)
+        models = list(waited_for(layout, plan, threads, below).values())
+        if way_of(plan) == "global":
+            models = sound_models(models, _SMALLEST)
         if not models:
             raise _nothing(layout, plan)
-        ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
+        ordered = sorted(models, key=lambda model: -model.num_reg_images())
         with quiet():
             for number, model in enumerate(ordered):
                 place = emptied(scratch / str(number))

@@ -15,7 +15,7 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_plugins.prepare import matching
+from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.app import prepared
 from crossgrad_plugins.prepare.plan import Plan, Settings
 from crossgrad_plugins.prepare.report import data_of, summary_lines
@@ -285,3 +285,18 @@ def test_pairs_are_chosen_by_number_and_gps(report, count, located, way):
     without = with_place.model_copy(update={"position": None})
     used = (with_place,) * located + (without,) * (count - located)
     assert matching.way_of(Plan(photos="", settings=Settings(), used=used, left_out=())) == way
+
+
+@pytest.mark.parametrize(
+    ("count", "folders", "way"),
+    [
+        (99, 1, "incremental"),
+        (100, 1, "global"),
+        (999, 2, "incremental"),
+        (1000, 2, "global"),
+    ],
+)
+def test_poses_are_found_by_number_and_folders(report, count, folders, way):
+    one = report.plan.used[0]
+    used = tuple(one.model_copy(update={"folder": str(n % folders)}) for n in range(count))
+    assert mapping.way_of(Plan(photos="", settings=Settings(), used=used, left_out=())) == way
