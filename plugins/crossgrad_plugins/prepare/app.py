@@ -102,7 +102,8 @@ def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
     ways = matching.way_of(plan), mapping.way_of(plan)
     report = Report(plan, features, links, result, ways)
     _timed("photos", lambda: write_scene(layout, plan, threads))
-    _write_report(layout, report)
+    if not layout.report.is_file():
+        _write_report(layout, report)
     return report
 
 

@@ -78,13 +78,30 @@ class Bridge:
 
 
 def lost_photos(
-    plan: Plan, features: Mapping[str, int], links: Sequence[Link], posed: Iterable[str]
+    plan: Plan,
+    features: Mapping[str, int],
+    links: Sequence[Link],
+    models: Sequence[frozenset[str]],
+    joined: Sequence[bool],
 ) -> tuple[Lost, ...]:
-    """The photos without a pose, and why they may have none."""
+    """The photos that are not in the scene, and why they may not be.
+
+    Args:
+        plan: The plan.
+        features: Name -> number of features.
+        links: Pairs with verified matches.
+        models: Names of the photos of each model.
+        joined: Whether each of these is in the scene.
+    """
     partners: Counter[str] = Counter()
     for link in links:
         partners.update((link.first, link.second))
-    inside = set(posed)
+    inside, elsewhere = set[str](), dict[str, int]()
+    for names, is_joined in zip(models, joined, strict=True):
+        if is_joined:
+            inside |= names
+        else:
+            elsewhere |= dict.fromkeys(names, len(names))
     usual = median(features.values())
     sharp = median(photo.sharpness for photo in plan.used)
     return tuple(
@@ -92,7 +109,9 @@ def lost_photos(
             photo.name,
             features[photo.name],
             partners[photo.name],
-            _why(photo, features[photo.name], partners[photo.name], (usual, sharp)),
+            f"in another model, of {elsewhere[photo.name]} photos"
+            if photo.name in elsewhere
+            else _why(photo, features[photo.name], partners[photo.name], (usual, sharp)),
         )
         for photo in plan.used
         if photo.name not in inside
@@ -151,10 +170,12 @@ def bridges_of(
     """
     if not parts:
         return ()
-    main = parts[0]
-    return tuple(
-        _bridge(plan, links, (main, part), heights) for part in parts[1:] if not part <= main
-    )
+    main, grouped = parts[0], dict[str, set[str]]()
+    for part in parts[1:]:
+        if part - main:
+            # One bridge leads to all pieces of a folder.
+            grouped.setdefault(_folders(plan, part - main), set()).update(part - main)
+    return tuple(_bridge(plan, links, (main, frozenset(p)), heights) for p in grouped.values())
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
@@ -181,14 +202,14 @@ def _bridge(
     main, part = parts
     crossing = [
         link for link in links
-        if (link.first in main and link.second in part - main)
-        or (link.second in main and link.first in part - main)
+        if (link.first in main and link.second in part)
+        or (link.second in main and link.first in part)
     ]  # fmt: skip
-    one, other = _middle(main, heights), _middle(part - main, heights)
+    one, other = _middle(main, heights), _middle(part, heights)
     ends = None if one is None or other is None else (min(one, other), max(one, other))
-    first, second = _folders(plan, main), _folders(plan, part - main)
+    first, second = _folders(plan, main), _folders(plan, part)
     advice = _advice(first, second, ends)
-    return Bridge(first, second, len(part - main), len(crossing), ends, advice)
+    return Bridge(first, second, len(part), len(crossing), ends, advice)
 
 
 def _middle(names: Iterable[str], heights: Mapping[str, float]) -> float | None:
@@ -205,6 +226,8 @@ def _folders(plan: Plan, names: Iterable[str]) -> str:
 
 def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str:
     """Which photos would join two parts."""
+    if first == second:
+        return f"{first}: the photos fall apart; add some that overlap with both parts"
     if heights is None:
         return (
             f"photos between {first} and {second} are missing: take a ramp from where one stands "

@@ -13,8 +13,9 @@ from crossgrad_plugins.prepare.waiting import quiet, rows_of, waited
 if TYPE_CHECKING:
     import pycolmap
 
-#: Up to so many photos all pairs are compared; without GPS, up to the second.
-_FEW, _SOME = 60, 100
+#: Up to so many photos all pairs are compared; without GPS, up to the second, and where they are in
+#: several folders, which few pairs may join, up to the third.
+_FEW, _SOME, _SOME_OF_FOLDERS = 60, 100, 250
 #: Share of the photos that need GPS for neighbours to be told by it.
 _MOST_LOCATED: Final = 0.9
 #: Photos that each one is compared with: the nearest by GPS, the most alike, the next by name.
@@ -58,7 +59,8 @@ def way_of(plan: Plan) -> str:
         return "exhaustive"
     if len(plan.located) >= _MOST_LOCATED * photos:
         return "spatial"
-    return "exhaustive" if photos <= _SOME else "retrieval"
+    some = _SOME if len(plan.folders) == 1 else _SOME_OF_FOLDERS
+    return "exhaustive" if photos <= some else "retrieval"
 
 
 def check_gps(plan: Plan) -> None:

@@ -51,7 +51,10 @@ class Report:
     @property
     def lost(self) -> tuple[Lost, ...]:
         """The photos that are not in the scene."""
-        return lost_photos(self.plan, self.features, self.links, self.posed)
+        parts = self.result.parts
+        models = [frozenset(part.photos) for part in parts]
+        joined = [part.joined for part in parts]
+        return lost_photos(self.plan, self.features, self.links, models, joined)
 
     @property
     def joins(self) -> tuple[Join, ...]:

@@ -56,6 +56,18 @@ def test_at_like_heights_overlap_is_asked_for():
     assert "overlap with both" in bridge.advice
 
 
+def test_one_bridge_leads_to_all_pieces_of_a_folder():
+    pieces = [frozenset(AERIAL), frozenset(STREET[:1]), frozenset(STREET[1:])]
+    (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, pieces), {})
+    assert bridge.photos == 3
+
+
+def test_a_folder_that_falls_apart_is_told_so():
+    pieces = [frozenset(AERIAL[:2]), frozenset(AERIAL[2:])]
+    (bridge,) = bridges_of(plan_of(*map(photo, AERIAL)), [], pieces, {})
+    assert "aerial: the photos fall apart" in bridge.advice
+
+
 def test_a_folder_in_no_model_needs_a_bridge_and_one_model_of_all_needs_none():
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS[:1]), {})
     assert bridge.second == "street"
@@ -104,6 +116,14 @@ def test_reasons_why_a_photo_is_lost(changed, features, links, why):
     plan = plan_of(*map(photo, AERIAL), bad)
     found = [Link("bad", name, 20) for name in AERIAL[:links]]
     counts = dict.fromkeys(AERIAL, 1000) | {"bad": features}
-    (lost,) = lost_photos(plan, counts, found, AERIAL)
+    (lost,) = lost_photos(plan, counts, found, [frozenset(AERIAL)], [True])
     assert lost.name == "bad"
     assert why in lost.why
+
+
+def test_a_photo_of_another_model_is_told_so():
+    counts = dict.fromkeys(AERIAL + STREET, 1000)
+    lost = lost_photos(PLAN, counts, [], MODELS, [True, False])
+    assert [each.name for each in lost] == STREET
+    assert {each.why for each in lost} == {"in another model, of 3 photos"}
+    assert not lost_photos(PLAN, counts, [], MODELS, [True, True])

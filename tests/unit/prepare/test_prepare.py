@@ -25,6 +25,7 @@ from crossgrad_plugins.readers.colmap import ColmapReader
 #: Metres of a unit of the bundled scene, for GPS, and a place in the south and the west.
 METRES, PLACE = 20.0, (-33.0, -70.0, 500.0)
 COUNT = 7
+NO_GPS = {"position": None}
 
 
 def with_gps(source, target, place):
@@ -270,20 +271,23 @@ def test_progress_is_counted_beside_the_database_s_writer(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("count", "located", "way"),
+    ("count", "located", "folders", "way"),
     [
-        (60, 60, "exhaustive"),
-        (61, 61, "spatial"),
-        (61, 50, "exhaustive"),
-        (101, 90, "retrieval"),
-        (2000, 0, "retrieval"),
-        (2000, 2000, "spatial"),
+        (60, 60, 1, "exhaustive"),
+        (61, 61, 1, "spatial"),
+        (61, 50, 1, "exhaustive"),
+        (101, 90, 1, "retrieval"),
+        (250, 200, 2, "exhaustive"),
+        (251, 200, 2, "retrieval"),
+        (2000, 2000, 3, "spatial"),
     ],
 )
-def test_pairs_are_chosen_by_number_and_gps(report, count, located, way):
-    with_place = next(photo for photo in report.plan.used if photo.position is not None)
-    without = with_place.model_copy(update={"position": None})
-    used = (with_place,) * located + (without,) * (count - located)
+def test_pairs_are_chosen_by_number_gps_and_folders(report, count, located, folders, way):
+    one = next(photo for photo in report.plan.used if photo.position is not None)
+    used = tuple(
+        one.model_copy(update={"folder": str(n % folders)} | ({} if n < located else NO_GPS))
+        for n in range(count)
+    )
     assert matching.way_of(Plan(photos="", settings=Settings(), used=used, left_out=())) == way
 
 
