@@ -35,10 +35,18 @@ from crossgrad_core.contract.contexts import (
     ViewRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.exporter import Exporter, Rounding
 from crossgrad_core.contract.exposure import Exposure, Fitted, PerPhoto
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
+from crossgrad_core.contract.georeference import (
+    COORDINATES_TAG,
+    INPUT,
+    LOCAL,
+    Georeference,
+    Placed,
+    Unplaced,
+)
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import (
     GramianOperator,
@@ -59,18 +67,11 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import (
-    Camera,
-    Photo,
-    Pinhole,
-    Scene,
-    Similarity,
-    View,
-    centers_of,
-)
+from crossgrad_core.contract.scene import Camera, Photo, Pinhole, Scene, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
+from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.start import MorePoints, Start
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
@@ -95,7 +96,10 @@ from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.wording import listed
 
 __all__ = [
+    "COORDINATES_TAG",
     "EMPTY_STATE",
+    "INPUT",
+    "LOCAL",
     "NO_EDIT",
     "SHORTEST_ANCHOR_INTERVAL",
     "AfterStepContext",
@@ -119,6 +123,7 @@ __all__ = [
     "Figure",
     "Fitted",
     "Gaussians",
+    "Georeference",
     "GradientProbe",
     "GramianOperator",
     "Granularity",
@@ -142,6 +147,7 @@ __all__ = [
     "Photo",
     "Pinhole",
     "PixelContext",
+    "Placed",
     "PluginState",
     "Quantity",
     "Rasterizer",
@@ -155,6 +161,7 @@ __all__ = [
     "RequestedRender",
     "Resolution",
     "Response",
+    "Rounding",
     "Rows",
     "Rule",
     "RunInfo",
@@ -173,6 +180,7 @@ __all__ = [
     "Start",
     "StepContext",
     "StepRecord",
+    "Unplaced",
     "UserError",
     "View",
     "ViewCounts",

@@ -31,6 +31,15 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             "Default: mean of the training views.",
         ),
     ] = None,
+    coordinates: Annotated[
+        str,
+        typer.Option(
+            metavar="input|local|enu|utm|epsg:N",
+            help="Coordinates of the file: the scene's, those that are trained in, metres east, "
+            "north and up, or projected ones; others than input go into "
+            "RUN/point_cloud_COORDINATES.ply.",
+        ),
+    ] = "input",
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
@@ -40,4 +49,6 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     from crossgrad_core.run import afterwards
 
     how = afterwards.How(device, threads, accept_scene)
-    afterwards.export(run, file_format=file_format, out=out, camera=camera, how=how)
+    afterwards.export(
+        run, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
+    )

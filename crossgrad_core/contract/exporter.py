@@ -2,13 +2,31 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.scene import Similarity
+from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
+
+
+@dataclass(frozen=True, eq=False)
+class Rounding:
+    """How a file keeps positions.
+
+    Attributes:
+        offset: [3] float64, what is to be added to the numbers of the file.
+        largest: How far rounding moves a Gaussian at most, in the file's units; None where the
+            exporter does not tell.
+    """
+
+    offset: NDArray[np.float64]
+    largest: float | None = None
 
 
 class Exporter(Component):
@@ -39,6 +57,10 @@ class Exporter(Component):
         Raises:
             UserError: The disk is full or the folder may not be written to.
         """
+
+    def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
+        """How positions are kept in the file that `write` makes of the same."""
+        return Rounding(np.zeros(3))
 
     def stored(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians as a reader of the file gets them, local frame; by default unchanged."""

@@ -10,6 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from crossgrad_core.contract.georeference import UNPLACED, Georeference
+from crossgrad_core.contract.similarity import Similarity
+
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
@@ -116,27 +119,6 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Similarity:
-    """x_local = (x_input - offset) * scale, in float64; the rotation is the identity.
-
-    Attributes:
-        offset: [3] float64, input frame.
-        scale: Local units per input unit.
-    """
-
-    offset: NDArray[np.float64]
-    scale: float
-
-    def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the input frame in the local frame."""
-        return (points - self.offset) * self.scale
-
-    def to_input(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the local frame in the input frame."""
-        return points / self.scale + self.offset
-
-
-@dataclass(frozen=True, eq=False)
 class Scene:
     """Everything a run knows about a place.
 
@@ -152,6 +134,7 @@ class Scene:
         point_sizes: [P] standard deviations of the first Gaussians, local units; NaN where the
             distance to neighbours tells. None: at all points.
         point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
+        georeference: Where on Earth it is.
     """
 
     name: str
@@ -164,6 +147,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     point_sizes: NDArray[np.float64] | None = None
     point_opacities: NDArray[np.float64] | None = None
+    georeference: Georeference = UNPLACED
 
     @cached_property
     def train_views(self) -> tuple[View, ...]:

@@ -10,6 +10,7 @@ from typing import Protocol
 import torch
 
 from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.georeference import INPUT, check_coordinates
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
@@ -22,6 +23,7 @@ from crossgrad_core.run.export import (
     described,
     drawer,
     export_scene,
+    georef_of,
     plain_renderer,
     renderer,
 )
@@ -273,6 +275,7 @@ def export(
     file_format: str | None,
     out: Path | None,
     camera: str | None = None,
+    coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> None:
     """Writes the trained scene to a file that viewers open, and prints what is in it.
@@ -282,12 +285,15 @@ def export(
         file_format: See `exported`.
         out: See `exported`.
         camera: See `exported`.
+        coordinates: See `exported`.
         how: How the run is opened.
 
     Raises:
         UserError: See `exported`.
     """
-    path, content = exported(folder, file_format=file_format, out=out, camera=camera, how=how)
+    path, content = exported(
+        folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
+    )
     for line in described(content, path):
         print(line)  # noqa: T201
     print(f"{content.gaussians:,} Gaussians in {path}")  # noqa: T201
@@ -299,6 +305,7 @@ def exported(
     file_format: str | None,
     out: Path | None,
     camera: str | None = None,
+    coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> tuple[Path, Exported]:
     """Writes the trained scene to a file that viewers open.
@@ -309,6 +316,7 @@ def exported(
         out: The file; by default one in the run's folder that summary.json does not describe as
             something else.
         camera: Name of the view to bake for; by default the average over the training views.
+        coordinates: Of the file, as `check_coordinates` takes them.
         how: How the run is opened.
 
     Returns:
@@ -316,24 +324,30 @@ def exported(
 
     Raises:
         UserError: There is no such format, it is no run, it has no checkpoint, the file exists,
-            there is no such view or nothing to bake for it, or the run is training and no other
-            file is named.
+            there is no such view or nothing to bake for it, the scene cannot be put into these
+            coordinates, or the run is training and no other file is named.
     """
+    check_coordinates(coordinates)
     if file_format is not None:
         find("exporters", file_format)
     with _writing(folder, out, "exporting"):
         if out is not None:
             _check_new(out)
+            _check_new(georef_of(out))
             check_file(out)
         setup, state = how.open(folder)
         exporter = _exporter(setup, file_format)
         if camera is not None:
             _check_bakes(setup)
-            path = out or folder / f"{CLOUD}_{_flat(setup, camera)}.{exporter.suffix}"
-            _check_new(path)
+        words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
+        words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]
+        name = f"{'_'.join(words)}.{exporter.suffix}"
+        if words == [CLOUD]:
+            path = out or folder / _own_name(folder, name, state.step)
         else:
-            path = out or folder / _own_name(folder, f"{CLOUD}.{exporter.suffix}", state.step)
-        return path, export_scene(setup, state, path, camera, exporter)
+            path = out or folder / name
+            _check_new(path)
+        return path, export_scene(setup, state, path, camera, exporter, coordinates)
 
 
 def _exporter(setup: Setup, name: str | None) -> Exporter:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from json import dumps
 from math import fsum
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torch import Tensor
 
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.georeference import COORDINATES_TAG, INPUT, Placed
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare
 from crossgrad_core.evaluation.metrics import psnr
+from crossgrad_core.system.files import write_atomically
 from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -74,8 +77,9 @@ def export_scene(
     path: Path,
     camera: str | None = None,
     exporter: Exporter | None = None,
+    coordinates: str = INPUT,
 ) -> Exported:
-    """Writes the trained scene in the coordinates of the input.
+    """Writes the trained scene; beside it `.georef.json`, where there is something to tell.
 
     Args:
         setup: The run.
@@ -84,9 +88,11 @@ def export_scene(
         camera: Name of the view to bake what depends on the view for; None takes the average over
             the training views.
         exporter: What writes the file; the run's own where none is given.
+        coordinates: Of the file, as `check_coordinates` takes them.
 
     Raises:
-        UserError: There is no view of that name, or the file cannot be written.
+        UserError: There is no view of that name, the scene cannot be put into these coordinates, or
+            the file cannot be written.
     """
     phase = setup.phase(state.step, training=False)
     view = None if camera is None else view_named(setup, camera)
@@ -95,8 +101,11 @@ def export_scene(
         cameras = [each.camera for each in views]
         baked = setup.backbone.bake(shown(state), phase, cameras)
     exporter = exporter or setup.selection.exporter
-    comments = (f"crossgrad step {state.step}",)
-    notes = exporter.write(baked, setup.scene.similarity, path, comments)
+    placed = setup.scene.georeference.placed(baked, setup.scene.similarity, coordinates)
+    comments = [f"crossgrad step {state.step}"]
+    comments += [] if coordinates == INPUT else [f"{COORDINATES_TAG} {coordinates}"]
+    notes = exporter.write(placed.gaussians, placed.similarity, path, comments)
+    notes += (*placed.notes, *_write_georef(path, placed, exporter))
     plain, background = setup.backbone.plain, _own_background(setup)
     if plain and background is None:
         return Exported(len(baked), notes=notes)
@@ -111,6 +120,23 @@ def export_scene(
         background=background,
         notes=notes,
     )
+
+
+def georef_of(path: Path) -> Path:
+    """The file beside an exported one that tells other programs where it belongs."""
+    return path.with_suffix(".georef.json")
+
+
+def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, ...]:
+    """Writes that file, where there is something to tell; answers what rounding costs."""
+    rounding = exporter.rounding(placed.gaussians, placed.similarity)
+    offset, largest = rounding.offset.tolist(), rounding.largest
+    if not placed.facts and not any(offset):
+        return ()
+    facts = {"coordinates": INPUT, **placed.facts, "offset": offset, "rounding": largest}
+    write_atomically(georef_of(path), f"{dumps({'file': path.name, **facts}, indent=1)}\n".encode())
+    told = f"; rounding moves Gaussians by at most {largest:.1g} units" if largest else ""
+    return (f"{path.name}: {facts['coordinates']} coordinates, see {georef_of(path).name}{told}",)
 
 
 def _own_background(setup: Setup) -> str | None:

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL

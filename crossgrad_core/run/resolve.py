@@ -34,7 +34,7 @@ def resolved(setup: Setup) -> RunConfig:
         update={
             **chosen,
             "operator": _operator(config, setup),
-            "reader": ComponentChoice(name=names["reader"]),
+            "reader": config.reader.model_copy(update={"name": names["reader"]}),
             "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,

@@ -122,27 +122,37 @@ class Run:
         with as_in_a_command():
             return evaluated(self.folder, self._opened)[0]
 
-    def export(self, path: Path | str, camera: str | None = None) -> Path:
+    def export(
+        self, path: Path | str, camera: str | None = None, coordinates: str = "input"
+    ) -> Path:
         """Writes the trained scene with the run's exporter, as `crossgrad export` does.
 
         Args:
             path: The file.
             camera: Name of the view to bake what depends on the view for; by default the average
                 over the training views.
+            coordinates: input, local, enu, utm or epsg:N (docs/coordinates.md).
 
         Returns:
             The file.
 
         Raises:
-            UserError: The file exists or cannot be written, there is no such view, or the run has
-                no checkpoint.
+            UserError: The file exists or cannot be written, there is no such view, the scene is not
+                georeferenced, or the run has no checkpoint.
         """
         from crossgrad_core.run.afterwards import exported
         from crossgrad_core.run.process import as_in_a_command
 
         with as_in_a_command():
             out = Path(path)
-            exported(self.folder, file_format=None, out=out, camera=camera, how=self._opened)
+            exported(
+                self.folder,
+                file_format=None,
+                out=out,
+                camera=camera,
+                coordinates=coordinates,
+                how=self._opened,
+            )
             return out
 
     def _open(self) -> "tuple[Setup, TrainState]":

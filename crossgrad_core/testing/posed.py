@@ -10,8 +10,9 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
+from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.state import PluginState
 
 

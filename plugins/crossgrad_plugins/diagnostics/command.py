@@ -127,7 +127,9 @@ def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None)
 
 
 def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
-    report = replace(watch.report(model.scene, which), exposure=exposure_of(model.scene))
+    report = watch.report(model.scene, which)
+    notes = (model.scene.georeference.note, *report.notes)
+    report = replace(report, notes=notes, exposure=exposure_of(model.scene))
     if options.signature is None:
         return report
     note = _write_signature(model, options.signature, options.seed)

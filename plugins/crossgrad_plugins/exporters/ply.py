@@ -6,9 +6,14 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Exporter, Gaussians, Similarity
+from crossgrad_core.plugin import Exporter, Gaussians, Rounding, Similarity
 from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_format.file import read_ply, sh_degree_of, write_ply
+from crossgrad_plugins.exporters.ply_format.file import (
+    position_rounding,
+    read_ply,
+    sh_degree_of,
+    write_ply,
+)
 
 
 class Ply(Exporter):
@@ -21,6 +26,10 @@ class Ply(Exporter):
         self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
     ) -> tuple[str, ...]:
         return write_ply(path, SplatCloud.from_gaussians(gaussians), similarity, comments)
+
+    @override
+    def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
+        return position_rounding(SplatCloud.from_gaussians(gaussians), similarity)
 
     @override
     def stored(self, gaussians: Gaussians) -> Gaussians:

@@ -111,6 +111,10 @@ class Fields:
             self.wrong(key, "a list of texts")
         return texts
 
+    def inner(self, key: str) -> "Fields":
+        """An object in the object."""
+        return self._child(self.value.get(key), key)
+
     def members(self, key: str) -> dict[str, "Fields"]:
         """Objects by their names in an object."""
         value = self.value.get(key)

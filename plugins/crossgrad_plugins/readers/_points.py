@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from crossgrad_core.plugin import Camera, UserError
 from crossgrad_core.scene.raw import RawView
 from crossgrad_plugins.exporters.ply_format.table import read_vertices
+from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.readers._inside import Inside
-from crossgrad_plugins.readers._poses import SAME, Frame3D
 
 #: Names under which tools put points beside their poses, the first one that is there is taken.
 USUAL: Final = ("sparse_pc.ply", "points3D.ply", "points3d.ply", "point_cloud.ply", "points.ply")

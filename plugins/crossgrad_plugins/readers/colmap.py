@@ -8,7 +8,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.numerics.rotations import matrix_rows
-from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, is_file
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
@@ -19,7 +19,10 @@ from crossgrad_plugins.readers._colmap_folder import (
 )
 from crossgrad_plugins.readers._colmap_model import read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
+from crossgrad_plugins.readers._place import by_code, by_file, by_gps
 
+#: The place on Earth, beside a model or in the scene's folder.
+_GEOREF = "georef.json"
 #: A rotation shorter than this, or longer than its inverse, has no length that can be squared.
 _SHORTEST = 1e-100
 
@@ -35,6 +38,14 @@ class ColmapReader(Reader):
     model: str | None = Field(
         None, description="folder of the model within the scene, such as sparse/1"
     )
+    crs: str | None = Field(
+        None, description="coordinate system that the poses are in, such as epsg:32633"
+    )
+    gps: Path | None = Field(
+        None,
+        description="what tells where photos were taken: a folder with the photos as the camera "
+        "wrote them, or a list as geo.txt; by itself georef.json, geo.txt, database.db, the photos",
+    )
 
     @override
     def accepts(self, path: Path) -> bool:
@@ -45,7 +56,28 @@ class ColmapReader(Reader):
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        return build_scene(read_raw(path, self.images, self.model), options)
+        raw = read_raw(path, self.images, self.model)
+        return self.placed(build_scene(raw, options), raw)
+
+    def placed(self, scene: Scene, raw: RawScene) -> Scene:
+        """The scene, made from `raw`, with its place on Earth where that is known.
+
+        Raises:
+            UserError: What an option names, or a `georef.json`, is not there or cannot be read.
+        """
+        if self.crs is not None and self.gps is not None:
+            raise UserError(
+                "the coordinate system of the poses leaves nothing for GPS to tell",
+                where="reader.crs, reader.gps",
+                todo="leave one of them out",
+            )
+        if self.crs is not None:
+            return by_code(scene, self.crs)
+        files = (choose_model(raw.root, self.model)[0] / _GEOREF, raw.root / _GEOREF)
+        file = next((file for file in files if is_file(file)), None)
+        if file is not None and self.gps is None:
+            return by_file(scene, file)
+        return by_gps(scene, raw, self.gps)
 
 
 def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:

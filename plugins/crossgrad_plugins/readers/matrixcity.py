@@ -16,11 +16,12 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.georeference.frames import rotation_of
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._points import check_seen, find_points
-from crossgrad_plugins.readers._poses import from_opengl, rotation_of
+from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import holds
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_lens, transform_of

@@ -22,15 +22,18 @@ from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.georeference.ellipsoid import place_at
+from crossgrad_plugins.georeference.frames import SAME, Frame3D, rotation_of
+from crossgrad_plugins.georeference.on_earth import OnEarth
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
-from crossgrad_plugins.readers._earth import local_frame
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
 from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
+from crossgrad_plugins.readers._place import at, by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
-from crossgrad_plugins.readers._poses import SAME, Frame3D, from_opencv, rotation_of
+from crossgrad_plugins.readers._poses import from_opencv
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import head_of
 from crossgrad_plugins.readers._xml import read_xml
@@ -83,7 +86,7 @@ class MetashapeReader(Reader):
         images = inside.name(self.images, "reader.images")
         chunk = _chunk(file)
         cameras, notes = _cameras(chunk, file)
-        world, where = _world(chunk, file, cameras, self.frame)
+        world, where, place = _world(chunk, file, cameras, self.frame)
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
         photos = PhotoNames.of(path / images)
         views = tuple(_view(inside, each, sensors, photos, world) for each in cameras)
@@ -92,7 +95,8 @@ class MetashapeReader(Reader):
         check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
         head = f"Metashape: {count(len(views), 'posed image')} from {file.name}, {points.note}"
         raw = raw_scene(inside, images, views, points, head, *notes, *where)
-        return build_scene(raw, options)
+        scene = build_scene(raw, options)
+        return by_gps(scene, raw) if place is None else at(scene, place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,21 +184,23 @@ def _camera(element: Element, file: Path, index: int) -> _Camera:
 
 def _world(
     chunk: Element, file: Path, cameras: list[_Camera], wanted: str
-) -> tuple[Frame3D, list[str]]:
-    """From the chunk's own coordinates to those of the scene, and a note on what was applied."""
-    if wanted == "chunk" or not cameras:
-        return SAME, []
-    frame, name = _transform(chunk, file, cameras[0].component)
-    system = (chunk.findtext("reference") or "").lstrip()
-    if name is None:
-        return SAME, []
-    if not system.startswith(_ON_EARTH):
-        return frame, [f"Metashape: the transform of the {name} is applied"]
+) -> tuple[Frame3D, list[str], OnEarth | None]:
+    """From the chunk's own coordinates to those of the scene, a note on it, and the place."""
+    frame, name = _transform(chunk, file, cameras[0].component if cameras else "")
+    if name is None or not cameras:
+        return SAME, [], None
     centers = frame.points(np.stack([camera.center for camera in cameras]))
-    local, origin = local_frame(centers.mean(axis=0))
-    if local is None:
-        return frame, [f"Metashape: the transform of the {name} is applied"]
-    return local.after(frame), [f"Metashape: east, north, up in metres around {origin}"]
+    on_earth = (chunk.findtext("reference") or "").lstrip().startswith(_ON_EARTH)
+    origin = place_at(centers.mean(axis=0)) if on_earth else None
+    if origin is None:
+        if wanted == "chunk":
+            return SAME, [], None
+        return frame, [f"Metashape: the transform of the {name} is applied"], None
+    local, source = origin.to_enu.after(frame), f"the transform of Metashape's {name}"
+    if wanted == "chunk":
+        return SAME, [], OnEarth(origin, local, source)
+    note = f"Metashape: east, north, up in metres around {origin.text}"
+    return local, [note], OnEarth(origin, SAME, source)
 
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:

@@ -11,11 +11,12 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.georeference.frames import Frame3D, rotation_of
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
+from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
-from crossgrad_plugins.readers._poses import Frame3D, rotation_of
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with, holds
 from crossgrad_plugins.readers._transforms import raw_views, read_frame, transform_of
@@ -60,7 +61,8 @@ class NerfstudioReader(Reader):
         if "fisheye_crop_radius" in whole:
             notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
         raw = raw_scene(inside, images, views, points, *notes)
-        return build_scene(replace(raw, split=_split(inside, whole, base, images)), options)
+        raw = replace(raw, split=_split(inside, whole, base, images))
+        return by_gps(build_scene(raw, options), raw)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
         """The file of points that was asked for, and where."""

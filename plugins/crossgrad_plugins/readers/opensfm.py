@@ -22,10 +22,13 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.raw_checks import FARTHEST
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.georeference.frames import SAME
+from crossgrad_plugins.georeference.on_earth import OnEarth
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_json
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens
+from crossgrad_plugins.readers._place import at, by_gps, origin_of
 from crossgrad_plugins.readers._points import Points
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import begins_with
@@ -70,7 +73,9 @@ class OpenSfmReader(Reader):
             f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
             f"{count(len(points.positions), 'SfM point')} from {points.source}"
         )
-        return build_scene(raw_scene(inside, images, views, points, head, *note), options)
+        raw = raw_scene(inside, images, views, points, head, *note)
+        scene, place = build_scene(raw, options), _place(chosen)
+        return by_gps(scene, raw) if place is None else at(scene, place)
 
     @property
     def _names(self) -> tuple[str, ...]:
@@ -102,6 +107,24 @@ def _choose(file: Path) -> tuple[Fields, list[str]]:
         f"OpenSfM: the reconstruction with most photos is taken; left out are those with {others}"
     )
     return models[best], [note] if others else []
+
+
+def _place(chosen: Fields) -> OnEarth | None:
+    """The place that the reconstruction was brought to; None where there was no GPS.
+
+    Its coordinates are metres east, north and up from its reference.
+    """
+    if "reference_lla" not in chosen:
+        return None
+    origin = origin_of(chosen.inner("reference_lla"))
+    if (origin.latitude, origin.longitude) == (0.0, 0.0):
+        return None
+    shots = [shot for shot in chosen.members("shots").values() if "gps_position" in shot]
+    off = [_center(shot) - shot.numbers("gps_position", 3) for shot in shots]
+    # OpenSfM does not take altitudes from photos unless it is told to.
+    level = np.array(off).reshape(-1, 3)[:, :2]
+    rms = {"rms_horizontal": float(np.sqrt((level**2).sum(axis=1).mean()))} if off else {}
+    return OnEarth(origin, SAME, f"reference_lla of {chosen.file.name}", rms)
 
 
 def _camera(fields: Fields) -> Calibration:
@@ -136,11 +159,21 @@ def _view(inside: Inside, name: str, shot: Fields, cameras: dict[str, Calibratio
     camera = shot.text("camera")
     if camera not in cameras:
         shot.wrong("camera", f"a camera of the file, such as {min(cameras, default='(none)')}")
-    plain = inside.name(name, shot.here)
+    return raw_view(inside.name(name, shot.here), cameras[camera], _pose(shot))
+
+
+def _pose(shot: Fields) -> NDArray[np.float64]:
+    """[4, 4] world to camera."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_by(shot.numbers("rotation", 3))
     pose[:3, 3] = shot.numbers("translation", 3)
-    return raw_view(plain, cameras[camera], pose)
+    return pose
+
+
+def _center(shot: Fields) -> NDArray[np.float64]:
+    """[3] of the camera."""
+    pose = _pose(shot)
+    return np.asarray(np.linalg.solve(pose[:3, :3], -pose[:3, 3]))
 
 
 def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -28,6 +28,7 @@ from crossgrad_plugins.readers._json import Fields
 from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
+from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
@@ -83,7 +84,8 @@ class RealityCaptureReader(Reader):
         check_seen(points, views, file)
         posed = f"{count(len(views), 'posed image')} from {file.name}"
         note = f"RealityCapture: {posed}, {points.note}"
-        return build_scene(raw_scene(inside, images, views, points, note), options)
+        raw = raw_scene(inside, images, views, points, note)
+        return by_gps(build_scene(raw, options), raw)
 
 
 @dataclass(frozen=True)

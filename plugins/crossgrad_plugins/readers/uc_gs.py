@@ -44,9 +44,8 @@ class UcGsReader(ColmapReader):
         views = tuple(replace(view, place=_place(view.name)) for view in raw.views)
         note = f"UC-GS: {count(len(test), 'posed image')} for testing by folder or name"
         split = (train, test) if train and test else None
-        return build_scene(
-            replace(raw, views=views, split=split, notes=(*raw.notes, note)), options
-        )
+        raw = replace(raw, views=views, split=split, notes=(*raw.notes, note))
+        return self.placed(build_scene(raw, options), raw)
 
 
 def is_test(name: str) -> bool:

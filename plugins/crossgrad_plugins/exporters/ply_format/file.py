@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.spherical import COEFFICIENTS
-from crossgrad_core.plugin import Similarity, UserError, atomic_file
+from crossgrad_core.plugin import COORDINATES_TAG, Rounding, Similarity, UserError, atomic_file
 from crossgrad_plugins.exporters.ply_format.cloud import REST, RenderMode, SplatCloud
 from crossgrad_plugins.exporters.ply_format.table import read_vertices, vertex_properties
 
@@ -27,7 +27,7 @@ PROPERTIES = (
     *(f"rot_{i}" for i in range(4)),
 )
 #: Rounding of positions to float32 may move a Gaussian by this much, in local units.
-POSITION_TOLERANCE = 1e-4
+POSITION_TOLERANCE = 1e-6
 
 _OFFSET_TAG = "crossgrad_offset:"
 _MODE_TAG = "SplatRenderMode:"
@@ -50,7 +50,7 @@ def write_ply(
     """Writes a cloud of the local frame in input coordinates; the file appears complete.
 
     Where the input coordinates are so large (UTM, ECEF) that float32 would move Gaussians by more
-    than 1e-4 local units, positions are written relative to a rounded offset, which stands in a
+    than 1e-6 local units, positions are written relative to a rounded offset, which stands in a
     comment `crossgrad_offset: x y z` and is applied by `read_ply`.
 
     Args:
@@ -85,6 +85,15 @@ def write_ply(
     return tuple(notes)
 
 
+def position_rounding(cloud: SplatCloud, similarity: Similarity) -> Rounding:
+    """How `write_ply` keeps the positions of a cloud."""
+    offset = position_offset(similarity)
+    moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
+    means = moved.selected(_representable(moved)).means
+    off = np.abs(means.astype(np.float32) - means)
+    return Rounding(offset, float(off.max(initial=0.0)))
+
+
 def position_offset(similarity: Similarity) -> NDArray[np.float64]:
     """[3] what to subtract from input coordinates before they are rounded to float32.
 
@@ -107,9 +116,11 @@ def read_ply(path: Path) -> SplatCloud:
         The cloud in the frame of the file, its `crossgrad_offset` applied.
 
     Raises:
-        UserError: Not a PLY file, no Gaussians in it, ends too early, or holds non-finite numbers.
+        UserError: Not a PLY file, no Gaussians in it, ends too early, holds non-finite numbers, or
+            is in other coordinates than a scene's input.
     """
     vertices = read_vertices(path)
+    _check_coordinates(vertices.comments, path)
     rest = _rest_names(vertices.columns, path)
     wanted = [name for name in PROPERTIES if not name.startswith(("n", "f_rest_"))]
     missing = [name for name in wanted if name not in vertices.columns]
@@ -277,6 +288,18 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
             todo=f"repair or remove the comment that starts with {_OFFSET_TAG}",
         )
     return offset
+
+
+def _check_coordinates(comments: Sequence[str], path: Path) -> None:
+    found = _tagged(comments, COORDINATES_TAG)
+    if found is not None:
+        raise UserError(
+            "PLY file in other coordinates than the scene's",
+            where=path,
+            expected="the coordinates of the scene's input",
+            found=found,
+            todo="export it again with --coordinates input",
+        )
 
 
 def _render_mode(comments: Sequence[str], path: Path) -> RenderMode:

@@ -7,6 +7,7 @@ from crossgrad_fuzz.targets import (
     lists,
     named,
     photos,
+    places,
     ply,
     readers,
     records,
@@ -19,7 +20,7 @@ TARGETS: dict[str, Target] = {
     target.name: target
     for module in (
         *(ply, colmap, scenes, readers, photos, settings, checkpoints, lists, tables),
-        *(records, named),
+        *(records, named, places),
     )
     for target in module.TARGETS
 }

@@ -114,6 +114,23 @@ def _nerfstudio_seeds() -> Sequence[Case]:
     ]
 
 
+def _opensfm_seeds() -> Sequence[Case]:
+    """All lenses, and a reconstruction that was brought to its place by GPS."""
+    cases = [_written("opensfm", lens) for lens in _LENSES]
+
+    def placed(models: Any) -> None:
+        place = {"latitude": 52.5, "longitude": 13.4, "altitude": 30.0}
+        models[1]["reference_lla"] = place
+        for shot in models[1]["shots"].values():
+            shot["gps_position"] = [1.0, 2.0, 3.0]
+
+    def nowhere(models: Any) -> None:
+        models[1]["reference_lla"] = {"latitude": 0, "longitude": 0, "altitude": 0}
+
+    file = "reconstruction.json"
+    return [*cases, _changed(cases[0], file, placed), _changed(cases[0], file, nowhere)]
+
+
 def _metashape_seeds() -> Sequence[Case]:
     """All lenses, cameras of two components, a chunk without a transform, and one on Earth."""
     cases = [_written("metashape", lens) for lens in _LENSES]
@@ -193,8 +210,6 @@ def _target(
     mutators: Sequence[Mutator] = (_VALUE,),
 ) -> Target:
     left_out: Callable[[ModuleType], tuple[str, ...]] = {
-        # Of chunks on Earth, which another target has.
-        _poses: ("Frame3D.after",),
         # Links, which no input holds.
         _inside: ("Inside.files",),
         # Files that options name, or of which there are none or several.
@@ -238,7 +253,7 @@ TARGETS = (
         *(_nerfstudio_seeds, _FIELDS),
     ),
     _target("uc-gs", uc_gs.UcGsReader, (uc_gs,), _forms("uc-gs", *_PLAIN), (), (_renamed,)),
-    _target("opensfm", opensfm.OpenSfmReader, (opensfm, _json), _forms("opensfm", *_LENSES)),
+    _target("opensfm", opensfm.OpenSfmReader, (opensfm, _json), _opensfm_seeds),
     _target(
         *("realitycapture", realitycapture.RealityCaptureReader, (realitycapture, _photos)),
         *(_forms("realitycapture", *_LENSES[:2]), (b",", b"\n", b'"', b"#name"), ()),

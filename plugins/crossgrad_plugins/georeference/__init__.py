@@ -1,0 +1,1 @@
+"""Where on Earth a scene is, and its Gaussians in coordinates of maps."""

@@ -1,0 +1,139 @@
+"""A scene whose place on Earth is known."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from crossgrad_core.plugin import INPUT, LOCAL, Gaussians, Json, Placed, Similarity
+from crossgrad_plugins.georeference.ellipsoid import Place
+from crossgrad_plugins.georeference.frames import SAME, Frame3D
+from crossgrad_plugins.georeference.projection import Projection, utm_code
+from crossgrad_plugins.georeference.turned import turned
+
+#: How far photos are from where their GPS says, in metres: 3-D, along the ground, upright.
+RESIDUALS: Final = ("median", "rms", "max", "rms_horizontal", "rms_vertical")
+_CONVENTION: Final = (
+    "position = numbers of the file + offset; [east, north, up, 1] = transform [position, 1], "
+    "metres from the origin; [input, 1] = to_input [position, 1]; matrices row by row; altitude "
+    "above the ellipsoid of WGS 84 where the source has it so"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class OnEarth:
+    """A scene whose place on Earth is known.
+
+    Attributes:
+        origin: Of east, north, up.
+        to_enu: From the coordinates of the scene's input to metres east, north and up from there.
+        source: What told it.
+        residuals: Metres by name, of `RESIDUALS`; empty where nothing could be compared.
+        system: Of the input, where that is in coordinates of maps. They are no similarity of east,
+            north, up: centres go by the system, and `to_enu` fits it best at the origin.
+    """
+
+    origin: Place
+    to_enu: Frame3D
+    source: str
+    residuals: Mapping[str, float] = field(default_factory=dict)
+    system: Projection | None = None
+
+    @property
+    def note(self) -> str:
+        """See `crossgrad_core.plugin.Georeference`."""
+        parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
+        told = f"; residuals: {', '.join(parts)}" if parts else ""
+        return (
+            f"georeferenced by {self.source}: origin at {self.origin.text}, 1 unit = "
+            f"{self.to_enu.scale:.6g} m{told}"
+        )
+
+    def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
+        """See `crossgrad_core.plugin.Georeference`."""
+        facts = {**self._facts(), "coordinates": coordinates}
+        centers = similarity.to_input(_means(gaussians))
+        here = self._enu_of(centers)
+        if self.system is not None and coordinates in {INPUT, LOCAL}:
+            facts["transform_error_m"] = _apart(self.to_enu.points(centers), here)
+        if coordinates == INPUT:
+            facts |= self.system.facts if self.system is not None else {}
+            return Placed(gaussians, similarity, {**facts, **self._ways(SAME)})
+        if coordinates == LOCAL:
+            own = Frame3D(np.eye(3), -similarity.scale * similarity.offset, similarity.scale)
+            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {**facts, **self._ways(own)})
+        if coordinates == "enu":
+            return self._turned(gaussians, similarity, self.to_enu, here, facts)
+        where, code = f"--coordinates {coordinates}", coordinates
+        projection = Projection.of(utm_code(self.origin) if code == "utm" else code, where)
+        middle = self.to_enu.points(similarity.offset[None])[0]
+        frame = projection.near(self.origin.to_enu, middle, where).after(self.to_enu)
+        points = projection.points(self.origin.to_enu.inverse.points(here))
+        metres = self.to_enu.scale / frame.scale
+        facts |= projection.facts
+        facts["transform_error_m"] = _apart(metres * points, metres * frame.points(centers))
+        placed = self._turned(gaussians, similarity, frame, points, facts)
+        return replace(placed, notes=projection.remarks)
+
+    def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] metres east, north and up from the origin of points [N, 3] of the input."""
+        if self.system is None:
+            return self.to_enu.points(points)
+        return self.origin.to_enu.points(self.system.geocentric(points))
+
+    def _turned(
+        self,
+        gaussians: Gaussians,
+        similarity: Similarity,
+        frame: Frame3D,
+        points: NDArray[np.float64],
+        facts: dict[str, Json],
+    ) -> Placed:
+        """Gaussians about `points` [N, 3], turned and scaled by a similarity from the input frame.
+
+        They get a frame of their own, turned against the local one and of its size, so that an
+        exporter only moves and scales them.
+        """
+        offset = frame.points(similarity.offset[None])[0]
+        own = Similarity(offset, similarity.scale / frame.scale)
+        means = torch.from_numpy(own.to_local(points)).to(gaussians.means.device)
+        moved = turned(gaussians, means, torch.from_numpy(frame.rotation))
+        return Placed(moved, own, {**facts, **self._ways(frame)})
+
+    def _facts(self) -> dict[str, Json]:
+        """What holds in any coordinates."""
+        residuals: dict[str, Json] = dict(self.residuals)
+        return {
+            "crs": None,
+            "origin": dict(vars(self.origin)),
+            "source": self.source,
+            "residuals_m": residuals,
+            "convention": _CONVENTION,
+        }
+
+    def _ways(self, frame: Frame3D) -> dict[str, Json]:
+        """The matrices of a file in coordinates to which `frame` leads from those of the input."""
+        back = frame.inverse
+        to_enu = self.to_enu.after(back)
+        return {
+            "metres_per_unit": to_enu.scale,
+            "transform": to_enu.matrix.tolist(),
+            "to_input": back.matrix.tolist(),
+        }
+
+
+def _means(gaussians: Gaussians) -> NDArray[np.float64]:
+    return np.asarray(gaussians.means.detach().cpu().double().numpy())
+
+
+def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float | None:
+    """How far two sets of points [N, 3] are apart; None where there are none.
+
+    Of all but the farthest hundredth, which may be as far as the horizon.
+    """
+    off = np.linalg.norm(points - others, axis=1)
+    off = off[np.isfinite(off)]
+    return float(np.quantile(off, 0.99)) if len(off) else None

@@ -1,0 +1,147 @@
+"""Coordinates of maps, by their EPSG codes."""
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.plugin import Json, UserError
+from crossgrad_plugins.georeference.ellipsoid import Place
+from crossgrad_plugins.georeference.frames import Frame3D
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
+_CODE: Final = re.compile(r"epsg:[0-9]{1,6}", re.IGNORECASE | re.ASCII)
+_SHOWN: Final = 80
+#: Geocentric coordinates of WGS 84.
+GEOCENTRIC: Final = "epsg:4978"
+#: Metres to both sides of a place between which a projection is told by its ends.
+_NEAR: Final = 10.0
+#: Metres of accuracy that need no mention.
+_KNOWN_WELL: Final = 1.0
+#: What a projection may stretch in one direction more than in another; a UTM zone does by 0.001.
+_UNEVEN: Final = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A coordinate reference system with metres or another unit of length on all axes.
+
+    Attributes:
+        code: Such as `epsg:32633`.
+        forward: From geocentric coordinates, x east and y north where it is a map.
+        accuracy: Metres to which it is known in WGS 84; None where PROJ does not say.
+    """
+
+    code: str
+    forward: "Transformer"
+    accuracy: float | None
+
+    @classmethod
+    def of(cls, code: str, where: str) -> "Projection":
+        """The system of a code.
+
+        Args:
+            code: Such as `epsg:32633`.
+            where: Names in errors what asked for it.
+
+        Raises:
+            UserError: It is no code, there is no such code, a grid is missing, or pyproj.
+        """
+        # Other forms of PROJ may name files anywhere.
+        if not _CODE.fullmatch(code):
+            raise _unknown(where, repr(code)[:_SHOWN])
+        try:
+            from pyproj import CRS, Transformer
+            from pyproj.exceptions import CRSError, ProjError
+        except ImportError as error:
+            raise UserError(
+                "coordinates of an EPSG code need pyproj",
+                where=where,
+                found="it is not installed",
+                todo='pip install "crossgrad[geo]"',
+            ) from error
+        try:
+            system = CRS.from_user_input(code).to_3d()
+            forward = Transformer.from_crs(GEOCENTRIC, system, always_xy=True, allow_ballpark=False)
+        except (CRSError, ProjError) as error:
+            raise _unknown(where, str(error).partition("\n")[0]) from error
+        return cls(code, forward, forward.accuracy if forward.accuracy >= 0.0 else None)
+
+    @property
+    def facts(self) -> dict[str, Json]:
+        """Of `.georef.json`, for a file in it."""
+        return {"crs": self.code.upper(), "crs_accuracy_m": self.accuracy}
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the user should know about coordinates in it."""
+        if self.accuracy is None:
+            return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)
+        if self.accuracy > _KNOWN_WELL:
+            return (f"{self.code}: exact to {self.accuracy:g} m, says PROJ",)
+        return ()
+
+    def points(self, geocentric: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] from geocentric coordinates [N, 3]; infinite where there are none."""
+        return np.column_stack(self.forward.transform(*geocentric.T))
+
+    def geocentric(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] geocentric coordinates of points [N, 3]; NaN where there are none."""
+        found = np.column_stack(self.forward.transform(*points.T, direction="INVERSE"))
+        return np.where(np.isfinite(found), found, np.nan)
+
+    def near(self, to_enu: Frame3D, place: NDArray[np.float64], where: str) -> Frame3D:
+        """The similarity from east, north, up to this system that fits best around a place.
+
+        Args:
+            to_enu: From geocentric coordinates.
+            place: [3] in east, north, up.
+            where: Names in errors what asked for it.
+
+        Raises:
+            UserError: Around the place the system stretches unevenly, mirrors, or is not defined.
+        """
+        ends = place + _NEAR * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        here, *sides = self.points(to_enu.inverse.points(ends))
+        stretch = (np.array(sides[:3]) - np.array(sides[3:])).T / (2.0 * _NEAR)
+        if not np.isfinite(stretch).all():
+            raise self._unusable(where, "the scene is outside of where it is defined")
+        left, sizes, right = np.linalg.svd(stretch)
+        rotation = left @ right
+        if np.linalg.det(rotation) < 0.0:
+            raise self._unusable(where, "its axes are left-handed")
+        if sizes[0] > (1.0 + _UNEVEN) * sizes[2]:
+            raise self._unusable(
+                where, f"a metre is {sizes[2]:.4g} to {sizes[0]:.4g} units, by direction"
+            )
+        scale = float(np.cbrt(sizes.prod()))
+        return Frame3D(rotation, here - scale * rotation @ place, scale)
+
+    def _unusable(self, where: str, found: str) -> UserError:
+        return UserError(
+            f"Gaussians cannot be written in {self.code}",
+            where=where,
+            expected="a right-handed system with the same unit on all axes",
+            found=found,
+            todo="take UTM (--coordinates utm), or enu",
+        )
+
+
+def _unknown(where: str, found: str) -> UserError:
+    return UserError(
+        "PROJ cannot compute these coordinates",
+        where=where,
+        found=found,
+        todo="check the code, or take one of WGS 84 or ETRS89 without a height system, such as "
+        "epsg:32633 or epsg:25833",
+    )
+
+
+def utm_code(place: Place) -> str:
+    """The EPSG code of the UTM zone of a place (WGS 84), without the exceptions of Norway."""
+    zone = int((place.longitude + 180.0) // 6.0) % 60 + 1
+    return f"epsg:{(32600 if place.latitude >= 0.0 else 32700) + zone}"

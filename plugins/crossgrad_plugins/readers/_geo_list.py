@@ -1,0 +1,105 @@
+"""Where photos were taken, by a list in the form of OpenDroneMap's geo.txt."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Collection
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import numpy as np
+
+from crossgrad_core.plugin import UserError, read_file
+from crossgrad_plugins.georeference.ellipsoid import place_at
+from crossgrad_plugins.georeference.gps_tags import Numbers, number
+from crossgrad_plugins.georeference.projection import Projection
+from crossgrad_plugins.readers._gps import Measured, measured
+
+#: Bytes that a word takes in a list.
+_WORD: Final = 64
+_DEGREES: Final = re.compile(r"epsg:4326|wgs ?84|\+proj=(longlat|latlong)\b.*", re.IGNORECASE)
+_ZONE: Final = "(0?[1-9]|[1-5][0-9]|60)"
+_UTM: Final = re.compile(f"wgs ?84 utm {_ZONE} ?([ns])", re.IGNORECASE)
+_PROJ_UTM: Final = re.compile(
+    rf"\+proj=utm \+zone={_ZONE}( \+south)?( \+(datum|ellps)=WGS84| \+units=m| \+no_defs"
+    r"| \+type=crs)*"
+)
+_SHOWN: Final = 80
+
+
+def of_list(path: Path, names: Collection[str]) -> Measured:
+    """The places in a list.
+
+    Its first line is the coordinate system, `EPSG:4326` for longitude and latitude; the others have
+    the name of a photo, x, y and altitude, and what follows is passed over.
+
+    Args:
+        path: The file.
+        names: The photos of the scene; the list may leave out their folders.
+
+    Raises:
+        UserError: The file cannot be read, a line lacks numbers, or the system is not known.
+    """
+    first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
+    rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
+    known, to_degrees = _by_file(names), _system(" ".join(first), path)
+    found = ((known[name], to_degrees(row)) for name, row in rows.items() if name in known)
+    return measured(found, path.name)
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_file(path, {b" ": _WORD, b"\n": _WORD}).decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _wrong(path, "a text file in UTF-8", str(error)) from error
+
+
+def _row(path: Path, line: int, words: list[str]) -> Numbers:
+    """x, y and altitude, which is NaN where it is missing."""
+    x, y, z = [*map(number, words[1:4]), *[math.nan] * 3][:3]
+    if not math.isfinite(x) or not math.isfinite(y):
+        shown = " ".join(words)[:_SHOWN]
+        raise _wrong(path, f"a name, x, y and altitude in line {line}", shown)
+    return x, y, z
+
+
+def _wrong(path: Path, expected: str, found: str) -> UserError:
+    return UserError(
+        "the list of places cannot be read",
+        where=path,
+        expected=expected,
+        found=found,
+        todo="mend it (docs/coordinates.md shows its form), or take it away",
+    )
+
+
+def _by_file(names: Collection[str]) -> dict[str, str]:
+    """Photos by their names and, where only one has it, by that of the file alone."""
+    times = Counter(PurePosixPath(name).name for name in names)
+    alone = {PurePosixPath(n).name: n for n in names if times[PurePosixPath(n).name] == 1}
+    return {**alone, **{name: name for name in names}}
+
+
+def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
+    """From coordinates in a system to degrees.
+
+    Raises:
+        UserError: There is no such system, or pyproj is not installed.
+    """
+    if _DEGREES.fullmatch(text):
+        return lambda xyz: (xyz[1], xyz[0], xyz[2])
+    utm = _UTM.fullmatch(text) or _PROJ_UTM.fullmatch(text)
+    if utm:
+        south = (utm[2] or "n").strip() in {"s", "S", "+south"}
+        text = f"epsg:{(32700 if south else 32600) + int(utm[1])}"
+    projection = Projection.of(text, str(path))
+
+    def on_earth(xyz: Numbers) -> Numbers | None:
+        flat = math.isnan(xyz[2])
+        point = projection.geocentric(np.array([[*xyz[:2], 0.0 if flat else xyz[2]]]))[0]
+        place = place_at(point) if np.isfinite(point).all() else None
+        if place is None:
+            return None
+        return place.latitude, place.longitude, math.nan if flat else place.altitude
+
+    return on_earth

@@ -1,0 +1,60 @@
+"""Where photos were taken, by the GPS in their EXIF headers."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from crossgrad_core.plugin import UserError, is_file
+from crossgrad_core.scene.pillow import opened
+from crossgrad_plugins.georeference.ellipsoid import Place
+from crossgrad_plugins.georeference.gps_tags import Numbers, gps_of, is_place
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Where photos were taken.
+
+    Attributes:
+        source: What tells it.
+        places: Name of a photo -> its place.
+        flat: Number of photos of which all but the altitude is known, beside those.
+    """
+
+    source: str
+    places: Mapping[str, Place] = field(default_factory=dict)
+    flat: int = 0
+
+
+def of_headers(files: Mapping[str, Path], source: str) -> Measured:
+    """The places in the EXIF headers of photos; those that have none are left out.
+
+    Args:
+        files: Name -> file; one that is not there, or is no photo, tells nothing.
+        source: What the photos are called.
+    """
+    return measured(((name, _header(path)) for name, path in files.items()), source)
+
+
+def measured(found: Iterable[tuple[str, Numbers | None]], source: str) -> Measured:
+    """What is a place on Earth among numbers of photos."""
+    places: dict[str, Place] = {}
+    flat = 0
+    for name, numbers in found:
+        if numbers is None or not is_place(*numbers[:2]):
+            continue
+        if math.isfinite(numbers[2]):
+            places[name] = Place(*numbers)
+        else:
+            flat += 1
+    return Measured(source, places, flat)
+
+
+def _header(path: Path) -> Numbers | None:
+    if not is_file(path):
+        return None
+    try:
+        with opened(path, "the photo's EXIF header cannot be read") as image:
+            return gps_of(image)
+    except UserError:  # Decoding the photo raises it again, if it is one of the photo.
+        return None
