@@ -25,6 +25,7 @@ class AnalyticSplatting(Vanilla):
     response: ClassVar[Response] = "analytic"
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = True
+    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
 
     @override
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:

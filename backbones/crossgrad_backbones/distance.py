@@ -53,6 +53,7 @@ class DistanceConditioned(Vanilla):
     """
 
     plain: ClassVar[bool] = False
+    passed_on: ClassVar[Mapping[str, str]] = {"sh_rest": "f_rest"}
 
     condition_scales: bool = Field(True, description="scales depend on the distance")
     condition_opacities: bool = Field(True, description="opacities depend on the distance")

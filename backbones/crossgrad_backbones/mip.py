@@ -46,6 +46,7 @@ class MipSplatting(Vanilla):
     response: ClassVar[Response] = "antialiased"
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = True
+    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
     parity: bool = Field(
@@ -72,7 +73,7 @@ class MipSplatting(Vanilla):
     def _filtered(self, parameters: Parameters, scene: Scene) -> Parameters:
         return {**parameters, "filter": self._widths(parameters, scene)}
 
-    def _widths(self, parameters: Parameters, scene: Scene) -> Tensor:
+    def _widths(self, parameters: Mapping[str, Tensor], scene: Scene) -> Tensor:
         cameras = [view.camera for view in scene.train_views]
         return filter_widths(parameters["means"], cameras, self.near, parity=self.parity)
 

@@ -1,5 +1,6 @@
 """Pixel-GS: the Gaussians of 3DGS with density control by pixels (Zhang et al. 2024)."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from crossgrad_backbones.vanilla import Vanilla
@@ -12,3 +13,4 @@ class PixelGS(Vanilla):
     """
 
     default_densifier: ClassVar[str] = "pixel"
+    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on

@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from crossgrad_core import defaults
 from crossgrad_core.contract.blocks import Block, Parameters
@@ -26,6 +27,9 @@ class Backbone(Component):
         plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
             PLY loses nothing.
         own_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
+        passed_on: Field of the Gaussians -> tensor that `decode` hands over as this field (or not
+            at all) and does not read: only the rows that are drawn need to be up to date. It
+            holds for the very class that says so, not for those that inherit from it.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -33,6 +37,14 @@ class Backbone(Component):
     response: ClassVar[Response] = "plain"
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = False
+    passed_on: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    @override
+    def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
+        # A class that inherits it may read in `decode` what its parent only hands over.
+        if "passed_on" not in vars(cls):
+            cls.passed_on = {}
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:

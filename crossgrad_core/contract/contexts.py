@@ -306,7 +306,7 @@ class RegularizeContext(StepContext):
         view: The view; None in the step's call.
     """
 
-    parameters: Parameters
+    parameters: Mapping[str, Tensor]
     backbone: "Backbone"
     gaussians: Gaussians | None
     view: View | None
@@ -329,7 +329,7 @@ class DensifyContext(StepContext):
             counted among the rendered views.
     """
 
-    parameters: Parameters
+    parameters: Mapping[str, Tensor]
     backbone: "Backbone"
     rasterizer: "Rasterizer"
     views: tuple[ViewRecord, ...]
@@ -351,7 +351,7 @@ class AfterStepContext(StepContext):
         edited: Whether density control changed the set of primitives in this step.
     """
 
-    parameters: Parameters
+    parameters: Mapping[str, Tensor]
     backbone: "Backbone"
     means_lr: float
     edited: bool

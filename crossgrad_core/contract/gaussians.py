@@ -6,9 +6,23 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 Response = Literal["plain", "antialiased", "analytic"]
 _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+
+
+@dataclass(frozen=True)
+class OnDemand:
+    """Tensors of which only those rows are up to date that were asked for.
+
+    Attributes:
+        fields: Which fields of the Gaussians they are.
+        bring: [R] int32 rows, each once, or None for all -> brings these up to date, in place.
+    """
+
+    fields: frozenset[str]
+    bring: Callable[[Tensor | None], None]
 
 
 @dataclass(frozen=True)
@@ -34,6 +48,8 @@ class Gaussians:
         slot: [N] int64, which of its primitive's Gaussians each one is; None where there is one.
         decoded: [P] bool, the primitives that were decoded for this view, whether or not they gave
             a Gaussian; None where all were.
+        on_demand: Tensors whose rows must be asked for before they are read; the gradients of these
+            are by rows, sparse. None where all is there. Only rasterizers with `by_rows` get it.
     """
 
     means: Tensor
@@ -49,6 +65,7 @@ class Gaussians:
     origin: Tensor | None = None
     slot: Tensor | None = None
     decoded: Tensor | None = None
+    on_demand: OnDemand | None = None
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -66,6 +83,23 @@ class Gaussians:
     def detached(self) -> "Gaussians":
         """The same Gaussians without their graph."""
         return self.mapped(torch.Tensor.detach)
+
+    def whole(self) -> "Gaussians":
+        """The same Gaussians for those who know nothing of rows on demand."""
+        return self if self.on_demand is None else _Whole(**vars(self))
+
+
+class _Whole(Gaussians):
+    """Gaussians that bring all rows of a tensor up to date when it is read."""
+
+    @override
+    def __getattribute__(self, name: str) -> Any:
+        if name == "on_demand":
+            return None
+        demand: OnDemand = super().__getattribute__("on_demand")
+        if name in demand.fields:
+            demand.bring(None)
+        return super().__getattribute__(name)
 
 
 @dataclass

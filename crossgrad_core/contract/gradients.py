@@ -42,14 +42,15 @@ class Gradients(ABC):
             divisor: What the sums are then divided by; K gives the mean without a further pass.
 
         Returns:
-            None for tensors that no view touches, or whose views are all non-finite.
+            None for tensors that no view touches, or whose views are all non-finite. Sparse, with
+            sorted rows, where the views' gradients are (`Gaussians.on_demand`).
         """
 
 
 class SeparateGradients(Gradients):
     """The gradients of the K views of one step, each of them known: opaque to operators.
 
-    Dense tensors today; the interface leaves room for sparse ones.
+    `elementwise` gives and wants dense tensors.
     """
 
     @abstractmethod
@@ -97,7 +98,8 @@ class SeparateGradients(Gradients):
             granularity: The one that `weights` was computed for.
 
         Returns:
-            None for tensors that no view touches, or whose views are all non-finite.
+            None for tensors that no view touches, or whose views are all non-finite; sparse where
+            those of `total` are.
         """
 
     @abstractmethod

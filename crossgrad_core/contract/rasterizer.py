@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
+from typing_extensions import override
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response
@@ -26,6 +27,8 @@ class Rasterizer(Component):
         together: Whether `render_views` is faster than one view after the other. The views of a
             step are then drawn in one call, with the graphs of all of them alive.
         repeatable: Whether the same input gives the same bits.
+        by_rows: Whether it heeds `Gaussians.on_demand`. It holds for the very class that says so,
+            not for those that inherit from it.
     """
 
     slot: ClassVar[str] = "rasterizers"
@@ -34,10 +37,18 @@ class Rasterizer(Component):
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
     together: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
+    by_rows: ClassVar[bool] = False
 
     max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
     near: float = Field(1e-3, gt=0.0, description="near plane, local units")
     dilation: float = Field(0.3, ge=0.0, description="dilation of the 2-D covariance, px^2")
+
+    @classmethod
+    @override
+    def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
+        # A class that inherits it may look at Gaussians before its parent asks for their rows.
+        if "by_rows" not in vars(cls):
+            cls.by_rows = False
 
     @classmethod
     def speed(cls, device: str) -> float:  # noqa: ARG003 - for those that run somewhere

@@ -19,15 +19,19 @@ def half_size(record: RenderedView, like: Tensor) -> Tensor:
     return torch.tensor([camera.width / 2, camera.height / 2]).to(like)
 
 
-def ndc_gradient(record: RenderedView) -> Tensor:
-    """[N, 2] gradient of the view's loss by the projected mean, per NDC unit."""
-    gradient = _present(record.screen.mean_gradient)
-    return gradient * half_size(record, gradient)
+def ndc_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
+    """[N, 2] gradient of the view's loss by the projected mean, per NDC unit; [S, 2] of `rows`."""
+    return _of_rows(record, record.screen.mean_gradient, rows)
 
 
-def ndc_abs_gradient(record: RenderedView) -> Tensor:
+def ndc_abs_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
     """[N, 2] the pixels' absolute gradients by the projected mean, summed, per NDC unit."""
-    gradient = _present(record.screen.abs_gradient)
+    return _of_rows(record, record.screen.abs_gradient, rows)
+
+
+def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None) -> Tensor:
+    gradient = _present(statistic)
+    gradient = gradient if rows is None else gradient[rows]
     return gradient * half_size(record, gradient)
 
 
@@ -62,9 +66,18 @@ def radii(record: RenderedView) -> Tensor:
     return record.screen.radii.to(record.gaussians.means) / max(camera.width, camera.height)
 
 
-def visible(record: RenderedView) -> Tensor:
+def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
     """[N] 1 where the Gaussian touched a pixel, else 0."""
-    return (record.screen.radii > 0).to(record.gaussians.means)
+    radii = record.screen.radii
+    return ((radii if rows is None else radii[rows]) > 0).to(record.gaussians.means)
+
+
+def seen(record: RenderedView) -> Tensor | None:
+    """[S] int64 rows of the Gaussians that touched a pixel: for sums over these alone.
+
+    None, which means all, on a GPU, where their number would be waited for.
+    """
+    return record.screen.radii.nonzero()[:, 0] if record.screen.radii.is_cpu else None
 
 
 def _present(statistic: Tensor | None) -> Tensor:
@@ -85,13 +98,15 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
     return {name: state.per_primitive.get(name, zeros).clone() for name in names}
 
 
-def add(record: RenderedView, total: Tensor, values: Tensor) -> None:
-    """Adds a value of each Gaussian [N] to its primitive's sum [P], in place."""
+def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
+    """Adds a value of each Gaussian [N], or of those in `rows`, to its primitive's sum [P]."""
     origin = record.gaussians.origin
-    if origin is None:
+    if origin is not None:
+        total.index_add_(0, origin if rows is None else origin[rows], values)
+    elif rows is None:
         total += values
     else:
-        total.index_add_(0, origin, values)
+        total.index_add_(0, rows, values)
 
 
 def mean(statistics: Mapping[str, Tensor], total: str, count: str) -> Tensor:

@@ -67,7 +67,7 @@ def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[T
 
 
 def apply_to_parameters(
-    edit: Edit, blocks: tuple[Block, ...], parameters: Parameters
+    edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]
 ) -> Parameters:
     """The parameters after an edit: new leaf tensors that require gradients where the old ones did.
 

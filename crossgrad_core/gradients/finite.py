@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from crossgrad_core.gradients.by_rows import values_of
+
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
 
 
@@ -27,7 +29,7 @@ def finite_and_present(tensor: Tensor | None) -> tuple[bool, bool]:
     """Whether no element is NaN or infinite, and whether one is not 0; (True, False) for None."""
     if tensor is None:
         return True, False
-    tensor = tensor.detach()
+    tensor = values_of(tensor.detach()) if tensor.is_sparse else tensor.detach()
     if not tensor.is_cpu and tensor.is_floating_point():
         value = float(largest(tensor))  # One pass, waited for once.
         return isfinite(value), value > 0.0

@@ -41,6 +41,14 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
     return kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
 
 
+def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
+    """[K, K] Gramian of gradients in `rows` of `count` rows, with the bits of dense ones."""
+    from crossgrad_core.gradients.numba_kernels import dense
+
+    width = max(_size(g) for g in column) // max(1, len(rows))
+    return dense.spread_gramian(_addresses([column])[0], rows.numpy(), width, count * width)
+
+
 def combine(
     columns: Sequence[Column],
     weights: NDArray[np.float64],

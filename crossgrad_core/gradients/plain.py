@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.gradients import native
+from crossgrad_core.gradients.by_rows import Packed
 from crossgrad_core.gradients.columns import Column, is_native
 
 
@@ -14,13 +15,20 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
     """Adds each column's gradients in order and in their own type, then divides.
 
     Args:
-        columns: T columns of contiguous gradients; a None is left out.
+        columns: T columns of contiguous gradients, dense or by rows; a None is left out.
         divisor: What the sums are divided by.
         keep: Leaves the gradients as they are; else the first of each column holds the result.
 
     Returns:
         T sums, None for columns without a gradient.
     """
+    packed = [Packed(column) for column in columns]
+    sums = _plain_sums([each.column for each in packed], divisor, keep=keep)
+    return [each.unpacked(result) for each, result in zip(packed, sums, strict=True)]
+
+
+def _plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
+    """The sums of dense columns."""
     sums: list[Tensor | None] = []
     compiled: list[Column] = []
     into: list[Tensor] = []

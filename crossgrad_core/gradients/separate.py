@@ -1,4 +1,4 @@
-"""Gradients of K views as dense tensors, one per view and parameter tensor."""
+"""Gradients of K views kept apart, one tensor per view and parameter tensor."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from typing_extensions import override
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Elementwise, Granularity, SeparateGradients
 from crossgrad_core.gradients import exact, generic, native
+from crossgrad_core.gradients.by_rows import Packed, dense
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
 from crossgrad_core.gradients.passes import passes_of
 from crossgrad_core.gradients.squares import column_gramians, column_remainders
@@ -35,9 +36,10 @@ class Groups:
 
 
 class DenseGradients(SeparateGradients):
-    """The gradients of K views, one dense tensor per view and parameter tensor.
+    """The gradients of K views, one tensor per view and parameter tensor.
 
-    Gramians are accumulated in float64 (see `column_gramians` for gradients beyond its range).
+    Those by rows stay so for Gramians of blocks and for sums; all else is taken of dense ones.
+    Gramians are accumulated in float64 (see `column_gramians` for what is beyond its range).
 
     Args:
         views: For each view: tensor name -> gradient; None or no entry where the view does not
@@ -61,9 +63,10 @@ class DenseGradients(SeparateGradients):
         self._known: dict[Granularity, NDArray[np.float64]] = {}
         self._lost: dict[Granularity, NDArray[np.float64]] = {}
         self._tensors = tuple(name for block in self._blocks for name in block.tensors)
-        self._columns: tuple[Column, ...] = tuple(
-            [_prepared(view.get(name)) for view in views] for name in self._tensors
+        self._packed = tuple(
+            Packed([_prepared(view.get(name)) for view in views]) for name in self._tensors
         )
+        self._columns: tuple[Column, ...] = tuple(each.column for each in self._packed)
         self._native = tuple(is_native(column) for column in self._columns)
         self._grouped: dict[Granularity, Groups] = {}
 
@@ -146,6 +149,7 @@ class DenseGradients(SeparateGradients):
     def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
         finite = self.finite("block")[self._groups("block").of_tensor]
         self._require_unspent()
+        self._unpack()
         return {
             name: function(name, _selected(column, keep))
             for name, column, keep in zip(self._tensors, self._columns, finite, strict=True)
@@ -154,6 +158,7 @@ class DenseGradients(SeparateGradients):
     @cached_property
     def _rows(self) -> tuple[int, ...]:
         """How many Gramians each block has under granularity `gaussian`."""
+        self._unpack()
         shapes = {
             name: next((g.shape for g in column if g is not None), None)
             for name, column in zip(self._tensors, self._columns, strict=True)
@@ -168,7 +173,20 @@ class DenseGradients(SeparateGradients):
     def _squares(self) -> NDArray[np.float64]:
         """[T, K, K] Gramians of the tensors; NaN or infinite where a view is not finite."""
         self._require_unspent()
-        return column_gramians(self._columns, self._views)
+        columns = [[] if p.rows is not None else p.column for p in self._packed]
+        squares = column_gramians(columns, self._views)
+        for t, packed in enumerate(self._packed):
+            if packed.rows is not None:
+                squares[t] = native.spread_gramian(packed.column, packed.rows, packed.shape[0])
+        return squares
+
+    def _unpack(self) -> None:
+        """Makes all gradients dense."""
+        if any(packed.rows is not None for packed in self._packed):
+            self._packed = tuple(
+                Packed([dense(p.unpacked(g)) for g in p.column]) for p in self._packed
+            )
+            self._columns = tuple(packed.column for packed in self._packed)
 
     def _groups(self, granularity: Granularity) -> Groups:
         if granularity not in self._grouped:
@@ -218,6 +236,7 @@ class DenseGradients(SeparateGradients):
         return np.concatenate(parts) if parts else np.zeros((0, self._views, self._views))
 
     def _remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+        self._unpack()
         raw = self._raw(granularity)
         if granularity != "gaussian":
             return column_remainders(self._columns, self._groups(granularity).of_tensor, raw)
@@ -294,7 +313,7 @@ class DenseGradients(SeparateGradients):
                 divisor,
             )
         self._spent = self._overwrite
-        return results
+        return {n: p.unpacked(results[n]) for n, p in zip(results, self._packed, strict=True)}
 
     def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
         """[T, K] views with the longest summand first; those of plain sums stay in order."""
@@ -337,7 +356,9 @@ class DenseGradients(SeparateGradients):
 
 
 def _prepared(gradient: Tensor | None) -> Tensor | None:
-    return None if gradient is None else gradient.detach().contiguous()
+    if gradient is None:
+        return None
+    return gradient.detach() if gradient.is_sparse else gradient.detach().contiguous()
 
 
 def _selected(column: Column, keep: NDArray[np.bool_]) -> list[Tensor | None]:

@@ -122,4 +122,6 @@ class SummedGradients(Gradients):
 
 
 def _contiguous(gradient: Tensor | None) -> Tensor | None:
-    return None if gradient is None else gradient.detach().contiguous()
+    if gradient is None:
+        return None
+    return gradient.detach() if gradient.is_sparse else gradient.detach().contiguous()

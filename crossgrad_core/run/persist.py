@@ -61,11 +61,11 @@ def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     device = setup.device
     return TrainState(
-        parameters={
+        tensors={
             name: tensor.to(device).requires_grad_(name in trained)
             for name, tensor in checkpoint.parameters.items()
         },
-        adam=AdamState(
+        moments=AdamState(
             exp_avg={name: tensor.to(device) for name, tensor in checkpoint.exp_avg.items()},
             exp_avg_sq={name: tensor.to(device) for name, tensor in checkpoint.exp_avg_sq.items()},
             steps=dict(checkpoint.adam_steps),

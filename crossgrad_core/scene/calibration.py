@@ -23,8 +23,6 @@ _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 # Beyond these nothing can be computed with a camera in single precision.
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
-#: Columns and rows of an undistorted photo at which its lens is searched for folds.
-_GRID = 256
 _AGAIN = "repair the camera, or export the model again"
 
 
@@ -87,9 +85,7 @@ class Calibration:
                 todo=_AGAIN,
             )
         focal = [self.params[i] for i in camera.focal_length_idxs()]
-        if not focal:
-            raise self._not_flat(where, "a camera without a focal length")
-        if min(focal) < _SHORTEST_FOCAL:
+        if min(focal, default=1.0) < _SHORTEST_FOCAL:
             raise UserError(
                 "a focal length is not positive",
                 where=where,
@@ -97,16 +93,6 @@ class Calibration:
                 found=f"{min(focal):g}",
                 todo=_AGAIN,
             )
-
-    def _not_flat(self, where: object, found: str) -> UserError:
-        return UserError(
-            f"photos of camera model {self.model} cannot be undistorted to a pinhole",
-            where=where,
-            expected="a perspective or fisheye camera",
-            found=found,
-            todo="cut 360-degree photos into perspective ones, for example with COLMAP's "
-            "panorama_sfm.py or ffmpeg's filter v360, and find the poses of those",
-        )
 
     @property
     def is_pinhole(self) -> bool:
@@ -143,7 +129,11 @@ class Calibration:
         try:
             camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera)
         except (RuntimeError, ValueError) as error:
-            raise self._not_flat("", str(error)) from error
+            raise UserError(
+                f"photos of camera model {self.model} cannot be undistorted to a pinhole",
+                found=str(error),
+                todo="export perspective photos, for example with COLMAP's image undistorter",
+            ) from error
         return self._read_pinhole(camera)
 
     @cached_property
@@ -151,8 +141,6 @@ class Calibration:
         """Whether the distorted photo reaches every pixel of the undistorted one."""
         if self.is_pinhole:
             return True
-        if self.reach < np.inf:
-            return False
         frame = self.pinhole
         u = np.arange(frame.width) + 0.5
         v = np.arange(frame.height) + 0.5
@@ -163,30 +151,6 @@ class Calibration:
         # Bilinear interpolation needs a pixel centre on either side.
         pixels = np.asarray(self._camera.img_from_cam(rays), dtype=float) - 0.5
         return bool(((pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])).all())
-
-    @cached_property
-    def reach(self) -> float:
-        """Up to what distance from the axis, at depth 1, the lens shows what is there.
-
-        Polynomials that were fitted to the middle of a photo may turn round outside of it: from
-        there on they show what they have shown already, mirrored. inf where none does so.
-        """
-        frame = self.pinhole
-        x = (np.linspace(0, frame.width, _GRID) - frame.cx) / frame.fx
-        y = (np.linspace(0, frame.height, _GRID) - frame.cy) / frame.fy
-        rays = np.stack([*np.meshgrid(x, y), np.ones((_GRID, _GRID))], -1)
-        pixels = np.asarray(self._camera.img_from_cam(rays.reshape(-1, 3)), dtype=float)
-        down, right = np.gradient(pixels.reshape(_GRID, _GRID, 2), y, x, axis=(0, 1))
-        upright = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]  # NaN is not
-        return float(np.hypot(x, y[:, None]).min(where=~upright, initial=np.inf))
-
-    def unfolded(self) -> NDArray[np.bool_]:
-        """[H, W], whether an undistorted pixel lies within `reach`."""
-        frame = self.pinhole
-        x = (np.arange(frame.width) + 0.5 - frame.cx) / frame.fx
-        y = (np.arange(frame.height) + 0.5 - frame.cy) / frame.fy
-        half = np.sqrt(np.maximum(self.reach**2 - y**2, 0.0))
-        return np.asarray(np.abs(x) < half[:, None])
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A photo in the pixels of `pinhole`, bilinear; black where nothing was seen.

@@ -148,14 +148,13 @@ class PhotoSource:
         return np.asarray(mask[rows[:, None], columns])
 
     def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels | None:
-        """The mask in undistorted pixels; pixels that the photo does not show do not count."""
+        """The mask in undistorted pixels; pixels that the photo does not reach do not count."""
         if keep is not None:
             keep = distorted.undistort(keep)
         if distorted.fills_frame:
             return keep
         reached = distorted.undistort(np.full((self.height, self.width), _OPAQUE, dtype=np.uint8))
-        shown = (reached == _OPAQUE) & distorted.unfolded()
-        return _both(keep, np.where(shown, _OPAQUE, 0).astype(np.uint8))
+        return _both(keep, np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8))
 
 
 #: Hashable, and equal where the outcome is.

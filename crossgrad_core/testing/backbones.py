@@ -201,6 +201,23 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
     )
 
 
+def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
+    """What `passed_on` names reaches the Gaussians as the very tensor, or not; nothing reads it."""
+    backbone = make()
+    parameters = created(backbone)
+    for name in parameters.keys() & set(backbone.passed_on.values()):
+        parameters[name] = torch.full_like(parameters[name], torch.nan)
+    for step in _STEPS:
+        gaussians = backbone.decode(parameters, sample_camera(), sample_phase(step))
+        for field, value in vars(gaussians).items():
+            if value is not None and field in backbone.passed_on:
+                kept = value is parameters.get(backbone.passed_on[field])
+                require(kept, f"{field} is not the tensor that passed_on names")
+            elif isinstance(value, Tensor):
+                known = bool(value.isfinite().all())
+                require(known, f"{field} is made of a tensor that passed_on names")
+
+
 BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     *COMPONENT_CHECKS,
     blocks_cover_the_parameters,
@@ -211,6 +228,7 @@ BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     edits_keep_rows_together,
     few_primitives_are_no_error,
     parameters_stay_untouched,
+    passed_on_tensors_are_handed_over,
     baking_gives_plain_gaussians,
     fitting_respects_the_user,
 )

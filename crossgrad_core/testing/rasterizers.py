@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
+from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render, Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.defaults import REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
@@ -232,6 +232,40 @@ def _same_gradient(name: str, ours: Tensor | None, theirs: Tensor | None) -> Non
     require(error < _GRADIENT, f"the gradient of {name} is {error:.2g} off the reference's")
 
 
+def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
+    """With `by_rows`, rows that are drawn are asked for and have the gradients, to the bit."""
+    rasterizer = make()
+    if not rasterizer.by_rows:
+        return
+    some = _moved(sample_gaussians(harmonics=True), _device(rasterizer))
+    with torch.no_grad():
+        some.means[::2] = 2.0 * sample_camera().center.to(some.means)
+    late = _moved(some, some.means.device)
+    tensors = {name: getattr(late, name) for name in ("sh_dc", "sh_rest")}
+    asked: list[int] = []
+
+    def bring(rows: Tensor | None) -> None:
+        chosen = torch.arange(len(some)) if rows is None else rows.long()
+        asked.extend(chosen.tolist())
+        for name, tensor in tensors.items():
+            tensor.data[chosen] = getattr(some, name).detach()[chosen]
+
+    for tensor in tensors.values():
+        tensor.data.fill_(torch.nan)
+    demand = OnDemand(frozenset(tensors), bring)
+    plain = _drawn(rasterizer, some, backward=True)
+    render = _drawn(rasterizer, replace(late, on_demand=demand), backward=True)
+    require(torch.equal(render.image, plain.image), "rows on demand give another image")
+    unseen = not any(row % 2 == 0 for row in asked)
+    require(len(set(asked)) == len(asked) and unseen, f"asked for the rows {asked}")
+    for name, tensor in tensors.items():
+        gradient, expected = tensor.grad, getattr(some, name).grad
+        good = gradient is not None and gradient.is_sparse
+        require(good, f"the gradient of {name} is not sparse")
+        same = gradient is not None and torch.equal(gradient.to_dense(), expected)
+        require(same, f"rows on demand give another gradient of {name}")
+
+
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
     """`--rasterizer auto` never takes it for a device on which it does not run."""
     rasterizer = make()
@@ -252,5 +286,6 @@ RASTERIZER_CHECKS: tuple[Check[Rasterizer], ...] = (
     gradients_reach_every_input,
     statistics_are_filled,
     same_input_same_bits,
+    rows_on_demand_are_asked_for,
     the_reference_draws_the_same,
 )

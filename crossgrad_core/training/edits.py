@@ -22,13 +22,14 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     if edit.is_empty:
         return False
     before = state.primitives(setup)
+    state.settle(edit.values if edit.source is None else None)
     for block in setup.blocks:
         if block.per_primitive:
             for name in block.tensors:
-                for moments in (state.adam.exp_avg, state.adam.exp_avg_sq):
+                for moments in (state.moments.exp_avg, state.moments.exp_avg_sq):
                     if name in moments:
                         moments[name] = apply_to_moment(edit, name, moments[name])
-    state.parameters = apply_to_parameters(edit, setup.blocks, state.parameters)
+    state.tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
     if edit.source is None:
         return False
     source, fresh = gather_indices(edit, before, edit.source.device)
@@ -36,7 +37,7 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
         name: _gathered(name, old, source, fresh, before) for name, old in state.states.items()
     }
     phase = setup.phase(state.step, training=True)
-    state.parameters = setup.backbone.prepare(state.parameters, setup.scene, phase)
+    state.tensors = setup.backbone.prepare(state.tensors, setup.scene, phase)
     return True
 
 

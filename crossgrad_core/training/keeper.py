@@ -59,7 +59,7 @@ class Keeper:
 
     def restore(self, state: TrainState) -> None:
         """Puts `state` back to the last complete step, or further back to the copy."""
-        for tensor in state.parameters.values():
+        for tensor in state.tensors.values():
             tensor.grad = None
         if not state.touched and are_parameters_finite(state):
             self._mark.restore(state)

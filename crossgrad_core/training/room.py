@@ -67,12 +67,12 @@ def curve(event: int, events: int, start: int, budget: int) -> int:
 def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
     """What a step keeps for each primitive."""
     per_primitive = sum(
-        state.parameters[name][:1].numel() * state.parameters[name].element_size()
+        state.tensors[name][:1].numel() * state.tensors[name].element_size()
         for block in setup.blocks
         if block.per_primitive
         for name in block.tensors
     )
-    kept = kept_bytes(rendered.records, state.parameters.values())
+    kept = kept_bytes(rendered.records, state.tensors.values())
     return Demand(
         parameters=per_primitive,
         kept=kept // max(1, state.primitives(setup)),

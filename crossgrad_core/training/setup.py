@@ -154,6 +154,17 @@ class Setup:
         return self.config.backward == "joint"
 
     @cached_property
+    def by_rows(self) -> Mapping[str, str]:
+        """Field of the Gaussians -> tensor whose steps wait until a row is drawn."""
+        trained = {name for block in self.trained_blocks for name in block.tensors}
+        # Who looks at the model after each step reads every row.
+        whole = self.joint or self.shows_model or self.device.type != "cpu"
+        if whole or not self.rasterizer.by_rows:
+            return {}
+        passed_on = self.backbone.passed_on
+        return {field: name for field, name in passed_on.items() if name in trained}
+
+    @cached_property
     def densify_first(self) -> bool:
         """Whether density control comes before the optimizer (the published order)."""
         return self.config.preset == "inria"

@@ -36,7 +36,7 @@ def first_state(setup: Setup) -> TrainState:
         for name, tensor in parameters.items()
     }
     parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
-    state = TrainState(parameters=parameters, adam=AdamState(), rngs=rngs)
+    state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = photo_parameters.started(setup)
     if photos is not None:
         state.commit({photo_parameters.STATE: photos})

@@ -1,15 +1,18 @@
 """The running state of the loop: all that changes, and all that a checkpoint holds."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from torch import Tensor
+from typing_extensions import override
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import PluginState
+from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.clock import Clock, Laps
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
@@ -37,8 +40,8 @@ class TrainState:
     """Everything that a step reads and writes.
 
     Attributes:
-        parameters: Tensor name -> parameter.
-        adam: The optimizer's moments.
+        tensors: The parameters as they lie in memory: rows may be late with steps of Adam.
+        moments: The optimizer's moments, likewise.
         rngs: Stream name -> its generator.
         states: Plugin name -> its state.
         step: Steps done, the one under way included.
@@ -48,10 +51,11 @@ class TrainState:
         laps: What the step under way has spent its time on.
         rewinds: How often training went back to the last good state.
         touched: Whether a step that is not complete has begun to change parameters or moments.
+        late: The steps that rows are late with.
     """
 
-    parameters: Parameters
-    adam: AdamState
+    tensors: Parameters
+    moments: AdamState
     rngs: dict[str, np.random.Generator]
     states: dict[str, PluginState] = field(default_factory=dict)
     step: int = 0
@@ -61,14 +65,65 @@ class TrainState:
     laps: Laps = field(default_factory=Laps)
     rewinds: int = 0
     touched: bool = False
+    late: Late = field(default_factory=Late)
+
+    @property
+    def parameters(self) -> Parameters:
+        """Tensor name -> parameter, with all steps taken."""
+        self.settle()
+        return self.tensors
+
+    @parameters.setter
+    def parameters(self, parameters: Parameters) -> None:
+        self.settle()
+        self.tensors = parameters
+
+    @property
+    def adam(self) -> AdamState:
+        """The optimizer's moments, with all steps taken."""
+        self.settle()
+        return self.moments
+
+    @adam.setter
+    def adam(self, adam: AdamState) -> None:
+        self.settle()
+        self.moments = adam
+
+    @property
+    def current(self) -> Mapping[str, Tensor]:
+        """The parameters, each with all steps taken once it is read."""
+        return _Current(self)
+
+    def settle(self, names: Iterable[str] | None = None) -> None:
+        """Takes the steps that rows of these tensors, by default of all, are late with."""
+        for name in self.late.names.intersection(self.late.names if names is None else names):
+            self.late.catch_up(name, self.tensors[name], self.moments)
 
     def primitives(self, setup: Setup) -> int:
         """Number of primitives."""
-        return primitives_of(setup.blocks, self.parameters)
+        return primitives_of(setup.blocks, self.tensors)
 
     def commit(self, states: Mapping[str, PluginState]) -> None:
         """Takes over the plugin states that a seam answered with."""
         self.states.update(states)
+
+
+class _Current(Mapping[str, Tensor]):
+    def __init__(self, state: TrainState) -> None:
+        self._state = state
+
+    @override
+    def __getitem__(self, name: str) -> Tensor:
+        self._state.settle((name,))
+        return self._state.tensors[name]
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._state.tensors)
+
+    @override
+    def __len__(self) -> int:
+        return len(self._state.tensors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +197,12 @@ class Snapshot:
         self.mark.restore(state)
 
     def _restore_tensors(self, state: TrainState) -> None:
-        state.parameters = {
-            name: t.clone().requires_grad_(state.parameters[name].requires_grad)
+        state.late = Late()
+        state.tensors = {
+            name: t.clone().requires_grad_(state.tensors[name].requires_grad)
             for name, t in self.parameters.items()
         }
-        state.adam = copied_moments(self.adam)
+        state.moments = copied_moments(self.adam)
 
 
 def copied_moments(adam: AdamState) -> AdamState:

@@ -16,11 +16,14 @@ from crossgrad_core.contract.contexts import (
     Sampled,
     StepRecord,
 )
+from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.by_rows import dense, tidy
 from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.density_views import observed_views
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.failure import NonFiniteError
@@ -55,9 +58,9 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     state.step += 1
     draw = _sample(setup, state)
     scales = scales_of(setup, state, draw)
-    rendered = render_views(setup, state, draw, scales)
+    rendered, of_views = render_views(setup, state, draw, scales)
     rendered = replace(rendered, observed=observed_views(setup, state, rendered.records))
-    context = _aggregate_context(setup, state, draw, rendered)
+    context = _aggregate_context(setup, state, draw, rendered, of_views)
     aggregated = _aggregate(setup, state, context)
     of_step: TensorGradients = {}
     if setup.regularizes:
@@ -68,6 +71,9 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         # On a GPU each look would be waited for: what is not finite is found with the parameters.
         _check_finite(state, rendered, gradients)
     state.laps.lap("aggregation")
+    counted = aggregated.counts
+    # An edit needs the memory that gradients hold.
+    del of_views, context, aggregated, of_step
     counts = _finish(setup, state, rendered, gradients, scale)
     follow(setup, state)
     primitives = state.primitives(setup)
@@ -79,7 +85,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         labels=draw.labels,
         losses=tuple(record.loss for record in rendered.records),
         primitives=primitives,
-        counts={**aggregated.counts, **counts},
+        counts={**counted, **counts},
         train_seconds=state.clock.train,
         scales=scales,
     )
@@ -113,11 +119,11 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
 
 
 def _aggregate_context(
-    setup: Setup, state: TrainState, draw: Draw, rendered: Rendered
+    setup: Setup, state: TrainState, draw: Draw, rendered: Rendered, of_views: Gradients
 ) -> AggregateContext:
     return AggregateContext(
         **context_fields(setup, state, "operator"),
-        gradients=rendered.gradients,
+        gradients=of_views,
         losses=np.array([record.loss for record in rendered.records]),
         labels=draw.labels,
         distances=setup.scene.distances[list(draw.views)],
@@ -137,10 +143,14 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 def _finish(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> Mapping[str, int]:
-    """Optimizer, density control and `after_step` in the order of the preset."""
+    """Optimizer, density control and `after_step` in the order of the preset.
+
+    `gradients` is emptied once they are spent.
+    """
     state.touched = True
     if not setup.densify_first:
         _optimize(setup, state, rendered, gradients, scale)
+        gradients.clear()
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
@@ -160,14 +170,23 @@ def _optimize(
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
-    adam_step(state.parameters, gradients, state.adam, rates, rule, scale.to_sum)
+    found = {name: tidy(g) for name, g in gradients.items()}
+    waiting = set(setup.by_rows.values())
+    by_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
+    whole = {name: dense(g) for name, g in found.items() if name not in by_rows}
+    state.settle(name for name, g in whole.items() if g is not None)
+    adam_step(state.tensors, whole, state.moments, rates, rule, scale.to_sum)
+    for name, gradient in by_rows.items():
+        param, to_sum = state.tensors[name], scale.to_sum[name]
+        step = one_more(name, param, state.moments, rates[name], rule, to_sum)
+        state.late.step(name, param, gradient, state.moments, step)
     state.laps.lap("optimizer")
 
 
 def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit, bool]:
     context = DensifyContext(
         **context_fields(setup, state, "densifier"),
-        parameters=state.parameters,
+        parameters=state.current,
         backbone=setup.backbone,
         rasterizer=setup.rasterizer,
         views=rendered.observed,
@@ -188,7 +207,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
 def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
     context = AfterStepContext(
         **context_fields(setup, state, "after_step"),
-        parameters=state.parameters,
+        parameters=state.current,
         backbone=setup.backbone,
         means_lr=means_rate_at(setup, state.step),
         edited=edited,

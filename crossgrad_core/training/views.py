@@ -19,10 +19,12 @@ from crossgrad_core.contract.contexts import (
     Scaled,
     ViewRecord,
 )
-from crossgrad_core.contract.gaussians import Gaussians, Render
+from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render
 from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.by_rows import dense, tidy
+from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
@@ -44,14 +46,12 @@ class Rendered:
 
     Attributes:
         records: One record per view.
-        gradients: Their gradients, apart or summed up as the operator needs them.
         regular: Sum of the gradients of the views' regularisation terms, apart from the above.
         photos: Position of each view and the values of its photo, with their gradients.
         observed: The records that density control gets.
     """
 
     records: tuple[ViewRecord, ...]
-    gradients: Gradients
     regular: TensorGradients
     photos: tuple[tuple[int, Leaves], ...]
     observed: tuple[ViewRecord, ...] = ()
@@ -94,8 +94,10 @@ def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
     )
 
 
-def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float]) -> Rendered:
-    """Renders the views of `draw` at their scales and gathers their gradients.
+def render_views(
+    setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float]
+) -> tuple[Rendered, Gradients]:
+    """The views of `draw` at their scales, and their gradients: apart or summed up.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -118,10 +120,10 @@ def render_views(setup: Setup, state: TrainState, draw: Draw, scales: Sequence[f
     known = _with_losses(state, records, losses)
     state.counters.backward_passes += len(records)
     if not setup.separate:
-        return Rendered(known, total, regular, tuple(photos))
+        return Rendered(known, regular, tuple(photos)), total
     # Single views are not needed after they are combined, unless a plugin says so.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
-    return Rendered(known, apart, regular, tuple(photos))
+    return Rendered(known, regular, tuple(photos)), apart
 
 
 def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
@@ -139,13 +141,13 @@ def _one_by_one(
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
     """Each view with its gradients, drawn and taken back before the next one."""
-    _clear(state.parameters)
+    _clear(state.tensors)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot, scales[slot])
         _regularize_view(setup, state, drawn, regular)
         state.laps.lap("loss")
         _backward(drawn.loss)
-        yield drawn, _take(state.parameters)
+        yield drawn, _take(state.tensors)
 
 
 def _together(
@@ -160,7 +162,7 @@ def _together(
     That pass ends at copies of what was decoded, which are each view's own; from there every view
     goes back to the parameters by itself.
     """
-    _clear(state.parameters)
+    _clear(state.tensors)
     slots = range(len(draw.views))
     prepared = [_prepare(setup, state, draw, slot, scales[slot]) for slot in slots]
     copies = [view.gaussians.mapped(_leaf) for view in prepared]
@@ -178,7 +180,7 @@ def _together(
     _backward(torch.stack([each.loss for each in drawn]).sum())
     for each, copy in zip(drawn, copies, strict=True):
         _pass_back(each.gaussians, copy)
-        yield each, _take(state.parameters)
+        yield each, _take(state.tensors)
 
 
 def _leaf(tensor: Tensor) -> Tensor:
@@ -210,9 +212,9 @@ def _with_losses(
 
 def _render_jointly(
     setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float], regular: TensorGradients
-) -> Rendered:
+) -> tuple[Rendered, Gradients]:
     """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
-    _clear(state.parameters)
+    _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     losses = [view.loss.detach() for view in drawn]
     records = _with_losses(state, [view.record for view in drawn], losses)
@@ -222,9 +224,9 @@ def _render_jointly(
     _backward(torch.stack([view.loss for view in drawn]).sum())
     state.laps.lap("backward")
     state.counters.backward_passes += 1
-    total = SummedGradients(_take(state.parameters), setup.trained_blocks, len(records))
+    total = SummedGradients(_take(state.tensors), setup.trained_blocks, len(records))
     photos = tuple((view.record.index, view.leaves) for view in drawn)
-    return Rendered(records, total, regular, photos)
+    return Rendered(records, regular, photos), total
 
 
 def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Prepared:
@@ -232,9 +234,7 @@ def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: floa
     target = target_at(setup, state, draw.views[slot], scale)
     background = background_of(setup, state)
     state.laps.lap("photos")
-    gaussians = setup.backbone.decode(
-        state.parameters, target.camera, setup.phase(state.step, training=True)
-    )
+    gaussians = _seen(setup, state, target.camera)
     state.laps.lap("decode")
     return _Prepared(slot, target, background, gaussians)
 
@@ -267,7 +267,7 @@ def _compare(
         view=setup.train_views[index],
         label=draw.labels[view.slot] if draw.labels is not None else None,
         loss=nan,
-        gaussians=view.gaussians.detached(),
+        gaussians=view.gaussians.detached().whole(),
         screen=render.screen,
         background=view.background,
         camera=target.camera,
@@ -279,6 +279,24 @@ def _compare(
     return _Drawn(record, view.gaussians, loss, leaves)
 
 
+def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
+    """What a view sees; rows of some tensors are brought up to date when they are drawn."""
+    phase = setup.phase(state.step, training=True)
+    gaussians = setup.backbone.decode(state.tensors, camera, phase)
+    names = {f: n for f, n in setup.by_rows.items() if getattr(gaussians, f) is state.tensors[n]}
+    if names.keys() != {f for f in setup.by_rows if getattr(gaussians, f) is not None}:
+        # It is not handed over as it is after all, and was read too early.
+        return setup.backbone.decode(state.parameters, camera, phase)
+    if not names or not is_native([state.tensors[name] for name in names.values()]):
+        return gaussians
+
+    def bring(rows: Tensor | None) -> None:
+        for name in names.values():
+            state.late.catch_up(name, state.tensors[name], state.moments, rows)
+
+    return replace(gaussians, on_demand=OnDemand(frozenset(names), bring))
+
+
 def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:
     """Renders the one view of `draw` for its statistics: nobody takes its gradients.
 
@@ -288,7 +306,7 @@ def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> V
     drawn = _draw_view(setup, state, draw, 0, scale)
     state.laps.lap("loss")
     _backward(drawn.loss)
-    _clear(state.parameters)
+    _clear(state.tensors)
     record = _with_losses(state, [drawn.record], [drawn.loss.detach()])[0]
     state.counters.backward_passes += 1
     state.laps.lap("backward")
@@ -391,7 +409,7 @@ def eval_background(setup: Setup) -> Tensor:
 
 def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: TensorGradients) -> None:
     if setup.regularizes:
-        add_regularization(setup, state, into, drawn.gaussians, drawn.record.view)
+        add_regularization(setup, state, into, drawn.gaussians.whole(), drawn.record.view)
 
 
 def add_regularization(
@@ -404,14 +422,14 @@ def add_regularization(
     """Adds the gradients of all regularisation terms, of one view or (None) of the step."""
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
-        parameters=state.parameters,
+        parameters=state.current,
         backbone=setup.backbone,
         gaussians=gaussians,
         view=view,
     )
     for answer in setup.hook.crossgrad_regularize(context=context):
         state.commit(answer.states)
-        _add(into, _gradients_of(answer.loss, state.parameters, keep=gaussians is not None))
+        _add(into, _gradients_of(answer.loss, state.tensors, keep=gaussians is not None))
 
 
 def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool) -> TensorGradients:
@@ -425,7 +443,7 @@ def _gradients_of(loss: Tensor, parameters: Mapping[str, Tensor], *, keep: bool)
 def _add(into: TensorGradients, more: Mapping[str, Tensor | None]) -> None:
     for name, gradient in more.items():
         if gradient is not None:
-            have = into.get(name)
+            have = dense(into.get(name))
             into[name] = gradient if have is None else have + gradient
 
 
@@ -474,6 +492,6 @@ def _clear(parameters: Mapping[str, Tensor]) -> None:
 
 
 def _take(parameters: Mapping[str, Tensor]) -> TensorGradients:
-    taken = {name: tensor.grad for name, tensor in parameters.items() if tensor.requires_grad}
+    taken = {name: tidy(t.grad) for name, t in parameters.items() if t.requires_grad}
     _clear(parameters)
     return taken

@@ -137,13 +137,6 @@ def unknown_camera_model(scene, tmp):
     return ["run", str(scene), *BASE]
 
 
-def camera_of_360_degrees(scene, tmp):
-    cameras = as_text(scene) / "cameras.txt"
-    size = np.array(cameras.read_text().splitlines()[-1].split()[2:4])
-    replace_in(cameras, first_data, lambda _: f"1 EQUIRECTANGULAR {' '.join([*size, *size])}")
-    return ["run", str(scene), *BASE]
-
-
 def two_images_of_one_name(scene, tmp):
     images = as_text(scene) / "images.txt"
     text = images.read_text().replace("0001.jpg", "0002.jpg")
@@ -300,9 +293,9 @@ def plugin_not_there(scene, tmp):
 MAKERS = [
     truncated_cameras, truncated_images, truncated_points, garbage_cameras, empty_model, no_sparse,
     no_photos, half_a_photo, photo_is_text, photo_of_another_shape, nan_pose, negative_focal,
-    unknown_camera_model, camera_of_360_degrees, two_images_of_one_name, zero_points,
-    all_photos_masked, all_photos_transparent, mask_of_another_shape, mask_folder_not_there,
-    masks_of_other_photos, scene_not_there, scene_is_a_file,
+    unknown_camera_model, two_images_of_one_name, zero_points, all_photos_masked,
+    all_photos_transparent, mask_of_another_shape, mask_folder_not_there, masks_of_other_photos,
+    scene_not_there, scene_is_a_file,
     unknown_option, unknown_operator, unknown_component_option, option_out_of_bounds,
     unknown_setting, set_without_value, zero_steps, steps_and_seconds, odd_pair, bad_background,
     no_such_device, used_output_folder, broken_config, config_not_there, init_is_no_ply,

@@ -150,6 +150,53 @@ def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
 
 
 @strict_device
+def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, dense: Rows) -> bool:
+    """Fills `dense` [K * CHUNK] with one chunk of each view; returns whether anything is in it."""
+    first = np.searchsorted(rows, start // width)
+    end = np.searchsorted(rows, (start + length - 1) // width + 1)
+    if first == end:
+        return False
+    dense[:] = np.float32(0.0)
+    for k in range(addresses.size):
+        if addresses[k] == 0:
+            continue
+        values = row(addresses[k], first * width, (end - first) * width)
+        for r in range(first, end):
+            at = rows[r] * width - start
+            for i in range(max(0, -at), min(width, length - at)):
+                dense[k * CHUNK + at + i] = values[(r - first) * width + i]
+    return True
+
+
+@strict_parallel_kernel
+def spread_gramian(addresses: Ints, rows: Ints, width: int, size: int) -> Floats:
+    """[K, K] what `gramians` finds for gradients that are zero but in some rows, to the bit.
+
+    Args:
+        addresses: [K] of the values [R * width]; 0 where a view does not touch the tensor.
+        rows: [R], sorted.
+        width: Elements of a row.
+        size: Elements of the tensor.
+    """
+    views = addresses.size
+    chunks = (size + CHUNK - 1) // CHUNK
+    partial = np.zeros((chunks, views, views))
+    for c in prange(chunks):
+        dense = np.empty(views * CHUNK, np.float32)
+        length = min(CHUNK, size - c * CHUNK)
+        if _spread(addresses, rows, width, c * CHUNK, length, dense):
+            places = np.zeros(views, np.int64)
+            for k in range(views):
+                if addresses[k] != 0:
+                    places[k] = dense.ctypes.data + 4 * k * CHUNK
+            compact = np.empty((views, views))
+            _chunk_gramian(places, 0, length, compact, partial[c])
+            # Numba frees an array after the last line that names it, even if its address is held.
+            dense[0] = np.float32(0.0)
+    return _summed(partial, np.zeros((chunks, 2), np.int64), 1)[0]
+
+
+@strict_device
 def _weighted(
     rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
 ) -> None:

@@ -51,16 +51,31 @@ def adam_step(
         grad = grads.get(name)
         if grad is None:
             continue
-        if name not in state.steps:
-            state.exp_avg[name] = torch.zeros_like(param, memory_format=torch.contiguous_format)
-            state.exp_avg_sq[name] = torch.zeros_like(state.exp_avg[name])
-            state.steps[name] = 0
-        state.steps[name] += 1
-        coefficients = _coefficients(state.steps[name], lrs[name], rule)
-        if scales is not None:
-            coefficients = replace(coefficients, scale=scales[name])
+        scale = 1.0 if scales is None else scales[name]
+        step = counted(name, param, state, lrs[name], rule, scale)
         update = update_on_gpu if param.is_cuda else update_tensor
-        update(param, grad, state.exp_avg[name], state.exp_avg_sq[name], coefficients)
+        update(param, grad, state.exp_avg[name], state.exp_avg_sq[name], step)
+
+
+def counted(
+    name: str, param: Tensor, state: AdamState, lr: float, rule: Rule, scale: float
+) -> Coefficients:
+    """Counts one more step of a tensor, whose moments start at zero; the coefficients of the step.
+
+    Args:
+        name: Name of the tensor.
+        param: The tensor.
+        state: Moments and step counts; changed.
+        lr: Learning rate.
+        rule: As in `adam_step`.
+        scale: What the gradient is multiplied by.
+    """
+    if name not in state.steps:
+        state.exp_avg[name] = torch.zeros_like(param, memory_format=torch.contiguous_format)
+        state.exp_avg_sq[name] = torch.zeros_like(state.exp_avg[name])
+        state.steps[name] = 0
+    state.steps[name] += 1
+    return replace(_coefficients(state.steps[name], lr, rule), scale=scale)
 
 
 def update_tensor(

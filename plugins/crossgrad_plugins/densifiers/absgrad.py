@@ -85,14 +85,15 @@ def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -
     """
     totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
     for record in context.views:
-        seen = screen_statistics.visible(record)
-        norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
+        rows = screen_statistics.seen(record)
+        norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record, rows), dim=1)
         absolute = torch.linalg.vector_norm(
-            screen_statistics.ndc_abs_gradient(record), ord=order, dim=1
+            screen_statistics.ndc_abs_gradient(record, rows), ord=order, dim=1
         )
-        screen_statistics.add(record, totals["gradient"], norms * seen)
-        screen_statistics.add(record, totals["absolute"], absolute * seen)
-        screen_statistics.add(record, totals["renders"], seen)
+        drawn = screen_statistics.visible(record, rows)
+        screen_statistics.add(record, totals["gradient"], norms * drawn, rows)
+        screen_statistics.add(record, totals["absolute"], absolute * drawn, rows)
+        screen_statistics.add(record, totals["renders"], drawn, rows)
     return totals
 
 

@@ -23,10 +23,11 @@ class AdaptiveDensityControl(CloneSplit):
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
         totals = screen_statistics.sums(context, state, ("gradient", "renders"))
         for record in context.views:
-            seen = screen_statistics.visible(record)
-            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record), dim=1)
-            screen_statistics.add(record, totals["gradient"], norms * seen)
-            screen_statistics.add(record, totals["renders"], seen)
+            rows = screen_statistics.seen(record)
+            norms = torch.linalg.vector_norm(screen_statistics.ndc_gradient(record, rows), dim=1)
+            drawn = screen_statistics.visible(record, rows)
+            screen_statistics.add(record, totals["gradient"], norms * drawn, rows)
+            screen_statistics.add(record, totals["renders"], drawn, rows)
         return PluginState(per_primitive=totals)
 
     @override

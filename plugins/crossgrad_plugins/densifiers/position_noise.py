@@ -1,11 +1,12 @@
 """Noise of the positions: Langevin exploration for Gaussians that are nearly transparent."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from crossgrad_core.numerics.elementwise import sigmoid
-from crossgrad_core.plugin import Parameters
 
 #: Steepness of the gate and the opacity at which it is half open (3DGS-MCMC).
 GATE_STEEPNESS = 100.0
@@ -15,7 +16,7 @@ NEGLIGIBLE = 1e-7
 
 
 def position_noise(
-    parameters: Parameters, strength: float, rng: np.random.Generator
+    parameters: Mapping[str, Tensor], strength: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
     """The rows of `means` that noise moves, and by how much.
 

@@ -31,6 +31,7 @@ class NumbaRasterizer(Rasterizer):
         {"depth", "pixels", "abs_gradient", "directions", "count"}
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
+    by_rows: ClassVar[bool] = True
 
     footprint: Footprint = Field("alpha", description=DESCRIPTION)
 
@@ -98,6 +99,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
     rest = _optional(gaussians.sh_rest)
     if gaussians.sh_dc is not None and rest is None:
         rest = np.empty((len(gaussians), 0, 3), np.float32)
+    demand = gaussians.on_demand
     return GaussianArrays(
         means=_array(gaussians.means),
         quats=_array(gaussians.quats),
@@ -107,6 +109,8 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
         dc=_optional(gaussians.sh_dc),
         rest=rest,
         degree=gaussians.sh_degree,
+        by_rows=frozenset() if demand is None else demand.fields,
+        bring=None if demand is None else lambda rows: demand.bring(torch.from_numpy(rows)),
     )
 
 
@@ -172,4 +176,17 @@ class _Draw(torch.autograd.Function):
         colors = found.colors if frame.gaussians.colors is not None else None
         rest = found.rest if found.rest is not None and found.rest.shape[1] else None
         arrays = (found.means, found.quats, found.scales, found.opacities, colors, found.dc, rest)
-        return None, *(None if array is None else torch.from_numpy(array) for array in arrays)
+        named = zip(_INPUTS, arrays, strict=True)
+        return None, *(_gradient(frame, name, array) for name, array in named)
+
+
+def _gradient(frame: Frame, name: str, array: NDArray[np.float32] | None) -> Tensor | None:
+    """The gradient of one input; by rows, sparse, where it was asked for."""
+    if array is None:
+        return None
+    values, rows = torch.from_numpy(array), frame.projected.rows
+    if rows is None or name not in frame.gaussians.by_rows:
+        return values
+    shape = (len(frame.gaussians.means), *values.shape[1:])
+    indices = torch.from_numpy(rows).long()[None]
+    return torch.sparse_coo_tensor(indices, values, shape, check_invariants=False)

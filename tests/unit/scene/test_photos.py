@@ -124,17 +124,6 @@ def test_pixels_that_the_photo_does_not_reach_do_not_count(source):
     assert image[keep].min() == 255
 
 
-def test_pixels_beyond_the_fold_of_a_lens_do_not_count(source):
-    Image.new("RGB", (60, 40), "white").save(source.path)
-    lens = Calibration("SIMPLE_RADIAL", 60, 40, (22.0, 30.0, 20.0, -0.3))
-    frame = lens.pinhole
-    folded = replace(source, distorted=lens, target=(frame.width, frame.height))
-    assert folded.may_mask
-    image, keep = folded.decode()
-    assert torch.equal(keep, (image[..., 0] == 255) & torch.from_numpy(lens.unfolded()))
-    assert 0 < keep.sum() < (image[..., 0] == 255).sum()
-
-
 def test_a_photo_that_changed_its_size_is_refused(source):
     Image.fromarray(RGB[:20]).save(source.path)
     with pytest.raises(UserError, match=r"has changed(?s:.*)60 x 40(?s:.*)60 x 20"):

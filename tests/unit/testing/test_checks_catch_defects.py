@@ -1,5 +1,6 @@
 """Each contract check fails for a component that breaks what it checks: checks times defects."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -289,6 +290,10 @@ class Flickers(Torch):
         return replace(render, image=render.image + 1e-6 * torch.rand(1))
 
 
+class AsksForNoRows(Torch):
+    by_rows: ClassVar[bool] = True
+
+
 class LessOpaque(Torch):
     def render(self, gaussians, camera, background, outputs=frozenset()):
         thinner = replace(gaussians, opacities=0.9 * gaussians.opacities)
@@ -343,6 +348,22 @@ class Drifts(Vanilla):
     def bake(self, parameters, phase, cameras):
         parameters["means"].data.add_(1.0)
         return super().bake(parameters, phase, cameras)
+
+
+class ReadsWhatItPassesOn(Vanilla):
+    passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
+
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        brightness = parameters["f_dc"][:, 0].mean(dim=1)
+        return replace(gaussians, opacities=gaussians.opacities * brightness.sigmoid())
+
+
+class HandsOverACopy(Vanilla):
+    passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
+
+    def decode(self, parameters, camera, phase):
+        return replace(super().decode(parameters, camera, phase), sh_dc=parameters["f_dc"].clone())
 
 
 class BakesAGraph(Vanilla):
@@ -532,6 +553,7 @@ DEFECTS = [
     (rasterizers.gradients_reach_every_input, FrozenOpacities),
     (rasterizers.statistics_are_filled, NoStatistics),
     (rasterizers.same_input_same_bits, Flickers),
+    (rasterizers.rows_on_demand_are_asked_for, AsksForNoRows),
     (rasterizers.the_reference_draws_the_same, LessOpaque),
     (backbones.blocks_cover_the_parameters, LooseTensor),
     (backbones.created_from_the_scene, GlobalStart),
@@ -540,6 +562,8 @@ DEFECTS = [
     (backbones.checkpoints_give_the_same_gaussians, CountsOnItself),
     (backbones.edits_keep_rows_together, SortsRows),
     (backbones.parameters_stay_untouched, Drifts),
+    (backbones.passed_on_tensors_are_handed_over, ReadsWhatItPassesOn),
+    (backbones.passed_on_tensors_are_handed_over, HandsOverACopy),
     (backbones.baking_gives_plain_gaussians, BakesAGraph),
     (backbones.fitting_respects_the_user, OverridesTheUser),
     (densifiers.quiet_before_its_time, Impatient),

@@ -46,19 +46,28 @@ def test_what_is_decoded_counts_where_it_is_more_than_the_parameters():
 
 
 class Look:
-    """Notes what is alive and how much room there is when density control is asked."""
+    """Notes what is alive when gradients are combined, and in density control how much room."""
 
     def __init__(self):
-        self.alive, self.room, self.demand = 0, 0, None
+        self.alive, self.left, self.room, self.demand = 0, 0, 0, None
+        self.shape = None
+
+    @hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        self.alive = self._alive()
+        return (yield)
 
     @hookimpl(wrapper=True)
     def crossgrad_densify(self, context):
-        shape = context.parameters["f_rest"].shape
+        self.shape = context.parameters["quats"].shape
+        self.left, self.room = self._alive(), context.room
+        return (yield)
+
+    def _alive(self):
         kinds = (torch.Tensor, torch.nn.Parameter)
         found = (each for each in gc.get_objects() if type(each) in kinds)
-        places = {each.untyped_storage().data_ptr() for each in found if each.shape == shape}
-        self.alive, self.room = len(places), context.room
-        return (yield)
+        shaped = (each for each in found if not each.is_sparse and each.shape == self.shape)
+        return len({each.untyped_storage().data_ptr() for each in shaped})
 
 
 def looked(monkeypatch, available=GIB, **settings):
@@ -95,6 +104,11 @@ def test_all_gradients_that_are_kept_are_counted(monkeypatch, views):
 def test_a_sum_keeps_no_gradient_of_a_single_view(monkeypatch):
     look = looked(monkeypatch, views=5)
     assert look.alive - OTHERS <= look.demand.gradients == 2
+
+
+@pytest.mark.parametrize("operator", ["sum", "pcgrad"])
+def test_an_edit_finds_no_gradient(monkeypatch, operator):
+    assert looked(monkeypatch, views=2, operator={"name": operator}).left == OTHERS
 
 
 def test_more_views_leave_less_room(monkeypatch):

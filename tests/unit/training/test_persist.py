@@ -28,8 +28,8 @@ def checkpoint():
     moments = {"means": torch.ones(2, 3)}
     return to_checkpoint(
         TrainState(
-            parameters={"means": torch.zeros(2, 3), "levels": torch.arange(2)},
-            adam=AdamState(dict(moments), dict(moments), {"means": 3}),
+            tensors={"means": torch.zeros(2, 3), "levels": torch.arange(2)},
+            moments=AdamState(dict(moments), dict(moments), {"means": 3}),
             rngs=make_streams(0),
             step=3,
         )

@@ -16,15 +16,16 @@ _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORM
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Number: TypeAlias = np.float32
-_Numbers: TypeAlias = tuple[
+Numbers: TypeAlias = tuple[
     _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number, _Number
 ]
 
 
 @kernel
-def _update(
-    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+def update(
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: Numbers
 ) -> None:
+    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
@@ -42,22 +43,16 @@ def _update(
 
 @parallel_kernel
 def _update_chunks(
-    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: _Numbers
+    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: Numbers
 ) -> None:
     for chunk in prange((len(param) + _CHUNK - 1) // _CHUNK):
         a, b = chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK)
-        _update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
+        update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
 
 
-def update_arrays(
-    param: NDArray[np.float32],
-    grad: NDArray[np.float32],
-    exp_avg: NDArray[np.float32],
-    exp_avg_sq: NDArray[np.float32],
-    step: Coefficients,
-) -> None:
-    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
-    numbers: _Numbers = (
+def numbers_of(step: Coefficients) -> Numbers:
+    """The numbers of a step in the type of the kernels."""
+    return (
         np.float32(step.beta1),
         np.float32(1 - step.beta1),
         np.float32(step.beta2),
@@ -68,6 +63,17 @@ def update_arrays(
         np.float32(step.square_floor),
         np.float32(step.scale),
     )
+
+
+def update_arrays(
+    param: NDArray[np.float32],
+    grad: NDArray[np.float32],
+    exp_avg: NDArray[np.float32],
+    exp_avg_sq: NDArray[np.float32],
+    step: Coefficients,
+) -> None:
+    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
+    numbers = numbers_of(step)
     # A single chunk is not worth waking other threads for.
-    update = _update if len(param) <= _CHUNK else _update_chunks
-    update(param, grad, exp_avg, exp_avg_sq, numbers)
+    run = update if len(param) <= _CHUNK else _update_chunks
+    run(param, grad, exp_avg, exp_avg_sq, numbers)

@@ -1,5 +1,6 @@
 """Inputs and outputs of a render, as plain arrays."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,9 @@ class GaussianArrays:
         dc: [N, 1, 3] harmonics of degree 0.
         rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
         degree: Active degree, 0 to 3.
+        by_rows: Fields whose rows `bring` must bring up to date before they are read, and whose
+            gradients are of these rows only.
+        bring: [R] int32 rows -> None.
     """
 
     means: Float32
@@ -36,6 +40,8 @@ class GaussianArrays:
     dc: Float32 | None = None
     rest: Float32 | None = None
     degree: int = 0
+    by_rows: frozenset[str] = frozenset()
+    bring: Callable[[Int32], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,7 @@ class Projected:
         owners: [N] int32, the Gaussian of each record.
         drawn: [chunks] int64, records per chunk.
         limits: [N, 2] int32, columns of 16 pixels that each record may touch; None for no limits.
+        rows: [R] int32, the Gaussians that have a record, sorted; None where nobody asks for them.
     """
 
     camera: KernelCamera
@@ -98,6 +105,7 @@ class Projected:
     owners: Int32
     drawn: Int64
     limits: Int32 | None = None
+    rows: Int32 | None = None
 
 
 @dataclass(frozen=True)
@@ -154,8 +162,8 @@ class GaussianGradients:
         scales: [N, 3].
         opacities: [N].
         colors: [N, 3] by the RGB drawn (after the clamp of harmonics).
-        dc: [N, 1, 3], None without harmonics.
-        rest: [N, B - 1, 3], None without harmonics.
+        dc: [N, 1, 3] or [R, 1, 3], those of the rows drawn; None without harmonics.
+        rest: [N, B - 1, 3] or [R, B - 1, 3], None without harmonics.
         centres: [N, 2] by the projected mean, per pixel.
         absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
         directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`, None unless asked for.

@@ -1,5 +1,7 @@
 """One rendered view as plain arrays: forward, backward, and what the two share."""
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +46,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.longest_axes import add_directions, longest_axes
 from crossgrad_plugins.rasterizers.numba_kernels.marked import count_marked
-from crossgrad_plugins.rasterizers.numba_kernels.projection import project
+from crossgrad_plugins.rasterizers.numba_kernels.projection import listed, project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
@@ -135,8 +137,8 @@ def backward(
         scales=np.zeros((count, 3), np.float32),
         opacities=np.zeros(count, np.float32),
         colors=np.zeros((count, 3), np.float32),
-        dc=None if gaussians.dc is None else np.zeros_like(gaussians.dc),
-        rest=None if gaussians.rest is None else np.zeros_like(gaussians.rest),
+        dc=_room(frame, "sh_dc", gaussians.dc),
+        rest=_room(frame, "sh_rest", gaussians.rest),
         centres=np.zeros((count, 2), np.float32),
         absolute=np.zeros((count, 2), np.float32) if absolute else None,
         directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
@@ -179,8 +181,18 @@ def backward(
             gradients.dc,
             gradients.rest,
             gradients.means,
+            ("sh_dc" in gaussians.by_rows, "sh_rest" in gaussians.by_rows),
         )
     return gradients
+
+
+def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
+    """Zeros for the gradient of one field: of all Gaussians, or of the rows that were drawn."""
+    if like is None:
+        return None
+    rows = frame.projected.rows
+    by_rows = rows is not None and field in frame.gaussians.by_rows
+    return np.zeros((len(rows) if by_rows else len(like), *like.shape[1:]), np.float32)
 
 
 def _directions(
@@ -322,6 +334,9 @@ def _project(
         projected.drawn,
         room,
     )
+    if gaussians.bring is not None:
+        projected = replace(projected, rows=listed(projected.drawn, projected.owners))
+        gaussians.bring(projected.rows)
     if gaussians.dc is not None and gaussians.rest is not None:
         share(
             shade,

@@ -48,6 +48,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     square,
 )
 
+#: Standard deviations at which a Gaussian of opacity 1 has faded, and 1 % for poses that are not
+#: quite rigid.
+_SIGMAS = 1.01 * math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
+#: The same depth may be rounded in another way here.
+_NEARER = 1.0 - 1e-9
+
 
 @device
 def _three(flat: NDArray[np.float32], k: int) -> Triple:
@@ -62,6 +68,73 @@ def _four(flat: NDArray[np.float32], k: int) -> Row:
         np.float64(flat[4 * k + 2]),
         np.float64(flat[4 * k + 3]),
     )
+
+
+@device
+def _may_be_drawn(
+    size: int,
+    camera: KernelCamera,
+    near: float,
+    dilation: float,
+    means: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    flags: NDArray[np.uint8],
+) -> None:
+    """Sets `flags` where one of `size` Gaussians may touch a pixel; no branches, so vectorised.
+
+    A footprint ends sqrt(2 log(255 opacity)) standard deviations from the mean, and the projected
+    standard deviation is at most that of a ball of the largest scale. All is times the depth.
+    """
+    pose = in_registers(camera.pose)
+    steep_x = max(abs(camera.left), abs(camera.right))
+    steep_y = max(abs(camera.top), abs(camera.bottom))
+    ball_x = _SIGMAS * camera.fx * math.sqrt(1.0 + steep_x * steep_x)
+    ball_y = _SIGMAS * camera.fy * math.sqrt(1.0 + steep_y * steep_y)
+    spare = _SIGMAS * math.sqrt(dilation) + 1.0
+    half_x, half_y = 0.5 * camera.width, 0.5 * camera.height
+    for k in range(size):
+        x, y, z = to_camera(pose, _three(means, k))
+        a, b, c = _three(scales, k)
+        ball = max(abs(a), abs(b), abs(c))
+        opacity = opacities[k]
+        off_x = abs(camera.fx * x + (camera.cx - half_x) * z)
+        off_y = abs(camera.fy * y + (camera.cy - half_y) * z)
+        inside = (off_x <= (half_x + spare) * z + ball_x * ball) & (
+            off_y <= (half_y + spare) * z + ball_y * ball
+        )
+        # The footprint of an opacity beyond 1 reaches farther.
+        flags[k] = (z > near * _NEARER) & (opacity >= ALPHA_THRESHOLD) & (inside | (opacity > 1.0))
+
+
+@device
+def _picked(
+    begin: int,
+    size: int,
+    flags: NDArray[np.uint8],
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    chosen: NDArray[np.int64],
+    picked: NDArray[np.float32],
+) -> int:
+    """Copies those of a block that may be drawn side by side; returns their number.
+
+    `chosen` says which they are; `picked` has their means, their quaternions and their scales.
+    """
+    count = 0
+    for k in range(size):
+        if flags[k]:
+            chosen[count] = begin + k
+            count += 1
+    for place in range(count):
+        i = chosen[place]
+        for axis in range(3):
+            picked[3 * place + axis] = means[i, axis]
+            picked[7 * BLOCK + 3 * place + axis] = scales[i, axis]
+        for axis in range(4):
+            picked[3 * BLOCK + 4 * place + axis] = quats[i, axis]
+    return count
 
 
 @device
@@ -123,8 +196,7 @@ def _give_slots(first: int, end: int, boxes: NDArray[np.int32], shelves: NDArray
 
 @device
 def _record_block(
-    begin: int,
-    size: int,
+    chosen: NDArray[np.int64],
     first_record: int,
     camera: KernelCamera,
     near: float,
@@ -139,12 +211,11 @@ def _record_block(
     boxes: NDArray[np.int32],
     owners: NDArray[np.int32],
 ) -> int:
-    """Makes records of the Gaussians of a block that touch a pixel; returns the next record."""
+    """Makes records of the chosen Gaussians that touch a pixel; returns the next record."""
     j = first_record
     width, height = camera.width, camera.height
-    for k in range(size):
-        i = begin + k
-        radii[i] = 0
+    for k in range(chosen.size):
+        i = chosen[k]
         opacity, z = np.float64(opacities[i]), get(found, CAMERA_DEPTH, k)
         within = (0.0, width - 1.0, 0.0, height - 1.0)
         if limits is not None:
@@ -170,6 +241,18 @@ def _record_block(
         owners[j] = i
         j += 1
     return j
+
+
+@kernel
+def listed(drawn: NDArray[np.int64], owners: NDArray[np.int32]) -> NDArray[np.int32]:
+    """[R] the Gaussians that have a record, sorted."""
+    rows = np.empty(drawn.sum(), np.int32)
+    place = 0
+    for chunk in range(drawn.shape[0]):
+        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+            rows[place] = owners[j]
+            place += 1
+    return rows
 
 
 @kernel
@@ -223,25 +306,40 @@ def project(
     """
     count = means.shape[0]
     found = np.empty(FOUND * BLOCK, np.float64)
+    flags = np.ones(BLOCK, np.uint8)
+    chosen = np.empty(BLOCK, np.int64)
+    picked = np.empty(10 * BLOCK, np.float32)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
         first = chunk * CHUNK
         end = first
         for begin in range(first, min(first + CHUNK, count), BLOCK):
             size = min(BLOCK, count - begin)
+            radii[begin : begin + size] = 0
+            if analytic is None and limits is None:
+                _may_be_drawn(
+                    size,
+                    camera,
+                    near,
+                    dilation,
+                    means.reshape(-1)[3 * begin :],
+                    scales.reshape(-1)[3 * begin :],
+                    opacities[begin:],
+                    flags,
+                )
+            left = _picked(begin, size, flags, means, quats, scales, chosen, picked)
             _project_block(
-                size,
+                left,
                 camera,
                 dilation,
                 antialiased,
-                means.reshape(-1)[3 * begin :],
-                quats.reshape(-1)[4 * begin :],
-                scales.reshape(-1)[3 * begin :],
+                picked,
+                picked[3 * BLOCK :],
+                picked[7 * BLOCK :],
                 found,
             )
             end = _record_block(
-                begin,
-                size,
+                chosen[:left],
                 end,
                 camera,
                 near,

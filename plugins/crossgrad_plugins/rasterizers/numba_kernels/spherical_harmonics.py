@@ -160,6 +160,7 @@ def unshade(
     v_dc: NDArray[np.float32],
     v_rest: NDArray[np.float32],
     v_means: NDArray[np.float32],
+    rows: tuple[bool, bool],
 ) -> None:
     """Carries gradients of the colours on to coefficients and centres.
 
@@ -176,16 +177,21 @@ def unshade(
         v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
         v_rest: [N, B - 1, 3] likewise, active degrees only.
         v_means: [N, 3] added to.
+        rows: Whether `v_dc` and `v_rest` have a row for each record instead, in their order.
     """
+    dc_by_rows, rest_by_rows = rows
     count = (degree + 1) * (degree + 1)
     basis = np.empty(BASIS, np.float64)
     v_basis = np.empty(BASIS, np.float64)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
+        before = drawn[:chunk].sum() - chunk * CHUNK
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             if records[j * RECORD + LOG_OPACITY] == -math.inf:
                 continue
             i = np.intp(owners[j])
+            to_dc = before + j if dc_by_rows else i
+            to_rest = before + j if rest_by_rows else i
             x, y, z, inverse = _direction(means, i, eye)
             _basis(degree, x, y, z, basis)
             v_basis[:] = 0.0
@@ -194,9 +200,9 @@ def unshade(
                 if records[j * RECORD + RED + channel] <= np.float32(0.0):
                     continue
                 v = np.float64(v_colors[i, channel])
-                v_dc[i, 0, channel] = v * basis[0]
+                v_dc[to_dc, 0, channel] = v * basis[0]
                 for k in range(1, count):
-                    v_rest[i, k - 1, channel] = v * basis[k]
+                    v_rest[to_rest, k - 1, channel] = v * basis[k]
                     v_basis[k] += v * np.float64(rest[i, k - 1, channel])
             v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_basis)
             along = x * v_x + y * v_y + z * v_z

@@ -72,8 +72,8 @@ def _state(*, full: bool) -> TrainState:
     )
     plugin = PluginState({"queue": [1, 2]}, {"order": torch.arange(3)}, {"seen": torch.ones(2)})
     return TrainState(
-        parameters=parameters,
-        adam=AdamState(dict(moments), dict(moments), dict.fromkeys(moments, 7)),
+        tensors=parameters,
+        moments=AdamState(dict(moments), dict(moments), dict.fromkeys(moments, 7)),
         rngs=make_streams(0),
         states={"near-far/x": plugin} if full else {},
         step=7,

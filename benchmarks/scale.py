@@ -1,0 +1,373 @@
+"""Step time and peak memory against Gaussians, image size, K and threads; a table and a figure.
+
+    python benchmarks/scale.py [--full] [--only TEXT] [--reps N] [--out DIR]
+
+A synthetic scene in memory: cameras in its middle look in some directions, and in front of each
+lies a cloud of Gaussians that it sees; all others lie where no camera looks. A `fixed` cell has one
+direction, so that each step sees the same Gaussians; a `turning` cell has ten, with a tenth of all
+Gaussians in each, so that each Gaussian is out of view for ten steps on average and what was put
+off for it is caught up with. Steps are those of a run in the midst of density control, between two
+edits, with SH degree 3.
+
+Seconds are of the CPU: the cells of a group take turns step by step in one process, and ratios are
+medians over pairs with the group's first cell. Memory is the largest resident set of a process of
+its own, with the copy that a run can go back to. The bound is what memory traffic alone would take,
+at the bandwidth of a copy on this machine: every number that a step cannot do without, once.
+
+With `--out` it writes scale.json and scale.svg.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from _machine import code, facts, peak_mib
+from torch import Tensor
+
+from crossgrad_core.numerics.threads import configure_threads
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.scene import Scene, View
+    from crossgrad_core.training.setup import Setup
+    from crossgrad_core.training.state import TrainState
+
+#: A step of the published schedule with SH degree 3, statistics gathered, and no edit near.
+STEP = 5_010
+#: ... and one that edits.
+EDIT = 5_100
+#: Steps that compile, decode photos and fill memory before any is measured.
+WARM_UP = 3
+#: Photos of each direction.
+PHOTOS = 4
+#: Bytes of a Gaussian of degree 3 that a step reads or writes: of the geometry, which culling needs
+#: (11 parameters and their moments, both ways), and of one that is drawn (59, and its gradients).
+UNSEEN, SEEN = 11 * 6 * 4, 59 * 8 * 4
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measured case.
+
+    Attributes:
+        gaussians: All of them.
+        visible: Those in front of each camera.
+        pixels: Of a photo, millions.
+        views: K.
+        operator: Name of the operator.
+        directions: That cameras look in.
+        threads: Of the process.
+    """
+
+    gaussians: int
+    visible: int
+    pixels: float = 0.12
+    views: int = 1
+    operator: str = "sum"
+    directions: int = 1
+    threads: int = 1
+
+    @property
+    def name(self) -> str:
+        """A short name."""
+        way = "turning" if self.directions > 1 else "fixed"
+        return (
+            f"{way}, {self.visible:,} of {self.gaussians:,}, {self.pixels:g} MP, "
+            f"K = {self.views} {self.operator}, threads {self.threads}"
+        )
+
+    @property
+    def bytes(self) -> int:
+        """What a step must move, at least."""
+        drawn = min(self.gaussians, self.visible * min(self.views, self.directions))
+        return UNSEEN * (self.gaussians - drawn) + SEEN * drawn
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A photo of random pixels.
+
+    Attributes:
+        seed: Seed of the pixels.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    seed: int
+    width: int
+    height: int
+
+    def image(self) -> Tensor:
+        """[H, W, 3] uint8."""
+        rng = np.random.default_rng(self.seed)
+        return torch.from_numpy(rng.integers(0, 256, (self.height, self.width, 3), np.uint8))
+
+    def mask(self) -> Tensor | None:
+        """None: every pixel counts."""
+        return None
+
+
+def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
+    """Title and cells, which are compared with the first of their group."""
+    base = Cell(20_000, 20_000)
+    yield "unseen", [base, replace(base, gaussians=200_000)]
+    yield "turning", [base, replace(base, gaussians=200_000, directions=10)]
+    if not full:
+        return
+    counts = (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)
+    yield "gaussians", [replace(base, gaussians=n, visible=10_000) for n in counts]
+    yield "megapixels", [replace(base, pixels=p) for p in (0.05, 0.12, 0.5, 2.0, 12.0)]
+    ways = ((1, "sum"), (2, "sum"), (4, "sum"), (2, "pcgrad"), (4, "pcgrad"))
+    yield "views", [replace(base, views=k, operator=o) for k, o in ways]
+    yield "threads", [base, replace(base, threads=2)]
+
+
+def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
+    """Cells whose memory is measured, and whether the last step edits the set of Gaussians."""
+    count = 1_000_000 if full else 200_000
+    pair = Cell(count, count, views=2, operator="pcgrad")
+    for cell in (pair, replace(pair, visible=count // 10)):
+        yield cell, False
+        yield cell, True
+
+
+def scene_of(cell: Cell) -> "Scene":
+    """The scene of a cell."""
+    from crossgrad_core.contract.scene import Scene, Similarity
+
+    width = round((cell.pixels * 1e6 * 4 / 3) ** 0.5)
+    size = (width, round(width * 3 / 4))
+    views = [_view(d, k, size) for d in range(cell.directions) for k in range(PHOTOS)]
+    points = _points(cell)
+    return Scene(
+        name="scale",
+        views=tuple(views),
+        train=tuple(range(len(views))),
+        test=(),
+        points=points,
+        point_colors=np.random.default_rng(1).integers(0, 256, points.shape, np.uint8),
+        similarity=Similarity(np.zeros(3), 1.0),
+        point_sizes=np.full(len(points), 0.3 / cell.visible**0.5),
+    )
+
+
+def _view(direction: int, number: int, size: tuple[int, int]) -> "View":
+    """Photo `number` of a direction: a little beside the others."""
+    from crossgrad_core.contract.scene import Camera, View
+
+    pose = np.eye(4)
+    pose[:3, :3] = _turn(2 * np.pi * direction / 10).T
+    pose[:3, 3] = -pose[:3, :3] @ (0.01 * np.array([number, 0.5 * number, 0.0]))
+    # 30 degrees across, so that ten directions do not overlap.
+    focal = 0.5 * size[0] / np.tan(np.deg2rad(15))
+    calibration = (focal, focal, size[0] / 2, size[1] / 2)
+    camera = Camera(*size, *calibration, torch.from_numpy(pose))
+    seed = direction * PHOTOS + number
+    photo = Noise(seed, *size)
+    return View(f"{seed:04}.png", camera, photo, "all", np.zeros(0, np.int64))
+
+
+def _turn(angle: float) -> np.ndarray:
+    """[3, 3] camera to world: x right, y down, z forward, turned about y."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _points(cell: Cell) -> np.ndarray:
+    """[N, 3] the clouds of all directions and then what no camera sees, in random order."""
+    rng = np.random.default_rng(0)
+    tan = np.tan(np.deg2rad(14))
+    depth = rng.uniform(1.0, 2.0, cell.gaussians)
+    flat = rng.uniform(-tan, tan, (cell.gaussians, 2)) * depth[:, None] * [1.0, 0.75]
+    local = np.column_stack([flat, depth])
+    direction = np.arange(cell.gaussians) // cell.visible
+    angles = 2 * np.pi * direction / 10
+    # One direction is looked at; the rest lies behind it, and is seen where there are ten.
+    if cell.directions == 1:
+        angles = np.where(direction > 0, np.pi, 0.0)
+    c, s = np.cos(angles), np.sin(angles)
+    world = np.column_stack(
+        [c * local[:, 0] + s * local[:, 2], local[:, 1], c * local[:, 2] - s * local[:, 0]]
+    )
+    return np.asarray(world[rng.permutation(cell.gaussians)])
+
+
+def setup_of(cell: Cell) -> "Setup":
+    """The run of a cell."""
+    from crossgrad_core.commands import assemble, configured
+
+    config = configured(
+        {
+            "scene": "examples/scenes/boruszyn",
+            "threads": cell.threads,
+            "steps": 30_000,
+            "schedule": "absolute",
+            "views_per_step": cell.views,
+            "backbone": {"name": "vanilla", "sh_degree": 3},
+            "sampler": {"name": "random"},
+            "operator": {"name": cell.operator},
+            "densifier": {"name": "adc"},
+            "max_gaussians": cell.gaussians,
+            "growth": "free",
+            "events": "steps",
+        }
+    )
+    return assemble(config, scene_of(cell), "colmap")
+
+
+class Run:
+    """A run in the midst of its steps.
+
+    Args:
+        cell: What is run.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        from crossgrad_core.commands import begin
+        from crossgrad_core.training.keeper import Keeper
+
+        self.setup = setup_of(cell)
+        self.state: TrainState = begin(self.setup)
+        self.state.step = STEP
+        self.keeper = Keeper(self.state)
+
+    def step(self) -> tuple[float, float]:
+        """Takes a step; seconds of the CPU and of the clock."""
+        from crossgrad_core.training.loop import timed_step
+
+        cpu, wall = process_time(), perf_counter()
+        timed_step(self.setup, self.state)
+        return process_time() - cpu, perf_counter() - wall
+
+
+def timed(title: str, cells: list[Cell], reps: int) -> Iterator[dict[str, Any]]:
+    """Medians of the cells of a group, which take turns."""
+    configure_threads(max(cell.threads for cell in cells))
+    runs = [Run(cell) for cell in cells]
+    seconds: list[list[tuple[float, float]]] = [[] for _ in runs]
+    for repetition in range(reps + WARM_UP):
+        for cell, run, found in zip(cells, runs, seconds, strict=True):
+            configure_threads(cell.threads)
+            took = run.step()
+            if repetition >= WARM_UP:
+                found.append(took)
+    speed = bandwidth()
+    for cell, found in zip(cells, seconds, strict=True):
+        yield {
+            "group": title,
+            "cell": asdict(cell),
+            "name": cell.name,
+            "cpu_seconds": median(cpu for cpu, _ in found),
+            "wall_seconds": median(wall for _, wall in found),
+            "ratio": median(a[0] / b[0] for a, b in zip(found, seconds[0], strict=True)),
+            "bound_seconds": cell.bytes / speed,
+        }
+
+
+def bandwidth() -> float:
+    """Bytes per second of CPU time that a copy reads and writes."""
+    source = np.ones(1 << 24)
+    target = np.zeros_like(source)
+    times = []
+    for _ in range(5):
+        start = process_time()
+        np.copyto(target, source)
+        times.append(process_time() - start)
+    return 2 * source.nbytes / min(times)
+
+
+def remembered(cell: Cell, *, edit: bool) -> None:
+    """Prints the peak memory of a few steps; run in a process of its own."""
+    configure_threads(cell.threads)
+    run = Run(cell)
+    for _ in range(2):
+        run.step()
+    if edit:
+        run.state.step = EDIT - 1
+        run.step()
+    kind = "edit" if edit else "step"
+    line = {"group": "memory", "cell": asdict(cell), "name": cell.name, "kind": kind}
+    print(json.dumps({**line, "peak_mib": peak_mib()}))
+
+
+def memory(cell: Cell, *, edit: bool) -> dict[str, Any]:
+    """The peak memory of a cell."""
+    task = json.dumps({"cell": asdict(cell), "edit": edit})
+    command = [sys.executable, __file__, "--task", task]
+    found: dict[str, Any] = json.loads(subprocess.check_output(command, text=True))
+    return found
+
+
+def draw(lines: list[dict[str, Any]], path: Path) -> None:
+    """Step time and its bound against the number of Gaussians, and against pixels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for axis, group, key in zip(
+        axes, ("gaussians", "megapixels"), ("gaussians", "pixels"), strict=True
+    ):
+        chosen = [line for line in lines if line["group"] == group]
+        across = [line["cell"][key] for line in chosen]
+        axis.loglog(across, [line["cpu_seconds"] for line in chosen], "o-", label="step")
+        axis.loglog(across, [line["bound_seconds"] for line in chosen], "--", label="memory bound")
+        axis.set_xlabel("Gaussians, 10,000 of them seen" if key == "gaussians" else "megapixels")
+        axis.set_ylabel("seconds of CPU per step")
+        axis.grid(visible=True, which="both", alpha=0.3)
+        axis.legend()
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--full", action="store_true", help="the whole table: half an hour")
+    parser.add_argument("--only", default="", help="only groups with this in their title")
+    parser.add_argument("--reps", type=int, default=15)
+    parser.add_argument("--out", type=Path, help="folder for scale.json and scale.svg")
+    parser.add_argument("--task", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.task:
+        task = json.loads(arguments.task)
+        remembered(Cell(**task["cell"]), edit=task["edit"])
+        return
+    lines: list[dict[str, Any]] = []
+    for title, cells in groups(full=arguments.full):
+        if arguments.only in title:
+            lines += timed(title, cells, arguments.reps)
+            show(lines[-len(cells) :])
+    if arguments.only in "memory":
+        for cell, edit in memory_cells(full=arguments.full):
+            lines.append(memory(cell, edit=edit))
+            show(lines[-1:])
+    print(json.dumps({"code": code(), **facts()}))
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        content = {"code": code(), **facts(), "lines": lines}
+        (arguments.out / "scale.json").write_text(json.dumps(content, indent=1))
+        draw(lines, arguments.out / "scale.svg")
+
+
+def show(lines: list[dict[str, Any]]) -> None:
+    """Prints one line for each cell."""
+    for line in lines:
+        if "peak_mib" in line:
+            print(f"{line['name']}, {line['kind']}: {line['peak_mib']:,.0f} MiB", flush=True)
+        else:
+            print(
+                f"{line['group']}: {line['name']}: {1e3 * line['cpu_seconds']:.1f} ms of CPU, "
+                f"{line['ratio']:.2f} times the first, bound {1e3 * line['bound_seconds']:.1f} ms",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

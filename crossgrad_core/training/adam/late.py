@@ -1,0 +1,142 @@
+"""Steps of Adam put off for rows that no view of a step drew, and caught up with when needed.
+
+Such a row has a gradient of zero; Adam moves it all the same, by moments that fade. What it is
+behind with is done row by row when the row is next drawn, or all at once when somebody reads the
+tensor, by the same float32 operations in the same order: the bits are those of steps taken at once.
+"""
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.gradients.by_rows import rows_of, values_of
+from crossgrad_core.training.adam.coefficients import Coefficients
+
+#: Steps that a row may be late with: tables stay short.
+LONGEST: Final = 256
+#: Second moments that fade faster may be gone before the kernel looks again.
+LEAST_BETA2: Final = 0.5
+
+
+@dataclass(eq=False)
+class _Behind:
+    """The rows of one tensor.
+
+    Attributes:
+        done: [N] steps that each row has had.
+        before: Steps before the first of `steps`; no row has had fewer.
+        steps: Numbers of the steps since, for rows without a gradient.
+    """
+
+    done: NDArray[np.int32]
+    before: int
+    steps: list[tuple[float, ...]] = field(default_factory=list)
+
+    def table(self) -> NDArray[np.float32]:
+        """The steps as the kernel wants them, flat."""
+        steps = np.array(self.steps, np.float32).reshape(-1, 5)
+        # What is above this step or below it from here on.
+        later = steps[::-1]
+        most = np.maximum.accumulate(later[:, 2])[::-1]
+        least = np.minimum.accumulate(later[:, 3])[::-1]
+        # Unless the first moment fades faster than the root of the second, and that slowly enough
+        # to stay a normal number between two looks, nothing is known of what is to come.
+        beta1, beta2 = steps[:, 0], steps[:, 1]
+        fades = bool(((beta1 <= np.sqrt(beta2)) & (beta2 >= LEAST_BETA2)).all())
+        most = most if fades else np.full_like(most, inf)
+        return np.column_stack([steps, most, least]).astype(np.float32).ravel()
+
+
+class Late:
+    """The steps that rows of tensors are behind with, by tensor name; empty if nothing is late."""
+
+    def __init__(self) -> None:
+        self._behind: dict[str, _Behind] = {}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The tensors of which rows may be behind."""
+        return frozenset(self._behind)
+
+    def step(
+        self, name: str, param: Tensor, grad: Tensor, adam: AdamState, step: Coefficients
+    ) -> None:
+        """Takes a step with the rows that `grad` (sparse) has; the others are late from now on.
+
+        Args:
+            name: Name of the tensor; its count in `adam` includes this step.
+            param: The tensor, float32 and contiguous, on the CPU.
+            grad: Its gradient by rows.
+            adam: Moments and counts.
+            step: The coefficients of the step.
+        """
+        from crossgrad_core.training.adam.numba_kernels.fused import numbers_of, update_arrays
+        from crossgrad_core.training.adam.numba_kernels.late import update_rows
+
+        count = adam.steps[name]
+        if name not in self._behind:
+            done = np.full(param.shape[0], count - 1, np.int32)
+            self._behind[name] = _Behind(done, count - 1)
+        rows = rows_of(grad).to(torch.int32)
+        self.catch_up(name, param, adam, rows)
+        behind, flat = self._behind[name], _flat(name, param, adam)
+        numbers, width = numbers_of(step), _width(param)
+        values = values_of(grad).contiguous().view(-1).numpy()
+        if len(rows) == len(behind.done):
+            update_arrays(flat[0], values, flat[1], flat[2], step)
+        else:
+            update_rows(rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
+        behind.done[rows.numpy()] = count
+        beta1, _, beta2, _, step_size, root_scale, eps, _, _ = map(float, numbers)
+        behind.steps.append((beta1, beta2, step_size, root_scale, eps))
+        _changed(name, param, adam)
+        if len(behind.steps) == LONGEST:
+            self.catch_up(name, param, adam)
+
+    def catch_up(
+        self, name: str, param: Tensor, adam: AdamState, rows: Tensor | None = None
+    ) -> None:
+        """Takes the steps that rows of a tensor are behind.
+
+        Args:
+            name: Name of the tensor.
+            param: The tensor.
+            adam: Moments and counts.
+            rows: [R] int32, each once; None: all, and nothing of the tensor is late any more.
+        """
+        behind = self._behind.get(name)
+        if behind is None:
+            return
+        if behind.steps and (rows is None or len(rows)):
+            from crossgrad_core.training.adam.numba_kernels.late import catch_up
+
+            which = None if rows is None else rows.numpy()
+            flat, width = _flat(name, param, adam), _width(param)
+            steps, before = behind.table(), behind.before
+            catch_up(which, width, flat[0], flat[1], flat[2], behind.done, before, steps)
+            _changed(name, param, adam)
+        if rows is None:
+            del self._behind[name]
+
+
+def _flat(name: str, param: Tensor, adam: AdamState) -> tuple[NDArray[np.float32], ...]:
+    """The tensor and its moments, flat."""
+    tensors = (param, adam.exp_avg[name], adam.exp_avg_sq[name])
+    return tuple(tensor.detach().view(-1).numpy() for tensor in tensors)
+
+
+def _width(param: Tensor) -> int:
+    """Elements of a row."""
+    return param.numel() // max(1, param.shape[0])
+
+
+def _changed(name: str, param: Tensor, adam: AdamState) -> None:
+    """Lets graphs that hold the old values notice that NumPy wrote behind autograd's back."""
+    for tensor in (param, adam.exp_avg[name], adam.exp_avg_sq[name]):
+        torch.autograd.graph.increment_version(tensor)

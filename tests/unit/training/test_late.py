@@ -1,0 +1,312 @@
+"""Steps of Adam that rows are late with: the bits of steps that are taken at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.contexts import Regularized
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
+from crossgrad_core.run.checkpoint.folders import Keep
+from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.adam.adam import adam_step, counted
+from crossgrad_core.training.adam.coefficients import Rule
+from crossgrad_core.training.adam.late import Late
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
+
+SHAPES = [(15, 3), (1, 3), (), (8,), (3, 3)]
+
+
+class Both:
+    """One tensor trained in both ways: `whole` at once, `rows` late."""
+
+    def __init__(self, start):
+        self.whole, self.rows = start.clone(), start.clone()
+        self.adam, self.other, self.late = AdamState(), AdamState(), Late()
+
+    def step(self, rows, values, lr, rule, scale=1.0):
+        gradient = by_rows(torch.from_numpy(rows), torch.from_numpy(values), self.whole.shape)
+        adam_step(
+            {"x": self.whole}, {"x": dense(gradient)}, self.adam, {"x": lr}, rule, {"x": scale}
+        )
+        step = counted("x", self.rows, self.other, lr, rule, scale)
+        self.late.step("x", self.rows, gradient, self.other, step)
+
+    def catch_up(self, rows=None):
+        chosen = None if rows is None else torch.from_numpy(rows.astype(np.int32))
+        self.late.catch_up("x", self.rows, self.other, chosen)
+
+    def same(self):
+        pairs = [(self.whole, self.rows)]
+        pairs += [(getattr(self.adam, k)["x"], getattr(self.other, k)["x"])
+                  for k in ("exp_avg", "exp_avg_sq")]  # fmt: skip
+        return self.adam.steps == self.other.steps and all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_late_steps_have_the_bits_of_steps_taken_at_once(seed):
+    rng = np.random.default_rng(seed)
+    shape = (int(rng.integers(1, 300)), *SHAPES[seed % len(SHAPES)])
+    both = Both(
+        torch.from_numpy(rng.normal(size=shape).astype(np.float32)) * 10.0 ** rng.uniform(-9, 3)
+    )
+    rule = Rule.for_views(int(rng.integers(1, 11))) if seed % 2 else Rule()
+    size, lr = 10.0 ** rng.uniform(-25, 3), 10.0 ** rng.uniform(-6, -1)
+    for step in range(120):
+        share = 0.0 if rng.random() < 0.6 else rng.random() ** 3
+        rows = np.flatnonzero(rng.random(shape[0]) < share)
+        values = rng.normal(size=(len(rows), *shape[1:])) * size
+        values *= rng.random(values.shape) < 0.8
+        both.step(rows, values.astype(np.float32), lr * 0.98**step, rule, 1.0 + seed % 3)
+        if step % 7 == 3:
+            both.catch_up(np.flatnonzero(rng.random(shape[0]) < 0.3))
+        if step % 50 == 40:
+            both.catch_up()
+            assert both.same()
+    both.catch_up()
+    assert both.same()
+
+
+@pytest.fixture(scope="module")
+def long_wait():
+    """Rows of all sizes that one step moves and ten thousand do not see, and their oracle."""
+    rng = np.random.default_rng(5)
+    start = (rng.normal(size=(64, 3, 3)) * 10.0 ** rng.uniform(-8, 1, (64, 1, 1))).astype(
+        np.float32
+    )
+    both = Both(torch.from_numpy(start))
+    every, none = np.arange(64), np.zeros(0, np.int64)
+    values = rng.normal(size=start.shape) * 10.0 ** rng.uniform(-12, 0, (64, 1, 1))
+    rates = 1e-3 * 0.9997 ** np.arange(10_001)
+    both.step(every, values.astype(np.float32), rates[0], Rule())
+    for rate in rates[1:]:
+        both.step(none, np.zeros((0, 3, 3), np.float32), rate, Rule())
+    both.catch_up()
+    p, m, v = start.astype(np.float64), 0.0, 0.0
+    gradient = values.astype(np.float32).astype(np.float64)
+    for t, rate in enumerate(rates, 1):
+        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+        root = np.sqrt(v / (1 - 0.999**t)) + 1e-15
+        p -= rate * (m / (1 - 0.9**t)) / root
+        gradient = 0.0
+    return both, start, p
+
+
+def test_ten_thousand_late_steps_have_the_bits_of_steps_taken_at_once(long_wait):
+    assert long_wait[0].same()
+
+
+def test_ten_thousand_late_steps_are_right_to_the_rounding_of_those_that_still_move(long_wait):
+    both, start, oracle = long_wait
+    way, error = np.abs(oracle - start).max(), np.abs(both.rows.double().numpy() - oracle)
+    # Each step rounds the parameter once; some 200 of them are larger than its last place.
+    largest = np.maximum(np.abs(start), np.abs(oracle))
+    assert (error <= 200 * 2.0**-24 * largest + 1e-5 * way).all()
+    assert way > 5e-3 and np.median(error / largest) < 1e-6
+
+
+def test_what_is_not_a_number_stays_visible():
+    both = Both(torch.ones(20, 3))
+    values = np.ones((2, 3), np.float32)
+    values[0, 1] = np.nan
+    both.step(np.array([3, 7]), values, 1e-3, Rule())
+    for _ in range(70):
+        both.step(np.array([5]), values[1:], 1e-3, Rule())
+    both.catch_up()
+    assert both.rows.isnan().nonzero().tolist() == [[3, 1]]
+
+
+def setup_of(operator="sum", backbone="vanilla", **settings):
+    options = {"sh_degree": 3} if backbone == "vanilla" else {}
+    times = {"densify_from": 8, "densify_every": 8, "densify_until": 20, "events": "steps"}
+    given = {
+        "steps": 24,
+        "sampler": {"name": "random"},
+        "operator": {"name": operator},
+        "backbone": {"name": backbone, **options},
+        "densifier": {"name": "adc"},
+        **times,
+        "sh_from": 3,
+        **settings,
+    }
+    return assemble(RunConfig.model_validate(given), half_seen(), "none")
+
+
+def half_seen():
+    """The sample scene with photos of one side of the cloud each, and a copy where none looks."""
+    scene, views = sample_scene(), []
+    for k, view in enumerate(scene.views):
+        aside = (-1) ** k * 0.5 * view.camera.width
+        views.append(replace(view, camera=replace(view.camera, cx=view.camera.cx + aside)))
+    points = np.concatenate([scene.points, scene.points + np.array([0.0, 0.0, 50.0])])
+    colors = np.concatenate([scene.point_colors, scene.point_colors])
+    return replace(scene, views=tuple(views), points=points, point_colors=colors)
+
+
+class PerView:
+    """Reads the higher bands of what a view and density control are given, and pulls at them."""
+
+    @hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is None or context.step % 5:
+            return None
+        return Regularized(1e-3 * context.gaussians.sh_rest.square().sum())
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        if context.step % 3 == 0:
+            for record in context.views:
+                assert record.gaussians.on_demand is None
+                read = record.gaussians.sh_rest.clone()
+                assert torch.equal(read, context.parameters["f_rest"])
+        return (yield)
+
+
+class Decay:
+    """Reads the higher bands in every fifth step, and pulls at them."""
+
+    @hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is not None or context.step % 5:
+            return None
+        return Regularized(1e-3 * context.parameters["f_rest"].square().sum())
+
+
+def trained(setup, plugins=()):
+    for k, plugin in enumerate(plugins):
+        setup.manager.register(plugin, name=f"own{k}")
+    state = first_state(setup)
+    late = 0
+    for _ in range(setup.schedule.total):
+        timed_step(setup, state)
+        late += bool(state.late.names)
+    return state, late
+
+
+def everything(state):
+    saved = to_checkpoint(state)
+    return {f"{kind} {name}": tensor for kind in ("parameters", "exp_avg", "exp_avg_sq")
+            for name, tensor in getattr(saved, kind).items()}, saved.adam_steps  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("settings", "plugins"),
+    [
+        ({}, ()),
+        ({"operator": "sum", "views": 2, "backbone": "mip"}, ()),
+        ({"operator": "pcgrad", "views": 3}, ()),
+        ({"operator": "pcgrad", "views": 2, "backbone": "distance"}, ()),
+        ({"operator": "graddrop", "views": 2}, ()),
+        ({"preset": "inria"}, ()),
+        ({"average": 0.5}, ()),
+        ({}, (Decay,)),
+        ({"views": 2}, (PerView,)),
+    ],
+    ids=str,
+)
+def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, plugins):
+    lazy, late = trained(setup_of(**settings), [plugin() for plugin in plugins])
+    monkeypatch.setattr(NumbaRasterizer, "by_rows", False)
+    plain, none = trained(setup_of(**settings), [plugin() for plugin in plugins])
+    assert none == 0 and (late > 5 or settings.get("operator") == "graddrop")
+    (ours, steps), (theirs, others) = everything(lazy), everything(plain)
+    assert steps == others and ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+@pytest.mark.parametrize("settings", [{}, {"operator": "pcgrad", "views": 2}], ids=str)
+@pytest.mark.parametrize("stop", [6, 13, 14])
+def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
+    tmp_path, monkeypatch, stop, settings
+):
+    with monkeypatch.context() as patched:
+        patched.setattr(NumbaRasterizer, "by_rows", False)
+        whole, none = trained(setup_of(**settings))
+    setup = setup_of(**settings)
+    first = first_state(setup)
+    for _ in range(stop):
+        timed_step(setup, first)
+    assert none == 0 and first.late.names
+    save(tmp_path, to_checkpoint(first), Keep(every=None))
+    second = from_checkpoint(setup, load(latest(tmp_path)))
+    counts = [timed_step(setup, second).primitives for _ in range(setup.schedule.total - stop)]
+    assert len(set(counts)) > 1
+    (ours, steps), (theirs, others) = everything(second), everything(whole)
+    assert steps == others and ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+class Brightened(Vanilla):
+    """Inherits, and reads in `decode` what its parent only hands over."""
+
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        brightness = parameters["f_dc"][:, 0].mean(dim=1)
+        return replace(gaussians, opacities=gaussians.opacities * brightness.sigmoid())
+
+
+def test_what_a_backbone_passes_on_is_not_inherited():
+    assert Brightened.passed_on == {} and Vanilla.passed_on
+    setup = setup_of()
+    own = replace(setup.selection, backbone=Brightened())
+    assert setup.by_rows and not replace(setup, selection=own).by_rows
+
+
+def test_other_sparse_gradients_are_brought_into_order():
+    """Rows in any order or twice, as autograd and a wrapper's sums leave them."""
+    rows, values = torch.tensor([4, 1, 4]), torch.tensor([[1.0], [2.0], [4.0]])
+    found = tidy(by_rows(rows, values, (6, 1)))
+    assert rows_of(found).tolist() == [1, 4] and values_of(found).tolist() == [[2.0], [5.0]]
+    assert tidy(dense(found).to_sparse()).tolist() == dense(found).tolist()
+
+
+def behind():
+    """A state with a tensor of which row 1 is behind."""
+    state = TrainState({"x": torch.ones(3, 2), "y": torch.ones(1)}, AdamState(), {})
+    for step in range(3):
+        rows = torch.tensor([0, 1, 2] if step == 0 else [0, 2])
+        gradient = by_rows(rows, torch.ones(len(rows), 2), (3, 2))
+        coefficients = counted("x", state.tensors["x"], state.moments, 0.1, Rule(), 1.0)
+        state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
+    return state
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda state: state.parameters["x"],
+        lambda state: state.current["x"],
+        lambda state: dict(state.current)["x"],
+        lambda state: {**state.current}["x"],
+        lambda state: Snapshot.of(state).parameters["x"],
+    ],
+)
+def test_who_reads_a_tensor_gets_all_steps(read):
+    state = behind()
+    raw = state.tensors["x"].clone()
+    assert state.late.names == {"x"} and state.current["y"] is state.tensors["y"]
+    found = read(state)
+    assert not state.late.names
+    assert torch.equal(found[[0, 2]], raw[[0, 2]]) and (found[1] < raw[1]).all()
+
+
+def test_going_back_forgets_what_was_late():
+    state = behind()
+    snapshot = Snapshot.of(state)
+    kept = state.tensors["x"].clone()
+    gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
+    coefficients = counted("x", state.tensors["x"], state.moments, 0.1, Rule(), 1.0)
+    state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
+    snapshot._restore_tensors(state)
+    assert not state.late.names and torch.equal(state.parameters["x"], kept)
