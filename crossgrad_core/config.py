@@ -238,13 +238,14 @@ class RunConfig(BaseModel):
         Field(
             None,
             description="Density control stops growing here; auto: as suits the length of the run. "
-            "Default: what fits into memory.",
+            "Default: auto where growth follows the curve, else what fits into memory.",
         )
     )
-    growth: Annotated[Literal["free", "curve"], Flag("free|curve", TRAINING)] = Field(
-        "free",
+    growth: Annotated[Literal["free", "curve"] | None, Flag("free|curve", TRAINING)] = Field(
+        None,
         description="Growth up to --max-gaussians: as it is asked for, or along a curve that gets "
-        "there with the last edit. Default: free.",
+        "there with the last edit. Default: curve for densifiers of Gaussians that clone and "
+        "split, else, and where --max-gaussians is a number, free.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None, ge=1, description="Steps between evaluations."

@@ -24,6 +24,8 @@ class Densifier(Component):
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.
         observes: Whether it gathers statistics of the views that the steps render.
+        budgeted: Whether a run that names no bound leads its growth along the curve to the budget
+            of its length, which is one of Gaussians.
     """
 
     slot: ClassVar[str] = "densifiers"
@@ -32,6 +34,7 @@ class Densifier(Component):
     edits: ClassVar[bool] = True
     resets: ClassVar[bool] = True
     observes: ClassVar[bool] = True
+    budgeted: ClassVar[bool] = False
 
     def window(self, schedule: Schedule) -> Schedule:
         """The schedule with the times at which this method edits; what the user set wins over it.

@@ -97,8 +97,8 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             yield setting, f"densifier {name} never edits"
     if config.reset_every is not None and not densifier.resets:
         yield "reset_every", f"densifier {name} resets no opacities"
-    if config.growth == "curve" and not (densifier.edits and config.max_gaussians):
-        yield "growth", "it leads nowhere; add --max-gaussians N, and a densifier that edits"
+    if config.growth == "curve" and not densifier.edits:
+        yield "growth", f"densifier {name} never edits"
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

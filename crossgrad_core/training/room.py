@@ -2,7 +2,7 @@
 
 import sys
 from math import exp, log
-from typing import cast
+from typing import Literal, cast
 
 from crossgrad_core.config import AUTO
 from crossgrad_core.contract.schedule import REFERENCE
@@ -31,18 +31,33 @@ def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
 
 def _most(setup: Setup, state: TrainState) -> int:
     """The most primitives that there may be after this step's edit."""
-    config, schedule = setup.config, setup.schedule
-    if config.growth == "free" and config.max_gaussians != AUTO:
-        return config.max_gaussians or sys.maxsize
+    schedule, growth, given = setup.schedule, growth_of(setup), bound_of(setup)
+    if growth == "free" and given != AUTO:
+        return given or sys.maxsize
     # Nothing is added before the first edit: what is there then is the start.
     first = PluginState({"start": state.primitives(setup)})
     start = cast("int", state.states.setdefault(STATE, first).values["start"])
-    given = config.max_gaussians or sys.maxsize
-    budget = usual_budget(start, schedule.length) if given == AUTO else given
-    if config.growth == "free" or budget == sys.maxsize:
+    budget = usual_budget(start, schedule.length) if given == AUTO else given or sys.maxsize
+    if growth == "free" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
     return min(budget, curve(events - schedule.edits(state.step), events, start, budget))
+
+
+def growth_of(setup: Setup) -> Literal["free", "curve"]:
+    """How the number of primitives grows: as was asked for, else as suits the densifier."""
+    if setup.config.growth is not None:
+        return setup.config.growth
+    # A bound that somebody names is a bound and no aim, and published times have published growth.
+    named = setup.config.max_gaussians not in {None, AUTO}
+    led = setup.densifier.budgeted and setup.schedule.counting.unit == "views"
+    return "curve" if led and not named else "free"
+
+
+def bound_of(setup: Setup) -> int | Literal["auto"] | None:
+    """The bound on the number of primitives; a curve to nowhere leads to what suits the length."""
+    given = setup.config.max_gaussians
+    return AUTO if given is None and growth_of(setup) == "curve" else given
 
 
 def usual_budget(start: int, length: int) -> int:

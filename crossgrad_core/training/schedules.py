@@ -8,6 +8,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.schedule import Counting, Schedule, Unit, is_published
+from crossgrad_core.training.room import growth_of
 from crossgrad_core.training.setup import Setup
 
 #: Times of density control that the user may set.
@@ -51,7 +52,18 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
 
 def notes_on_length(setup: Setup) -> tuple[str, ...]:
     """What is noted about a run of this length."""
-    return (*growth_note(setup), *setup.selection.resolution.remarks(setup.schedule))
+    resolution = setup.selection.resolution
+    return (*growth_note(setup), *_curve_note(setup), *resolution.remarks(setup.schedule))
+
+
+def _curve_note(setup: Setup) -> tuple[str, ...]:
+    """Says that growth follows the curve, where nobody asked for it."""
+    if not setup.schedule.grows or setup.config.growth or growth_of(setup) == "free":
+        return ()
+    return (
+        "growth follows a curve to the number of primitives that suits the length (--max-gaussians "
+        "auto); --growth free adds as many as density control asks for",
+    )
 
 
 def growth_note(setup: Setup) -> tuple[str, ...]:

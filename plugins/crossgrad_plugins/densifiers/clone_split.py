@@ -94,6 +94,7 @@ class CloneSplit(Densifier):
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
+    budgeted = True
 
     split_scale: float = Field(0.01, gt=0, description="split above, clone below; scene extents")
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="prune below")

@@ -19,10 +19,11 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import room
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.room import curve, usual_budget
+from crossgrad_core.training.room import bound_of, curve, growth_of, usual_budget
 from crossgrad_core.training.start import first_state
 
 #: Densifiers that want more than any curve gives them, and their backbones.
@@ -81,7 +82,7 @@ def test_every_method_that_grows_follows_the_curve(name):
         assert found[2 * edit] == curve(edit, EDITS, start, budget)
         assert found[2 * edit - 1] == found[2 * edit - 2]
     assert found[-1] == budget
-    at_once = counts_of(setup_of(name, max_gaussians=budget))
+    at_once = counts_of(setup_of(name, max_gaussians=budget, growth="free"))
     assert at_once[2] == budget
 
 
@@ -109,6 +110,37 @@ def test_what_was_pruned_may_be_added_again():
     state.adam = first_state(setup).adam
     state.states = {**state.states, "densifier": PluginState()}
     assert timed_step(setup, state).primitives == 20  # All are cloned: far from the curve.
+
+
+@pytest.mark.parametrize(
+    ("settings", "growth", "bound"),
+    [
+        ({}, "curve", "auto"),
+        ({"max_gaussians": "auto"}, "curve", "auto"),
+        ({"max_gaussians": 60}, "free", 60),
+        ({"growth": "free"}, "free", None),
+        ({"growth": "free", "max_gaussians": "auto"}, "free", "auto"),
+        ({"growth": "curve", "max_gaussians": 60}, "curve", 60),
+        ({"events": "steps"}, "free", None),
+        ({"events": "steps", "growth": "curve"}, "curve", "auto"),
+        ({"preset": "inria"}, "free", None),
+        ({"schedule": "absolute"}, "free", None),
+        ({"densifier": {"name": "none"}}, "free", None),
+        ({"densifier": {"name": "mcmc"}}, "free", None),
+        ({"backbone": {"name": "scaffold"}}, "free", None),
+        ({"backbone": {"name": "pixel"}}, "curve", "auto"),
+    ],
+)
+def test_what_growth_a_run_has(settings, growth, bound):
+    """And the resolved configuration asks for the same, in so many words."""
+    config = RunConfig.model_validate({"steps": 2_000, **settings})
+    setup = assemble(config, sample_scene(), "none")
+    assert (growth_of(setup), bound_of(setup)) == (growth, bound)
+    written = resolved(setup)
+    assert (written.growth, written.max_gaussians) == (growth, bound)
+    assert any("follows a curve" in note for note in setup.notes) == (
+        growth == "curve" and "growth" not in settings
+    )
 
 
 def test_a_budget_below_the_start_adds_nothing():
@@ -144,7 +176,7 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
     turn = first.step_of(first.next_edit(first.densify_from + first.densify_every))
     wanted = Schedule.for_run(longer, counting=counting)
     schedule, present, reached = first, 1_000, []
-    config = SimpleNamespace(growth="curve", max_gaussians=9_000)
+    config = RunConfig(growth="curve", max_gaussians=9_000)
     state = SimpleNamespace(states={}, step=0, primitives=lambda _: present)
     for step in range(1, max(longer, 2_000) + 1):
         if step == turn + 1:

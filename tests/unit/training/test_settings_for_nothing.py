@@ -75,7 +75,6 @@ IDLE = [
     ({"densifier": {"name": "none"}, "densify_every": 10}, "densify_every"),
     ({"densifier": {"name": "none"}, "max_gaussians": 10}, "max_gaussians"),
     ({"densifier": {"name": "none"}, "growth": "curve"}, "growth"),
-    ({"densifier": {"name": "adc"}, "growth": "curve"}, "growth"),
     ({"densifier": {"name": "none"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
     (
@@ -147,6 +146,7 @@ AT_WORK = [
     {"grouping": {"name": "gmm"}, "observers": [{"name": "diagnostics"}]},
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"max_gaussians": "auto", "growth": "curve"},
+    {"densifier": {"name": "adc"}, "growth": "curve"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
     {"fewest_edits": 6},
     {"fewest_edits": 6, "schedule": "absolute", "reference": 600},
