@@ -1,4 +1,4 @@
-"""What is left of a sweep that is kept: its tables, packed into one small file, and back.
+"""The tables of a sweep, packed into one small file to be kept, and back.
 
     python benchmarks/kept.py pack runs/sweeps/GRID benchmarks/results/GRID.tar.xz
     python benchmarks/kept.py unpack benchmarks/results/GRID.tar.xz runs/sweeps/GRID
