@@ -1,4 +1,4 @@
-"""What waiting threads cost: a training step with several ways to wait, alone and among others.
+"""The cost of waiting threads: a training step with several ways to wait, alone and among others.
 
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
