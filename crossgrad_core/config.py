@@ -97,10 +97,10 @@ class RunConfig(BaseModel):
         description="exposure.json of another run on these photos: the exposure starts from its "
         "values.",
     )
-    start: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
-        ComponentChoice(name=defaults.START),
+    start: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+        None,
         description="What is added to the points that a run starts from. "
-        f"Default: {defaults.START}, nothing.",
+        f"Default: {defaults.START}; {defaults.BARE_START}, nothing, with --preset inria.",
     )
     resolution: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.RESOLUTION),

@@ -11,7 +11,9 @@ SAMPLER: Final = "random"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"
-START: Final = "sfm"
+START: Final = "filled"
+#: The start of published runs, and of those that begin with points of their own: it adds nothing.
+BARE_START: Final = "sfm"
 #: The start that has points for a scene without any: a hint.
 START_ALONE: Final = "triangulated"
 RESOLUTION: Final = "full"

@@ -28,7 +28,15 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
-from crossgrad_core.defaults import CHAIN, EXPORTER, METRICS, READER, START_ALONE
+from crossgrad_core.defaults import (
+    BARE_START,
+    CHAIN,
+    EXPORTER,
+    METRICS,
+    READER,
+    START,
+    START_ALONE,
+)
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
@@ -237,7 +245,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    start = _built(Start, config.start)
+    start_choice = _or_default(config.start, _usual_start(config))
+    start = _built(Start, start_choice)
     _require_points(config, scene, start)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
@@ -270,7 +279,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
         "exposure": fitted.name or config.exposure.name,
-        "start": config.start.name,
+        "start": start_choice.name,
         "resolution": config.resolution.name,
         "exporter": config.exporter.name,
         "reader": reader,
@@ -298,6 +307,12 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         view_plan=views,
     )
     return selection, notes
+
+
+def _usual_start(config: RunConfig) -> str:
+    """The start of a run that names none."""
+    bare = config.preset == "inria" or config.reading.init != "points"
+    return BARE_START if bare else START
 
 
 def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.defaults import GROUP_SAMPLER, PROGRESS, START
+from crossgrad_core.defaults import BARE_START, GROUP_SAMPLER, PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
@@ -164,7 +164,8 @@ def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
-    if config.start.name != START and config.reading.init != "points":
+    asked = config.start is not None and config.start.name != BARE_START
+    if asked and config.reading.init != "points":
         yield "start", f"--init {config.reading.init} has points of its own; leave one of them out"
 
 
