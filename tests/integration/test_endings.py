@@ -28,6 +28,8 @@ def scene(tmp_path_factory):
 
 def run(scene, out):
     settings = {"scene": str(scene), "out": str(out), "steps": STEPS, "eval_every": 4, "threads": 1}
+    # A filled start would look at all photos before the first step.
+    settings["start"] = {"name": "sfm"}
     return app.run(settings, verbosity=-1)
 
 
