@@ -36,11 +36,13 @@ USUAL: Mapping[str, Any] = {
     "densify_every": 10,
     "densify_until": 45,
     "eval_every": 50,
+    "start": "sfm",
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.
 CASES: Mapping[str, Mapping[str, Any]] = {
     "bundled": {"max_size": 80, "reset_every": 30, "growth": "curve", "max_gaussians": 24_000},
+    "bundled filled": {"max_size": 80, "start": "filled"},
     **{each: {"backbone": each, "operator": "symmetric"} for each in BACKBONES},
     "exposure": {"exposure": "affine", "views": 3},
     "mcmc": {"densifier": "mcmc", "resolution": "octaves", "views": 1},
