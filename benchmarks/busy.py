@@ -3,10 +3,10 @@
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
 OpenMP's threads spin for a while when they have nothing to do, which is quickest where nothing else
-runs, and takes the core from the process that needs it where something does: another program, or the very
-thread that they wait for. In each round every way takes its turn, alone and beside as many programs
-that compute as there are cores; the table has medians over the rounds in ms, and what one process
-of one thread takes, alone and beside a second one, as "two cores" may be one.
+runs, and takes the core from the process that needs it where something does: another program, or
+the very thread that they wait for. In each round every way takes its turn, alone and beside as many
+programs that compute as there are cores; the table has medians over the rounds in ms, and what one
+process of one thread takes, alone and beside a second one, as "two cores" may be one.
 """
 
 import argparse

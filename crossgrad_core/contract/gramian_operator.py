@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Sequence
 from functools import partial
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ class MatrixOperator(Operator):
 
     It can be a link of a chain and serve single blocks.
     """
+
+    by_rows: ClassVar[bool] = True
 
     @abstractmethod
     def transform(
@@ -62,6 +64,8 @@ class GramianOperator(MatrixOperator):
         granularity: What one Gramian covers: each block's tensors, all geometry / all appearance
             blocks, everything, or each Gaussian's row of a block.
     """
+
+    by_rows: ClassVar[bool] = True
 
     granularity: Granularity = Field("block", description="what one Gramian covers")
 

@@ -4,6 +4,8 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+from typing_extensions import override
+
 from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
 from crossgrad_core.contract.marks import hookimpl
@@ -25,6 +27,9 @@ class Operator(Component):
             says that the operator does nothing.
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no labels.
+        by_rows: Whether `aggregate` hands on what `total` and `combine` answer as it is, sparse or
+            dense. It holds for the class that says so and those that keep its `aggregate`; others
+            get dense gradients only.
     """
 
     slot: ClassVar[str] = "operators"
@@ -32,6 +37,14 @@ class Operator(Component):
     views: ClassVar[ViewCounts] = ViewCounts()
     idle_at_one: ClassVar[bool] = False
     default_grouping: ClassVar[str | None] = None
+    by_rows: ClassVar[bool] = False
+
+    @classmethod
+    @override
+    def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
+        answers = {"aggregate", "crossgrad_aggregate_gradients"} & vars(cls).keys()
+        if answers and "by_rows" not in vars(cls):
+            cls.by_rows = False
 
     @property
     def usual_grouping(self) -> str | None:

@@ -157,9 +157,11 @@ class Setup:
     def by_rows(self) -> Mapping[str, str]:
         """Field of the Gaussians -> tensor whose steps wait until a row is drawn."""
         trained = {name for block in self.trained_blocks for name in block.tensors}
-        # Who looks at the model after each step reads every row.
+        # Who looks at the model after each step reads every row, and a wrapper of the aggregation
+        # computes with dense gradients.
         whole = self.joint or self.shows_model or self.device.type != "cpu"
-        if whole or not self.rasterizer.by_rows:
+        wrapped = len(self.hook.crossgrad_aggregate_gradients.get_hookimpls()) > 1
+        if whole or wrapped or not (self.rasterizer.by_rows and self.operator.by_rows):
             return {}
         passed_on = self.backbone.passed_on
         return {field: name for field, name in passed_on.items() if name in trained}

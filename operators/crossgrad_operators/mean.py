@@ -24,6 +24,7 @@ class Mean(MatrixOperator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
+    by_rows: ClassVar[bool] = True
 
     @override
     def transform(

@@ -23,6 +23,7 @@ class Sum(MatrixOperator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
+    by_rows: ClassVar[bool] = True
 
     @override
     def transform(

@@ -23,6 +23,9 @@ from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_operators.graddrop import GradDrop
+from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_operators.sum import Sum
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
 SHAPES = [(15, 3), (1, 3), (), (8,), (3, 3)]
@@ -261,6 +264,38 @@ def test_what_a_backbone_passes_on_is_not_inherited():
     setup = setup_of()
     own = replace(setup.selection, backbone=Brightened())
     assert setup.by_rows and not replace(setup, selection=own).by_rows
+
+
+class Clipped(Sum):
+    """Inherits, and computes with what its parent only hands on."""
+
+    def aggregate(self, context, state):
+        answer, state = super().aggregate(context, state)
+        gradients = {name: None if g is None else g.clamp(-1.0, 1.0)
+                     for name, g in answer.gradients.items()}  # fmt: skip
+        return replace(answer, gradients=gradients), state
+
+
+class Clip:
+    """A wrapper that computes with the aggregated gradients."""
+
+    @hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        answer = yield
+        assert not any(g.is_sparse for g in answer.gradients.values() if g is not None)
+        return answer
+
+
+def test_what_an_operator_hands_on_is_not_inherited():
+    assert not Clipped.by_rows and not GradDrop.by_rows and Sum.by_rows and PCGrad.by_rows
+    setup = setup_of()
+    own = replace(setup.selection, operator=Clipped())
+    assert setup.by_rows and not replace(setup, selection=own).by_rows
+
+
+def test_wrappers_of_the_aggregation_get_dense_gradients():
+    _, late = trained(setup_of(views=2, operator="sum"), [Clip()])
+    assert late == 0
 
 
 def test_other_sparse_gradients_are_brought_into_order():
