@@ -47,8 +47,6 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "exposure": {"exposure": "affine", "views": 3},
     "mcmc": {"densifier": "mcmc", "resolution": "octaves", "views": 1},
 }
-#: Cells of a side of the figures of a render.
-CELLS = 4
 
 
 def key() -> str:
@@ -59,7 +57,7 @@ def key() -> str:
     return f"{platform.system()} {processor} {made_for}; {versions}"
 
 
-def made(name: str, folder: Path) -> dict[str, Any]:
+def made(name: str, folder: Path) -> dict[str, str]:
     """What this machine makes of a case.
 
     Args:
@@ -67,23 +65,16 @@ def made(name: str, folder: Path) -> dict[str, Any]:
         folder: An empty folder for the scene and the run.
 
     Returns:
-        `training` and `render`, the hashes of the parameters and of the first held-out view;
-        `figures`, name -> means and root mean squares of tensors, means of parts of the render.
+        `training` and `render`, the hashes of the parameters and of the first held-out view.
     """
     bundled = name.startswith("bundled")
     views = {"views": 6, "folders": ("near", "far")}
     scene = bundled_scene() if bundled else write_tiny_scene(folder / "scene", **views)
     run = cg.run(scene, out=folder / "run", **{**USUAL, **CASES[name]})
     parameters = dict(sorted(load(latest(run.folder)).parameters.items()))
-    image = run.render(run.scene.test_views[0].name)
-    tensors = {name: tensor.detach().numpy() for name, tensor in parameters.items()}
     return {
-        "training": _hash(*tensors.values()),
-        "render": _hash(image),
-        "figures": {
-            "render": [_mean(part) for row in _parts(image, 0) for part in _parts(row, 1)],
-            **{name: [_mean(t), _mean(t.astype(float) ** 2) ** 0.5] for name, t in tensors.items()},
-        },
+        "training": _hash(*(tensor.detach().numpy() for tensor in parameters.values())),
+        "render": _hash(run.render(run.scene.test_views[0].name)),
     }
 
 
@@ -95,17 +86,9 @@ def _hash(*arrays: np.ndarray) -> str:
     return found.hexdigest()[:32]
 
 
-def _parts(image: np.ndarray, axis: int) -> list[np.ndarray]:
-    return np.array_split(image, CELLS, axis=axis)
-
-
-def _mean(array: np.ndarray) -> float:
-    return float(f"{array.mean(dtype=np.float64) if array.size else 0.0:.7g}")
-
-
-def known() -> dict[str, dict[str, Any]]:
+def known() -> dict[str, dict[str, dict[str, str]]]:
     """Key -> case -> what was made of it."""
-    found: dict[str, dict[str, Any]] = json.loads(PATH.read_text(encoding="utf-8"))
+    found: dict[str, dict[str, dict[str, str]]] = json.loads(PATH.read_text(encoding="utf-8"))
     return found
 
 
