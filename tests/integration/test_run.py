@@ -243,7 +243,7 @@ def test_published_order_differs_and_runs(scene, tmp_path):
 
 
 def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
-    run(scene, tmp_path / "run", steps=4)
+    run(scene, tmp_path / "run", steps=4, start={"name": "sfm"})
     assert quality(tmp_path / "run")[-1]["primitives"] == "200"
     assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
 
@@ -251,6 +251,7 @@ def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
 def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     # Every Gaussian is above a threshold of 1e-12, so the first edit wants to double them all.
     settings = {"steps": 60, **GROWTH, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
+    settings["start"] = {"name": "sfm"}
     settings["rate_factor"] = 1.0  # With larger rates some become transparent and are pruned.
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230

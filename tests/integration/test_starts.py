@@ -6,7 +6,8 @@ import pytest
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.run.results.config_file import read_notes
+from crossgrad_core.run import app
+from crossgrad_core.run.results.config_file import read_config, read_notes
 
 BASE = ["--steps", "8", "--threads", "1", "--max-size", "40", "--views", "2", "-q"]
 
@@ -25,10 +26,10 @@ def run(scene, out, *options):
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
-def test_filled_adds_primitives_and_says_so(scene, tmp_path, backbone):
+def test_by_default_the_start_is_filled_and_says_so(scene, tmp_path, backbone):
     options = ("--backbone", backbone, "--densifier", "none")
-    assert run(scene, tmp_path / "plain", *options) == 0
-    assert run(scene, tmp_path / "filled", *options, "--start", "filled") == 0
+    assert run(scene, tmp_path / "plain", *options, "--start", "sfm") == 0
+    assert run(scene, tmp_path / "filled", *options) == 0
     assert primitives(tmp_path / "filled") > primitives(tmp_path / "plain")
     assert any(note.startswith("start: ") for note in read_notes(tmp_path / "filled"))
     assert not any(note.startswith("start: ") for note in read_notes(tmp_path / "plain"))
@@ -43,6 +44,15 @@ def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
         (tmp_path / name / "point_cloud.ply").read_bytes() for name in ("whole", "broken")
     )
     assert one == other
+
+
+@pytest.mark.parametrize("options", [("--init", "random"), ("--preset", "inria")], ids=str)
+def test_these_runs_start_bare(scene, tmp_path, options):
+    """Their configuration says so, and repeats the run."""
+    assert run(scene, tmp_path / "run", *options) == 0
+    stored = read_config(tmp_path / "run")
+    assert stored["start"] == {"name": "sfm"}
+    assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
 
 
 def test_points_of_its_own_make_a_start_do_nothing(scene, tmp_path, capsys):

@@ -67,7 +67,7 @@ def config_of(row: Row) -> RunConfig:
         for slot, name in zip(SLOTS, row, strict=True)
     }
     views = _several_views(choices["sampler"], choices["operator"])
-    few = {"steps": 100, "views": views, "metrics": [{"name": "psnr"}]}
+    few = {"steps": 100, "views": views, "metrics": [{"name": "psnr"}], "start": {"name": "sfm"}}
     return RunConfig.model_validate({**few, **choices, **_TIMES})
 
 

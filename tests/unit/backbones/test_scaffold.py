@@ -281,6 +281,7 @@ def test_at_most_so_many_cameras_are_averaged():
 def test_training_lowers_the_loss(options):
     config = RunConfig(
         steps=60,
+        start=ComponentChoice(name="sfm"),
         backbone=ComponentChoice(name="scaffold", **options),
         operator=ComponentChoice(name="pcgrad"),
         sampler=ComponentChoice(name="random"),

@@ -240,8 +240,11 @@ EARLY = {"events": "steps", "densify_from": 1, "densify_until": 9, "densify_ever
 
 def setup_of(**options):
     config = RunConfig(
-        steps=10, densifier=ComponentChoice(name="mcmc", **options), **EARLY
-    )  # fmt: skip
+        steps=10,
+        start=ComponentChoice(name="sfm"),
+        densifier=ComponentChoice(name="mcmc", **options),
+        **EARLY,
+    )
     return assembling.assemble(config, sample_scene(), "none")
 
 

@@ -53,6 +53,7 @@ BACKBONES = {
 def test_a_checkpoint_changes_nothing(tmp_path, name, stop, edits_in):
     config = RunConfig(
         steps=10,
+        start=ComponentChoice(name="sfm"),
         events="steps",
         densify_from=1,
         densify_until=9,

@@ -140,7 +140,9 @@ def trained(path, reader):
     from crossgrad_core.training.loop import timed_step
     from crossgrad_core.training.start import first_state
 
-    config = RunConfig(scene=path, steps=5, threads=1, reader={"name": reader})
+    config = RunConfig(
+        scene=path, steps=5, threads=1, start={"name": "sfm"}, reader={"name": reader}
+    )
     setup = assemble(config, *read_scene(config, path))
     state = first_state(setup)
     for _ in range(5):

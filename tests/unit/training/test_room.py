@@ -47,6 +47,7 @@ EDITS = 4
 def setup_of(densifier, **settings):
     """A run of 4 edits, after steps 2, 4, 6 and 8."""
     config = RunConfig(
+        start={"name": "sfm"},
         steps=10, events="steps", densify_from=1, densify_until=9, densify_every=2,
         densifier=ComponentChoice(name=densifier, **GREEDY[densifier]),
         backbone=ComponentChoice(**BACKBONES.get(densifier, {"name": "vanilla"})), **settings,

@@ -49,7 +49,12 @@ def setup_of(backbone, densifier, operator, views, rasterizer="numba"):
     chosen = {"backbone": backbone, "densifier": densifier}
     config = {slot: {"name": name, **NEEDED.get((slot, name), {})} for slot, name in chosen.items()}
     config |= {"operator": {"name": operator}, "sampler": {"name": "random"}, "views": views}
-    config |= {"steps": STEPS, "rasterizer": {"name": rasterizer}, **TIMES}
+    config |= {
+        "steps": STEPS,
+        "start": {"name": "sfm"},
+        "rasterizer": {"name": rasterizer},
+        **TIMES,
+    }
     return assemble(RunConfig.model_validate(config), sample_scene(), "none")
 
 
