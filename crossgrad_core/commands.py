@@ -39,11 +39,13 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
-    from crossgrad_core.run.settings import layered
+    from crossgrad_core.run.settings import layered, merged
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.frozen import view_gradients
     from crossgrad_core.training.model import model_of
+    from crossgrad_core.training.room import usual_budget
+    from crossgrad_core.training.schedules import counting_of
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
     from crossgrad_core.training.state import TrainState
@@ -79,6 +81,7 @@ __all__ = [
     "check_folder",
     "chosen",
     "configured",
+    "counting_of",
     "did_you_mean",
     "disk_errors",
     "entries",
@@ -94,6 +97,7 @@ __all__ = [
     "load_command",
     "load_entry",
     "locked",
+    "merged",
     "model_of",
     "names",
     "offers",
@@ -114,6 +118,7 @@ __all__ = [
     "table_bytes",
     "take_steps",
     "tell",
+    "usual_budget",
     "view_gradients",
     "way_on",
     "with_steps",
@@ -137,15 +142,18 @@ _LATE: Final = {
     "TrainingFailedError": "training.failure",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
+    "counting_of": "training.schedules",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",
     "layered": "run.settings",
+    "merged": "run.settings",
     "model_of": "training.model",
     "open_run": "run.opening:opened",
     "panels_of": "run.results.panel_layout",
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
+    "usual_budget": "training.room",
     "view_gradients": "training.frozen",
 }
 

@@ -204,6 +204,11 @@ class RunConfig(BaseModel):
         description="Training rules: default, or inria (order of a step, 3-sigma footprint and "
         "near plane of the original code).",
     )
+    plan: Annotated[Literal["auto", "off"], Flag("auto|off", CONFIGURATION)] = Field(
+        "off",
+        description="auto: what the scene does not need is left out, on evidence that is shown; "
+        "what is set here wins. Default: off.",
+    )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",
         description="One backward pass per view, or one for all views. Default: separate.",

@@ -30,6 +30,8 @@ READER: Final = "colmap"
 PREPARING_READER: Final = "photos-alone"
 #: The operator that runs the links of `--operator a+b`.
 CHAIN: Final = "chain"
+#: The planner of `--plan auto`.
+PLANNER: Final = "scene"
 #: The observer that every run has.
 PROGRESS: Final = "progress"
 

@@ -62,6 +62,7 @@ from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.poses import footprint_of, radial_distances
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
@@ -88,7 +89,7 @@ from crossgrad_core.run.results.lines import (
     length_lines,
     progress_line,
 )
-from crossgrad_core.scene.bimodality import bimodality
+from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.input_files import is_file, open_file, read_file
 from crossgrad_core.system.terminal import shows_bar
@@ -101,6 +102,7 @@ __all__ = [
     "INPUT",
     "LOCAL",
     "NO_EDIT",
+    "ONE_MODE",
     "SHORTEST_ANCHOR_INTERVAL",
     "AfterStepContext",
     "AggregateContext",
@@ -184,6 +186,7 @@ __all__ = [
     "UserError",
     "View",
     "ViewCounts",
+    "ViewPlan",
     "ViewRecord",
     "Weighting",
     "apply_to_parameters",

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
 
@@ -52,7 +52,7 @@ class Entry:
 
     Attributes:
         name: Name that users type.
-        slot: Slot that it fills, or `commands`: a key of `OFFERED`.
+        slot: Slot that it fills, a key of `OFFERED`, or `planners`.
         value: Where its class is: `module:Class`.
         distribution: Name of the distribution that offers it.
         version: Version of that distribution.
@@ -215,7 +215,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     # One unfiltered call: each one scans every installed distribution.
     points = entry_points()
     found: dict[str, tuple[Entry, ...]] = {}
-    for slot, group in OFFERED.items():
+    for slot, group in {**OFFERED, PLANNERS: f"crossgrad.{PLANNERS}"}.items():
         described = (
             Entry(point.name, slot, point.value, *_identity(point.dist))
             for point in points.select(group=group)

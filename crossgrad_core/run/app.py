@@ -18,6 +18,7 @@ from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
 from crossgrad_core.run.opening import continued, parsed, set_up
+from crossgrad_core.run.planning import seconds_of
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
@@ -31,6 +32,7 @@ from crossgrad_core.run.results.folder import (
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
+from crossgrad_core.run.results.plan_file import write_plan
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
@@ -161,6 +163,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config, setup.notes)
+        write_plan(folder, setup.plan)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         with way_on(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
@@ -184,7 +187,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
     known_starts(setup)
-    return setup, load_seconds + _decoded(setup, way)
+    return setup, load_seconds + seconds_of(setup.plan) + _decoded(setup, way)
 
 
 def with_defaults(config: RunConfig) -> RunConfig:

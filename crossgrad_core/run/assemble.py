@@ -42,6 +42,7 @@ from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import LISTS
 from crossgrad_core.run.idle import idle_note
+from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
@@ -164,6 +165,10 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.
     """
+    plan = None
+    if config.plan == AUTO:
+        config, plan = planned(config, scene)
+        scene = replace(scene, notes=(*scene.notes, *notes_of(plan)))
     config = _with_first_degree(config)
     selection, notes = select(config, scene, reader)
     observers = {choice.name: _built(Observer, choice) for choice in config.observers}
@@ -186,6 +191,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=choose_device(config.device),
         notes=tuple(notes),
         scaled_photos=_photos(config),
+        plan=plan,
     )
     # The length of a run within a budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()

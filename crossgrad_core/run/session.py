@@ -24,6 +24,7 @@ from crossgrad_core.run.results.metrics_csv import (
 )
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.plan_file import read_plan
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.training.memory import peak_mebibytes
@@ -163,6 +164,7 @@ class Session:
             config=setup.config.model_dump(mode="json"),
             environment={**environment(str(setup.device)), **machine},
             notes=setup.notes,
+            plan=read_plan(self.folder),
             error=error,
         )
         write_summary(self.folder, summary)

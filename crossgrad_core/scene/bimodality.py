@@ -2,12 +2,18 @@
 
 from dataclasses import dataclass
 from math import sqrt
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+#: The coefficient of a uniform sample, cut off: what lies below has one mode.
+ONE_MODE: Final = 0.555
 #: Smallest sample with a finite-sample kurtosis.
 _SMALLEST = 4
+#: In smaller ones two equal points stay below a uniform law in the finite-sample form
+#: (docs/groupings.md).
+_SMALLEST_SAMPLE = 10
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,11 @@ class Bimodality:
     population: float
     size: int
     reason: str = ""
+
+    @property
+    def deciding(self) -> float:
+        """The form that decides: the finite-sample one, of small samples that of plain moments."""
+        return self.sample if self.size >= _SMALLEST_SAMPLE else self.population
 
 
 def bimodality(values: NDArray[np.float64]) -> Bimodality:

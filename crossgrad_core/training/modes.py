@@ -5,12 +5,7 @@ import numpy as np
 from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.defaults import SAMPLER
-from crossgrad_core.scene.bimodality import bimodality
-
-#: Sarle's coefficient of a uniform sample, cut off: what lies below has one mode.
-ONE_MODE = 0.555
-#: In smaller ones two equal points stay below that in the finite-sample form (docs/groupings.md).
-SMALLEST_SAMPLE = 10
+from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 
 
 def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
@@ -27,7 +22,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
     if quantity is None:
         return ()
     found = bimodality(quantity.values[np.isfinite(quantity.values)])
-    figure = found.sample if found.size >= SMALLEST_SAMPLE else found.population
+    figure = found.deciding
     # Not a number where all values are equal or there are too few: nothing can be said.
     if not figure < ONE_MODE:
         return ()

@@ -20,6 +20,7 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.contract.state import Json
 from crossgrad_core.scene.photos_ahead import PhotosAhead
 from crossgrad_core.training.operator_scale import OperatorScale
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
@@ -41,6 +42,7 @@ class Setup:
         notes: What was chosen or left out, and why.
         scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
         photos_ahead: The threads that decode photos beside the steps.
+        plan: What a planner decided and why, as plain data; None where none was asked.
         pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
 
@@ -55,6 +57,7 @@ class Setup:
     notes: tuple[str, ...]
     scaled_photos: ScaledPhotos | DevicePhotos
     photos_ahead: PhotosAhead = field(default_factory=PhotosAhead)
+    plan: Mapping[str, Json] | None = None
     pixel_share: float = 0.6
 
     @property

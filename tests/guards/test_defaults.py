@@ -8,7 +8,7 @@ from support.imports import CORE, ROOT
 
 from crossgrad_core import defaults
 from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import OFFERED
+from crossgrad_core.registry.slots import OFFERED, PLANNERS
 
 #: Names of plugins that are ordinary words as well: of a text, of a setting, of a library.
 WORDS = {
@@ -94,4 +94,4 @@ def test_a_name_would_be_found(source):
 def test_each_default_is_installed():
     own = {name: value for name, value in vars(defaults).items() if name.isupper()}
     for value in own.values():
-        assert set(value.split("+")) <= NAMES
+        assert set(value.split("+")) <= {*NAMES, *registry.entries(PLANNERS)}

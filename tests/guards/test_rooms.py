@@ -39,6 +39,7 @@ PLACES = {
     "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
     "crossgrad_plugins.compare": COMMAND_ROOMS,
     "crossgrad_plugins.diagnostics": COMMAND_ROOMS,
+    "crossgrad_plugins.planner": COMMAND_ROOMS,
     # Reads photos and their headers, which is what comes before a scene.
     "crossgrad_plugins.prepare": (*COMMAND_ROOMS, *READERS),
     "crossgrad_plugins.sweep": COMMAND_ROOMS,

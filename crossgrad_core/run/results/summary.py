@@ -41,6 +41,7 @@ class Summary:
         environment: Machine and versions.
         ply: What is in the PLY; None where none was written.
         notes: What was chosen or left out, and why.
+        plan: What a planner decided and on what evidence; None where none was asked.
         error: Why the run failed; None otherwise.
     """
 
@@ -54,6 +55,7 @@ class Summary:
     environment: "Mapping[str, Json]"
     ply: "Mapping[str, Json] | None" = None
     notes: Sequence[str] = ()
+    plan: "Mapping[str, Json] | None" = None
     error: str | None = None
 
 
@@ -117,6 +119,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
+        "plan": None if summary.plan is None else dict(summary.plan),
         "definitions": _definitions(summary.result),
         "environment": dict(summary.environment),
         "config": dict(summary.config),

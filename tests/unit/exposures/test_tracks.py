@@ -29,7 +29,7 @@ def observed(gains, points, per_photo, noise=0.1, seed=0):
     numbers = np.concatenate([np.sort(rng.choice(points, per_photo, replace=False)) for _ in gains])
     stops = gains[photos] + brightness[numbers] + rng.normal(0, noise, len(photos))
     stops += (rng.random(len(photos)) < 0.05) * rng.normal(3, 2, len(photos))
-    return Observations(photos, numbers, stops)
+    return Observations(photos, numbers, stops, np.arange(points))
 
 
 def test_planted_gains_are_found_among_outliers():
@@ -45,7 +45,7 @@ def test_a_long_chain_of_photos_is_solved_to_its_ends():
     planted = np.linspace(-3, 3, count)
     photos = np.repeat(np.arange(count), 10)
     points = (5 * np.repeat(np.arange(count), 10) + np.tile(np.arange(10), count)).astype(np.int64)
-    fit = fitted(Observations(photos, points, planted[photos]), count)
+    fit = fitted(Observations(photos, points, planted[photos], np.arange(points.max() + 1)), count)
     assert np.abs(fit.gains - planted).max() < 1e-3
 
 
@@ -56,6 +56,7 @@ def test_parts_that_share_no_point_have_a_mean_of_zero_each():
         np.concatenate([one.photos, other.photos + 2]),
         np.concatenate([one.points, other.points + 20]),
         np.concatenate([one.stops, other.stops]),
+        np.arange(40),
     )
     gains = fitted(joined, 4).gains
     assert gains[:2].mean() == pytest.approx(0.0, abs=0.05)
@@ -65,7 +66,7 @@ def test_parts_that_share_no_point_have_a_mean_of_zero_each():
 
 def test_without_observations_there_is_nothing_to_tell():
     none = np.zeros(0, dtype=np.int64)
-    fit = fitted(Observations(none, none, np.zeros(0)), 3)
+    fit = fitted(Observations(none, none, np.zeros(0), none), 3)
     assert fit.gains.tolist() == [0.0] * 3
     assert fit.reduction == 0.0
 

@@ -24,11 +24,13 @@ class Observations:
         photos: [O] position of the photo among those that were looked at.
         points: [O] numbers of the points, from 0 on without gaps.
         stops: [O] log2 of the brightness in linear light.
+        rows: [N] the row of each number among the points of the scene.
     """
 
     photos: NDArray[np.int64]
     points: NDArray[np.int64]
     stops: NDArray[np.float64]
+    rows: NDArray[np.int64]
 
     @property
     def count(self) -> int:
@@ -54,8 +56,8 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     # What is too dark or cut off in all photos but one tells nothing about that one.
     _, numbers, times = np.unique(rows, return_inverse=True, return_counts=True)
     kept = times[numbers] > 1
-    _, numbers = np.unique(rows[kept], return_inverse=True)
-    return Observations(photos[kept], numbers, stops[kept])
+    known, numbers = np.unique(rows[kept], return_inverse=True)
+    return Observations(photos[kept], numbers, stops[kept], known)
 
 
 def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:

@@ -1,0 +1,44 @@
+"""`--plan auto`: a planner decides settings by the scene, before a run is assembled."""
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import TypeAlias, cast
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.state import Json
+from crossgrad_core.defaults import PLANNER
+from crossgrad_core.registry.entries import find, resolve_entry
+from crossgrad_core.registry.slots import PLANNERS
+
+_LOG = logging.getLogger(__name__)
+#: What a planner decided, as plain data: `seconds` that it took, `notes` for the user, and
+#: `decisions`, whatever else it says of each.
+Plan: TypeAlias = Mapping[str, Json]
+#: A planner: the configuration, in which only what the user set is set, and the scene -> the
+#: configuration with its decisions, and the plan.
+Planner: TypeAlias = Callable[[RunConfig, Scene], tuple[RunConfig, Plan]]
+
+
+def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan]:
+    """The configuration with what the planner decided, which repeats the run without it.
+
+    Raises:
+        UserError: There is no planner, it cannot be imported, or a photo cannot be decoded.
+    """
+    _LOG.info("looking at what the scene needs")
+    planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
+    decided, plan = planner(config, scene)
+    return decided.model_copy(update={"plan": "off"}), plan
+
+
+def notes_of(plan: Plan) -> tuple[str, ...]:
+    """What the user should know of a plan."""
+    notes = plan.get("notes")
+    return tuple(map(str, notes)) if isinstance(notes, list) else ()
+
+
+def seconds_of(plan: Plan | None) -> float:
+    """How long it took to decide; 0 where nothing was."""
+    seconds = (plan or {}).get("seconds")
+    return float(seconds) if isinstance(seconds, int | float) else 0.0

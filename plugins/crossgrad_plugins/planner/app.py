@@ -1,0 +1,76 @@
+"""The command `crossgrad plan`."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from shlex import quote
+from shutil import get_terminal_size
+
+from crossgrad_core.commands import (
+    UserError,
+    check_file,
+    configured,
+    merged,
+    read_scene,
+    write_settings,
+)
+from crossgrad_plugins.planner.planner import Plan, plan_of
+from crossgrad_plugins.planner.terminal import lines_of
+
+#: Columns where nothing tells how many there are.
+_COLUMNS = 120
+
+
+def plan(
+    file: Path | None,
+    options: Mapping[str, object],
+    assignments: Sequence[str],
+    probe_seconds: float | None,
+    write: Path | None,
+) -> tuple[Plan, str | None]:
+    """What the scene calls for, and how to run it.
+
+    Args:
+        file: Configuration file of the run, or None.
+        options: Options of the run that the user gave; None stands for nothing.
+        assignments: `KEY=VALUE` texts.
+        probe_seconds: Training seconds of a probe, or None.
+        write: Where the run's settings go, or None.
+
+    Returns:
+        The plan, and the command that carries it out; None where nothing was written.
+
+    Raises:
+        UserError: The input is bad, or the file cannot be written; nothing was written.
+    """
+    if write is not None:
+        _check_free(write)
+    settings = merged(file, options, assignments)
+    config = configured(settings)
+    scene, _ = read_scene(config)
+    made = plan_of(config, scene, probe_seconds)
+    if write is None:
+        return made, None
+    whole = {"scene": str(config.scene), **made.applied_to(settings), "plan": "off"}
+    write_settings(write, whole)
+    return made, f"crossgrad run --config {quote(str(write))}"
+
+
+def show(made: Plan, way: str | None, *, as_json: bool) -> None:
+    """Prints a plan, and the command that carries it out."""
+    if as_json:
+        print(json.dumps(made.as_data(), indent=2, ensure_ascii=False))  # noqa: T201
+        return
+    for line in lines_of(made, get_terminal_size((_COLUMNS, 0)).columns):
+        print(line)  # noqa: T201 - the result of the command
+    print(way or "crossgrad run SCENE --plan auto decides the same and trains")  # noqa: T201
+
+
+def _check_free(file: Path) -> None:
+    if file.exists():
+        raise UserError(
+            "the file is there already",
+            where=f"--write {file}",
+            todo="choose another name, or remove it",
+        )
+    check_file(file)

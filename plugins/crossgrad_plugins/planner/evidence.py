@@ -1,0 +1,100 @@
+"""Figures that decisions rest on: from the scene, and from a probe where one may be taken."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel
+
+from crossgrad_core.commands import RunConfig
+from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewPlan, build_component
+from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.planner.probe import Probe
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The figures of a run to be; each is worked out when a decision asks for it.
+
+    Attributes:
+        config: The configuration, in which only what the user set is set.
+        scene: Its scene.
+        seconds: Training seconds of the probe; None where none may be taken.
+    """
+
+    config: RunConfig
+    scene: Scene
+    seconds: float | None = None
+
+    def is_given(self, *names: str) -> bool:
+        """Whether the user set any of these settings; None leaves one to the run.
+
+        Args:
+            names: Settings, such as `exposure`, `reading.init` or `backbone.sh_degree`.
+        """
+        known = _set_in(self.config, "") | _set_in(self.config.reading, "reading.")
+        known |= {f"backbone.{name}" for name in self.config.backbone.options}
+        return not known.isdisjoint(names)
+
+    @cached_property
+    def modes(self) -> Modes:
+        """The modes of the camera distances."""
+        return modes_of(self.scene)
+
+    @property
+    def grouping(self) -> str:
+        """The grouping that splits by the distances that were looked at."""
+        return "footprint" if self.modes.quantity == DEPTH else "radial"
+
+    @cached_property
+    def probe(self) -> "Probe | None":
+        """What a short training run shows; None where none may be taken."""
+        if self.seconds is None:
+            return None
+        from crossgrad_plugins.planner.probe import probed
+
+        return probed(self.config, self.seconds, self.grouping)
+
+    @cached_property
+    def view_plan(self) -> ViewPlan:
+        """How many views the steps have, without decisions on it."""
+        if self.config.view_plan is not None:
+            return self.config.view_plan
+        sampler = self.config.sampler
+        return ViewPlan((build_component(Sampler, sampler.name, sampler.options).usual_views,))
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """The numbers of views that steps have."""
+        return self.view_plan.counts
+
+    @cached_property
+    def backbone(self) -> Backbone:
+        """The backbone as it fits itself to the scene."""
+        choice = self.config.backbone
+        return build_component(Backbone, choice.name, choice.options).fitted_to(self.scene)[0]
+
+    @property
+    def degree(self) -> int | None:
+        """The highest degree of its spherical harmonics; None where none can be set."""
+        degree = self.backbone.model_dump().get("sh_degree")
+        return degree if isinstance(degree, int) else None
+
+    @cached_property
+    def steps(self) -> int | None:
+        """Length of the run in steps; None where it follows the clock."""
+        if self.config.max_views is not None:
+            return self.view_plan.steps_of(self.config.max_views)
+        return self.config.steps
+
+    def scene_note(self, word: str) -> str | None:
+        """What the reader noted with that word; None where it did not."""
+        return next((note for note in self.scene.notes if word in note), None)
+
+
+def _set_in(model: BaseModel, prefix: str) -> set[str]:
+    """Names of the settings of a group that have a value of the user's."""
+    given = model.model_fields_set
+    return {f"{prefix}{name}" for name in given if getattr(model, name) is not None}

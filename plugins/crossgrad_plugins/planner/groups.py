@@ -1,0 +1,137 @@
+"""Modes of the cameras, pairs of views, views per step, and the operator."""
+
+from math import isfinite, isnan
+from typing import Final
+
+from crossgrad_core.plugin import ONE_MODE
+from crossgrad_plugins.planner.decision import NOTHING, Decision, given
+from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, Modes
+
+#: sigma_b^2 / sigma_w^2 from which pairs pay: they take its share out of a step's variance.
+LEAST_RHO: Final = 0.1
+#: Conflict of gradients whose directions have nothing to do with each other.
+CHANCE: Final = 0.5
+
+_NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
+
+
+def modes(evidence: Evidence) -> Decision:
+    """How many modes the distances of the cameras have."""
+    found = evidence.modes
+    rule = (
+        f"two: bimodality >= {ONE_MODE} and far / near >= {LEAST_RATIO}, from {FEWEST} views on; "
+        f"one distance: range (95th / 5th percentile) < {LEAST_RATIO}"
+    )
+    source = "Sarle's coefficient, as in the paper; 0.555 is that of a uniform sample"
+    plain = Decision("modes", _name(found), "default", "", rule, source, "--grouping NAME")
+    figures = {
+        "bimodality": found.bimodality,
+        "bimodality_of_heights": found.height,
+        "far_over_near": found.ratio,
+        "range": found.spread,
+        "views": len(found.logs),
+    }
+    evidence_text = f"{_figures(found)} over {len(found.logs)} views, range {found.spread:.1f}"
+    return plain.found(evidence_text, decided=found.two or found.one, figures=figures)
+
+
+def pairs(evidence: Evidence) -> Decision:
+    """Whether steps draw pairs of near and far views."""
+    config, found = evidence.config, evidence.modes
+    part, usual = "pairs of views", config.sampler.name
+    if evidence.is_given("sampler", "grouping"):
+        return given(part, usual, "--sampler NAME")
+    rule = f"two modes, and sigma_b^2 / sigma_w^2 >= {LEAST_RHO} with its whole interval"
+    plain = Decision(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
+    if found.one:
+        return plain.found(f"one mode: {_figures(found)}", decided=True, saved="groups of views")
+    if not found.two:
+        return plain.found(f"modes undecided: {_figures(found)}")
+    return _pairs_of_two_modes(evidence, plain)
+
+
+def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
+    """Whether pairs pay, by the probe."""
+    probe = evidence.probe
+    if probe is None:
+        return plain.found(f"two modes; sigma_b^2 / sigma_w^2 is {_NOT_KNOWN}")
+    if probe.problem or not isfinite(probe.rho_low + probe.rho_high):
+        return plain.found(f"the probe tells nothing: {probe.problem or 'no variance'}")
+    figures = {"rho": probe.rho, "rho_low": probe.rho_low, "rho_high": probe.rho_high}
+    shown = f"sigma_b^2 / sigma_w^2 {probe.rho:.3f} [{probe.rho_low:.3f}, {probe.rho_high:.3f}]"
+    if probe.rho_low < LEAST_RHO:
+        decided = probe.rho_high < LEAST_RHO
+        saved = "groups of views" if decided else NOTHING
+        return plain.found(shown, decided=decided, saved=saved, figures=figures)
+    if any(count % 2 for count in evidence.counts):
+        return plain.found(f"{shown}; pairs need an even --views", figures=figures)
+    return plain.found(shown, figures=figures).changed(
+        f"near-far by {evidence.grouping}",
+        {"sampler": "near-far", "grouping": evidence.grouping},
+        f"--sampler {plain.choice}",
+        f"{probe.rho / (1.0 + probe.rho):.0%} of a step's gradient variance",
+    )
+
+
+def views_per_step(evidence: Evidence) -> Decision:
+    """How many views a step has."""
+    part, most = "views per step", max(evidence.counts)
+    if evidence.is_given("views_per_step"):
+        return given(part, evidence.config.views_per_step, "--views K")
+    rule = "1 where the gradient noise scale is below K: further views of a step add nothing"
+    source = "McCandlish et al. 2018, the simple noise scale"
+    plain = Decision(part, str(most), "default", "", rule, source, "--views K")
+    if evidence.is_given("sampler", "operator"):
+        return plain.found("as the sampler and operator that you set have it")
+    probe = evidence.probe
+    if probe is None:
+        return plain.found(f"the gradient noise scale is {_NOT_KNOWN}")
+    if probe.problem or isnan(probe.noise_scale):
+        return plain.found(f"the probe tells nothing: {probe.problem or 'no variance'}")
+    figures = {"noise_scale": probe.noise_scale}
+    shown = plain.found(
+        f"gradient noise scale {probe.noise_scale:.0f} views", decided=True, figures=figures
+    )
+    if probe.noise_scale >= most or "sampler" in pairs(evidence).settings:
+        return shown
+    saved = f"{most - 1} of {most} renders of a step"
+    return shown.changed("1", {"views_per_step": 1}, "--views K", saved)
+
+
+def operator(evidence: Evidence) -> Decision:
+    """Whether the views' gradients are kept apart, and how they are combined."""
+    part = "operator"
+    usual = "+".join(link.name for link in evidence.config.operators)
+    if evidence.is_given("operator"):
+        return given(part, usual, "--operator NAME")
+    rule = f"projects where pairs are drawn and conflict exceeds {CHANCE:.0%} with its interval"
+    source = "paper; half of random directions conflict"
+    plain = Decision(part, usual, "default", "", rule, source, "--operator NAME")
+    apart = "gradients of each view kept apart"
+    if evidence.modes.one:
+        return plain.found("one mode: no near and far to conflict", decided=True, saved=apart)
+    probe = evidence.probe
+    if probe is None:
+        return plain.found(f"conflict of near and far gradients is {_NOT_KNOWN}")
+    if probe.problem or not isfinite(probe.conflict):
+        return plain.found(f"the probe tells nothing: {probe.problem or 'no pairs'}")
+    figures = {"conflict": probe.conflict, "conflict_low": probe.conflict_low}
+    shown = f"{probe.conflict:.0%} of near-far pairs conflict, at least {probe.conflict_low:.0%}"
+    if probe.conflict_low > CHANCE and "sampler" in pairs(evidence).settings:
+        made = plain.found(shown, figures=figures)
+        return made.changed("symmetric", {"operator": "symmetric"}, f"--operator {usual}")
+    return plain.found(shown, decided=True, saved=apart, figures=figures)
+
+
+def _name(found: Modes) -> str:
+    if found.two:
+        return "two modes"
+    if not found.one:
+        return "undecided"
+    return "one mode, one distance" if found.spread < LEAST_RATIO else "one mode, continuous"
+
+
+def _figures(found: Modes) -> str:
+    shown = "undefined" if isnan(found.bimodality) else f"{found.bimodality:.2f}"
+    return f"bimodality of {found.quantity} {shown}, far / near {found.ratio:.1f}"

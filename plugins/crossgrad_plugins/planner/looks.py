@@ -1,0 +1,117 @@
+"""Exposure, degree of spherical harmonics, and the filter of scale."""
+
+from math import isnan
+from typing import Final
+
+from crossgrad_plugins.planner.decision import Decision, given
+from crossgrad_plugins.planner.evidence import Evidence
+
+#: Share of the variance of tracks that a view dependence worth its cost explains.
+LEAST_SHARE: Final = 0.02
+#: Numbers of a Gaussian without higher bands: position, shape, opacity, colour.
+_OTHER_NUMBERS: Final = 14
+#: Range of footprints below which all photos show the scene at one scale: an octave.
+ONE_SCALE: Final = 2.0
+
+
+def exposure(evidence: Evidence) -> Decision:
+    """Whether photos get an exposure each."""
+    part, usual = "exposure", evidence.config.exposure.name
+    if evidence.is_given("exposure", "exposure_from"):
+        return given(part, usual, "--exposure NAME")
+    from crossgrad_plugins.exposures.tracks.gains import (
+        LEAST_REDUCTION,
+        LEAST_SPREAD,
+        training_gains,
+    )
+
+    rule = f"gain from {LEAST_SPREAD} stops and {LEAST_REDUCTION:.0%} less deviation on"
+    plain = Decision(
+        part, usual, "default", "", rule, "docs/exposure.md, six scenes", "--exposure gain"
+    )
+    if not any(len(view.seen) for view in evidence.scene.train_views):
+        return plain.found("no SfM tracks tell how bright photos are beside each other")
+    gains = training_gains(evidence.scene)
+    photos = int(gains.known.sum())
+    if not photos:
+        return plain.found(gains.evidence)
+    figures = {"spread_stops": gains.spread, "reduction": gains.fit.reduction, "photos": photos}
+    shown = plain.found(
+        f"gains of {photos} photos: {gains.spread:.2f} stops standard deviation, "
+        f"{gains.fit.reduction:.0%} off the deviation of tracks",
+        decided=True,
+        saved="a gain and its step per photo",
+        figures=figures,
+    )
+    if not gains.differ:
+        return shown
+    return shown.changed("gain", {"exposure": "gain"}, "--exposure none")
+
+
+def degree(evidence: Evidence) -> Decision:
+    """Up to which degree colours depend on the direction."""
+    part, config = "SH degree", evidence.config
+    name = config.backbone.name
+    if evidence.is_given("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "reading.init"):
+        chosen = config.backbone.options.get("sh_degree", "as you start it")
+        return given(part, chosen, "--set backbone.sh_degree=N")
+    rule = f"0 where degree 1 explains less than {LEAST_SHARE:.0%} of tracks, its whole interval"
+    source = "ours: leave one out over the directions of a track, exposure taken out"
+    force = "--set backbone.sh_degree=N"
+    usual = "as the backbone has it" if evidence.degree is None else str(evidence.degree)
+    plain = Decision(part, usual, "default", "", rule, source, force)
+    if evidence.degree is None:
+        return plain.found(f"backbone {name} has no degree to set")
+    if evidence.degree == 0:
+        return plain.found("too few views for more", decided=True)
+    if not any(len(view.seen) for view in evidence.scene.train_views):
+        return plain.found("no SfM tracks tell how colours depend on the direction")
+    return _of_tracks(evidence, plain)
+
+
+def _of_tracks(evidence: Evidence, plain: Decision) -> Decision:
+    """The degree by the view dependence of the tracks."""
+    from crossgrad_plugins.planner.view_dependence import (
+        FEWEST_TRACKS,
+        LEAST_OBSERVATIONS,
+        LEAST_RADIUS,
+        view_dependence,
+    )
+
+    found = view_dependence(evidence.scene)
+    figures = {"tracks": found.tracks, "share": found.share, "low": found.low, "high": found.high}
+    if found.tracks < FEWEST_TRACKS or isnan(found.share):
+        return plain.found(
+            f"{found.tracks} tracks with {LEAST_OBSERVATIONS} views over {LEAST_RADIUS:.0f} "
+            f"degrees or more; {FEWEST_TRACKS} are needed",
+            figures=figures,
+        )
+    shown = (
+        f"degree 1 explains {found.share:.0%} [{found.low:.0%}, {found.high:.0%}] of the "
+        f"brightness of {found.tracks} tracks"
+    )
+    if found.high >= LEAST_SHARE:
+        return plain.found(shown, decided=found.low >= LEAST_SHARE, figures=figures)
+    bands = 3 * ((1 + (evidence.degree or 0)) ** 2 - 1)
+    saved = f"{bands} of {_OTHER_NUMBERS + bands} numbers of a Gaussian"
+    made = plain.found(shown, figures=figures)
+    return made.changed("0", {"backbone.sh_degree": 0}, "--set backbone.sh_degree=3", saved)
+
+
+def scale_filter(evidence: Evidence) -> Decision:
+    """Whether Gaussians are filtered to the sampling of the photos."""
+    part, name = "scale filter", evidence.config.backbone.name
+    if evidence.is_given("backbone"):
+        return given(part, f"as backbone {name} has it", "--backbone mip")
+    spread = evidence.modes.spread
+    rule = f"none where footprints range over less than {ONE_SCALE:g}"
+    plain = Decision(part, "none", "default", "", rule, "Mip-Splatting's zoom", "--backbone mip")
+    figures = {"range": spread}
+    if spread < ONE_SCALE:
+        return plain.found(
+            f"footprints range over {spread:.1f}", decided=True, saved="the filter", figures=figures
+        )
+    return plain.found(
+        f"footprints range over {spread:.1f}; what a filter gains there is not measured",
+        figures=figures,
+    )

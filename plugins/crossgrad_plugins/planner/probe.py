@@ -1,0 +1,66 @@
+"""A short training run that measures gradients: what cameras and photos cannot tell."""
+
+from dataclasses import dataclass
+from math import nan, sqrt
+from typing import Final, cast
+
+from crossgrad_core.commands import RunConfig, TrainingFailedError, UserError
+from crossgrad_plugins.diagnostics.command import Options, diagnose_scene
+from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
+
+#: The optimizer sees gradients in Adam's metric.
+_METRIC: Final = "adam"
+#: Standard errors of a 95 % interval.
+_WIDE: Final = 1.96
+
+
+@dataclass(frozen=True)
+class Probe:
+    """The gradients of single views at the end of a short run, in Adam's metric over all blocks.
+
+    Attributes:
+        rho: sigma_b^2 / sigma_w^2, between and within near and far views.
+        rho_low: Lower end of its 95 % interval.
+        rho_high: The upper one.
+        noise_scale: How many views a step could use.
+        conflict: Share of the near-far pairs whose gradients conflict.
+        conflict_low: Lower end of its 95 % interval, the views of the smaller group taken as the
+            independent ones.
+        problem: Why there are no figures; empty where there are.
+    """
+
+    rho: float = nan
+    rho_low: float = nan
+    rho_high: float = nan
+    noise_scale: float = nan
+    conflict: float = nan
+    conflict_low: float = nan
+    problem: str = ""
+
+
+def probed(config: RunConfig, seconds: float, grouping: str) -> Probe:
+    """The figures of a vanilla run of so many training seconds.
+
+    Args:
+        config: The configuration, with a scene; components are replaced.
+        seconds: Training seconds.
+        grouping: Which views are near and far.
+    """
+    length = {"steps": None, "max_views": None, "seconds": seconds, "plan": "off"}
+    options = Options(grouping=grouping, probes=1, seconds=seconds, seed=config.seed)
+    try:
+        report = diagnose_scene(config.model_copy(update=length), options)
+    except (UserError, TrainingFailedError) as error:
+        return Probe(problem=error.what if isinstance(error, UserError) else str(error))
+    whole = [row for row in rows_of(report.probes, _METRIC) if row["block"] == ALL]
+    return _of_row(whole[-1]) if whole else Probe(problem=report.failure or "no step was taken")
+
+
+def _of_row(row: Row) -> Probe:
+    rate = cast("float", row["conflict_rate"])
+    views = min(cast("int", row["near_views"]), cast("int", row["far_views"]))
+    rho, low, high, noise = (
+        cast("float", row[name]) for name in ("rho", "rho_low", "rho_high", "noise_scale")
+    )
+    lowest = rate - _WIDE * sqrt(0.25 / views)
+    return Probe(rho, low, high, noise, rate, lowest)

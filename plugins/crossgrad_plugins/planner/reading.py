@@ -1,0 +1,98 @@
+"""Where training starts, and what reading the photos has decided: lenses, masks, background."""
+
+import re
+from typing import Final
+
+from crossgrad_plugins.planner.decision import Decision, given
+from crossgrad_plugins.planner.evidence import Evidence
+
+#: A photo shares points with no other one.
+_ONE_PHOTO: Final = 1
+#: How a reader notes the colour behind photos with transparency.
+_BLENDED: Final = re.compile(r"blended over RGB \(([\d.]+), ([\d.]+), ([\d.]+)\)")
+
+
+def start(evidence: Evidence) -> Decision:
+    """Where training starts."""
+    part, config = "start", evidence.config
+    if evidence.is_given("start", "reading.init"):
+        chosen = config.start.name if config.start else config.reading.init
+        return given(part, chosen, "--start NAME or --init")
+    points, views = len(evidence.scene.points), len(evidence.scene.train_views)
+    figures = {"points": points, "views": views}
+    plain = Decision(
+        part,
+        "as a run starts",
+        "default",
+        "",
+        "points found in photos where there are none; random ones for a single photo",
+        "docs/starts.md",
+        "--start NAME or --init random",
+    )
+    if points:
+        return plain.found(f"{points:,} SfM points", figures=figures)
+    shown = plain.found(f"no SfM points, {views} training photos", figures=figures)
+    if views > _ONE_PHOTO:
+        return shown.changed("triangulated", {"start": "triangulated"}, "--init random")
+    return shown.changed("random points", {"reading.init": "random"}, "--init FILE.ply")
+
+
+def undistortion(evidence: Evidence) -> Decision:
+    """Whether photos are undistorted."""
+    note = evidence.scene_note("undistorted")
+    plain = Decision(
+        "undistortion",
+        "photos are undistorted" if note else "none",
+        "default",
+        "",
+        "where the camera model is no pinhole",
+        "the scene's cameras",
+        "undistorted photos",
+    )
+    if note:
+        return plain.found(note.removeprefix("photos: "), decided=True)
+    return plain.found("all cameras are pinholes", decided=True, saved="a resampling of each photo")
+
+
+def masks(evidence: Evidence) -> Decision:
+    """Whether pixels are masked."""
+    part = "masks"
+    if evidence.is_given("reading.masks"):
+        return given(part, evidence.config.reading.masks, "--set reading.masks=FOLDER")
+    note = evidence.scene_note("masks: ") or evidence.scene_note("does not count")
+    plain = Decision(
+        part,
+        "masked pixels do not count" if note else "none",
+        "default",
+        "",
+        "where the scene has masks, or photos transparency",
+        "the scene's folder",
+        "--set reading.masks=FOLDER",
+    )
+    if note:
+        return plain.found(note, decided=True)
+    return plain.found("no photo has a mask", decided=True, saved="weights of pixels")
+
+
+def background(evidence: Evidence) -> Decision:
+    """What is drawn behind the scene."""
+    part, usual = "background", evidence.config.background
+    if evidence.is_given("background"):
+        return given(part, usual, "--background COLOR")
+    plain = Decision(
+        part,
+        usual,
+        "default",
+        "",
+        "the colour that transparent photos were blended over, else black, as viewers draw",
+        "docs/starts.md; docs/readers.md",
+        "--background COLOR",
+    )
+    note = evidence.scene_note("blended over RGB")
+    found = _BLENDED.search(note) if note else None
+    if note is None or found is None:
+        return plain.found("no photo is transparent", decided=True)
+    color = ",".join(f"{float(level):g}" for level in found.groups())
+    name = {"0,0,0": "black", "1,1,1": "white"}.get(color, color)
+    shown = plain.found(note.removeprefix("photos: "), decided=True)
+    return shown if name == usual else shown.changed(name, {"background": name}, "--background C")

@@ -1,0 +1,120 @@
+"""Resolution and its schedule, number of primitives, length, and density control."""
+
+from dataclasses import replace
+from typing import Final
+
+from crossgrad_core.commands import counting_of, usual_budget
+from crossgrad_core.plugin import Resolution, Schedule, build_component
+from crossgrad_plugins.planner.decision import Decision, given
+from crossgrad_plugins.planner.evidence import Evidence
+
+#: Share of a step's time that goes with its pixels, as docs/resolutions.md has it.
+_OF_PIXELS: Final = 0.6
+#: Photos whose spectra are looked at, at most, spread over all.
+_PHOTOS: Final = 8
+#: A budget of more primitives is none.
+_NO_BOUND: Final = 2**31
+
+
+def resolution(evidence: Evidence) -> Decision:
+    """At which sizes steps render."""
+    part, usual = "resolution", evidence.config.resolution.name
+    if evidence.is_given("resolution"):
+        return given(part, usual, "--resolution NAME")
+    from crossgrad_plugins.resolutions.spectral import Spectral
+
+    train = evidence.scene.train
+    part_of_it = replace(evidence.scene, train=train[:: -(-len(train) // _PHOTOS) or 1])
+    found = build_component(Resolution, "spectral", {}).fitted_to(part_of_it)
+    courses = found.courses if isinstance(found, Spectral) else None
+    pixels = sum(
+        each.photos * sum(scale**2 for scale in each.scales or (1.0,)) / len(each.scales or (1.0,))
+        for each in (courses or {}).values()
+    )
+    pixels /= max(1, len(part_of_it.train))
+    return Decision(
+        part,
+        usual,
+        "default",
+        f"small photos first would render {pixels:.0%} of the pixels up to the end of density "
+        f"control, about {_OF_PIXELS * (1.0 - pixels):.0%} less time there; not measured here",
+        "full until small photos first are measured to lose nothing",
+        "DashGaussian: 46 % less time, published",
+        "--resolution spectral",
+        figures={"share_of_pixels": pixels},
+    )
+
+
+def count(evidence: Evidence) -> Decision:
+    """How many primitives there may be."""
+    part, config = "primitives", evidence.config
+    if evidence.is_given("max_gaussians", "growth"):
+        return given(part, config.max_gaussians or config.growth, "--max-gaussians N")
+    points, steps = len(evidence.scene.points), evidence.steps
+    plain = Decision(
+        part,
+        "as suits the length",
+        "default",
+        "",
+        "30,000 or the start's, more in longer runs; no bound from 30,000 views on",
+        "docs/schedules.md (Taming 3DGS, metal-gauss)",
+        "--max-gaussians N",
+    )
+    if steps is None:
+        return plain.found(f"{points:,} points; the length follows the clock")
+    views = steps * max(evidence.counts)
+    budget = usual_budget(points, views)
+    shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
+    return plain.found(
+        f"{points:,} points, {views:,} views: {shown}", figures={"points": points, "views": views}
+    )
+
+
+def length(evidence: Evidence) -> Decision:
+    """How long the run is."""
+    config, views = evidence.config, len(evidence.scene.train_views)
+    if config.seconds is not None:
+        choice = f"{config.seconds:g} s"
+    elif config.max_views is not None:
+        choice = f"{config.max_views:,} views"
+    else:
+        choice = f"{config.steps or 0:,} steps"
+    return Decision(
+        "length",
+        choice,
+        "default",
+        f"{views} training photos; where more time stops to pay is not known of this scene",
+        "as long as you ask for",
+        "no measurement",
+        "--seconds S or --steps N",
+    )
+
+
+def densifier(evidence: Evidence) -> Decision:
+    """Whether there is density control."""
+    part, config = "densifier", evidence.config
+    named = config.densifier
+    usual = evidence.backbone.default_densifier if named is None else named.name
+    if evidence.is_given("densifier", "backbone"):
+        return given(part, usual, "--densifier NAME")
+    rule = "none where the schedule has no edit: the run is over before the first transient is"
+    plain = Decision(part, usual, "default", "", rule, "docs/schedules.md", "--densifier NAME")
+    steps = evidence.steps
+    if not steps:
+        return plain.found("the length follows the clock, and edits follow the length")
+    if evidence.is_given(*_EDITS):
+        return plain.found("edits are as you set them")
+    counting = counting_of(config, evidence.view_plan, len(evidence.scene.train_views))
+    edits = Schedule.for_run(steps, config.schedule, counting).edits()
+    shown = plain.found(f"{edits} edits in {steps:,} steps", decided=True, figures={"edits": edits})
+    if edits:
+        return shown
+    saved = "its screen statistics, and its module"
+    return shown.changed("none", {"densifier": "none"}, f"--densifier {usual}", saved)
+
+
+#: Settings that only make sense with density control.
+_EDITS: Final = (
+    *("densify_from", "densify_until", "densify_every", "fewest_edits", "reset_every"),
+    *("density_views", "max_gaussians", "growth"),
+)

@@ -1,0 +1,171 @@
+"""`crossgrad plan` and `--plan auto`: the table, and runs without what is left out."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.commands import ended
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.system.yaml_values import read_mapping
+
+FEW = ("--steps", 4, "--threads", 1, "--rasterizer", "torch", "-q")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("scene"), views=8, points=120)
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def settings(folder):
+    return read_mapping(folder / "config.yaml", "a configuration", "repair it")
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A planned run that stopped half-way and was gone on with."""
+    out = tmp_path_factory.mktemp("runs") / "planned"
+    assert ended("run", scene, *FEW, "--plan", "auto", "--stop-after", 2, "--out", out) == 0
+    assert ended("run", "--resume", out, "-q") == 0
+    return out
+
+
+def test_the_table(scene, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert ended("plan", scene, "--set", "exposure=gain") == 0
+    out = capsys.readouterr().out
+    assert "gain (yours)" in out
+    assert "cost saved" in out
+    assert max(map(len, out.splitlines())) <= 120
+
+
+def test_json_has_every_figure(scene, capsys):
+    assert ended("plan", scene, "--json", "--steps", 4) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["settings"] == {"densifier": "none"}
+    parts = {each["part"]: each for each in plan["decisions"]}
+    assert set(parts["modes"]["figures"]) == {
+        *("bimodality", "bimodality_of_heights", "far_over_near", "range", "views")
+    }
+    assert all(each["rule"] and each["source"] for each in parts.values())
+
+
+def test_a_plan_that_is_written_down_is_a_run_s(scene, tmp_path, trained):
+    file, out = tmp_path / "plan.yaml", tmp_path / "run"
+    assert ended("plan", scene, "--steps", 4, "--write", file) == 0
+    assert ended("run", "--config", file, *FEW[2:], "--out", out) == 0
+    known = settings(trained)
+    assert {name: value for name, value in settings(out).items() if name != "notes"} == {
+        name: value for name, value in known.items() if name != "notes"
+    } | {"stop_after": None}
+
+
+def test_the_summary_tells_the_plan(trained):
+    plan = summary(trained)["plan"]
+    assert plan["settings"] == {"densifier": "none"}
+    assert plan["seconds"] >= sum(each["seconds"] for each in plan["decisions"]) - 0.1
+    assert [each for each in summary(trained)["notes"] if each.startswith("plan: densifier")]
+
+
+def test_the_configuration_repeats_the_run_without_the_planner(trained, tmp_path):
+    known, again = settings(trained), tmp_path / "again"
+    assert known["plan"] == "off"
+    assert known["densifier"] == {"name": "none"}
+    file = trained / "config.yaml"
+    assert ended("run", "--config", file, "--set", "stop_after=null", "-q", "--out", again) == 0
+    assert (again / "point_cloud.ply").read_bytes() == (trained / "point_cloud.ply").read_bytes()
+    assert summary(again)["plan"] is None
+
+
+def test_what_the_user_set_wins(scene, tmp_path):
+    out = tmp_path / "run"
+    given = ("--densifier", "adc", "--exposure", "gain")
+    assert ended("run", scene, *FEW, "--plan", "auto", *given, "--out", out) == 0
+    assert settings(out)["densifier"]["name"] == "adc"
+    assert settings(out)["exposure"]["name"] == "gain"
+    plan = summary(out)["plan"]
+    basis = {each["part"]: each["basis"] for each in plan["decisions"]}
+    assert basis["densifier"] == basis["exposure"] == "given"
+    assert plan["settings"] == {}
+
+
+def test_a_scene_without_points_gets_some(scene, tmp_path, capsys):
+    bare = tmp_path / "bare"
+    write_tiny_scene(bare, views=8, points=0)
+    assert ended("plan", bare) == 0
+    assert "triangulated" in capsys.readouterr().out
+
+
+def test_a_single_photo_trains(tmp_path):
+    write_tiny_scene(tmp_path / "one", views=1, points=0)
+    out = tmp_path / "run"
+    assert ended("run", tmp_path / "one", *FEW, "--plan", "auto", "--out", out) == 0
+    assert settings(out)["reading"]["init"] == "random"
+
+
+def test_nothing_is_overwritten_and_bad_input_writes_nothing(scene, tmp_path, capsys):
+    file = tmp_path / "plan.yaml"
+    assert ended("plan", tmp_path / "nothing", "--write", file) == 2
+    assert not file.exists()
+    file.write_text("mine")
+    assert ended("plan", scene, "--write", file) == 2
+    assert file.read_text() == "mine"
+    assert "there already" in capsys.readouterr().err
+
+
+_LOADED = """
+import sys
+from crossgrad_core.cli.main import main
+try:
+    main(sys.argv[1:])
+finally:
+    print("\\n".join(sorted(name for name in sys.modules if name.startswith("crossgrad_"))))
+"""
+#: What a run of one mode, even exposure and no room for edits does not need.
+LEFT_OUT = (
+    *("densifiers.adc", "samplers.near_far", "groupings.radial", "groupings.footprint"),
+    *("exposures.gain", "exposures.per_photo", "diagnostics", "planner.probe"),
+)
+
+
+def test_what_is_left_out_is_not_imported(scene, tmp_path):
+    out = tmp_path / "run"
+    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--plan", "auto", "--out", out]
+    done = subprocess.run(
+        list(map(str, arguments)), capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = done.stdout.splitlines()
+    assert "crossgrad_plugins.planner.planner" in loaded
+    assert "crossgrad_plugins.densifiers.none" in loaded
+    for name in LEFT_OUT:
+        assert f"crossgrad_plugins.{name}" not in loaded
+
+
+def test_bands_that_are_left_out_are_not_allocated(scene, tmp_path, monkeypatch):
+    from crossgrad_plugins.planner import view_dependence as measured
+
+    matte = measured.ViewDependence(500, -0.02, -0.03, -0.01)
+    monkeypatch.setattr(measured, "view_dependence", lambda scene: matte)
+    out = tmp_path / "run"
+    assert ended("run", scene, *FEW, "--plan", "auto", "--out", out) == 0
+    assert settings(out)["backbone"]["sh_degree"] == 0
+    checkpoint = next(Path(out).glob("checkpoints/*"))
+    names = b"".join(each.read_bytes()[:4096] for each in checkpoint.glob("*.safetensors"))
+    assert b"f_dc" in names
+    assert b"f_rest" not in names
+
+
+def test_without_a_plan_the_planner_is_not_imported(scene, tmp_path):
+    out = tmp_path / "run"
+    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
+    done = subprocess.run(list(map(str, arguments)), capture_output=True, text=True, check=True)
+    assert not [name for name in done.stdout.splitlines() if ".planner" in name]
+    assert summary(out)["plan"] is None
+    assert not (out / "plan.json").exists()

@@ -1,0 +1,350 @@
+"""What the planner decides, on which evidence: scenes that were measured, and made-up ones."""
+
+import csv
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crossgrad_core.commands import configured, layered, read_scene
+from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.exposures.tracks import gains as tracks
+from crossgrad_plugins.exposures.tracks.fit import Fit
+from crossgrad_plugins.exposures.tracks.gains import TrackGains
+from crossgrad_plugins.planner import groups, looks
+from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.modes import Modes
+from crossgrad_plugins.planner.planner import PARTS, plan_of, planned
+from crossgrad_plugins.planner.probe import Probe
+from crossgrad_plugins.planner.terminal import lines_of
+
+#: A folder with scenes of these names, where there is one.
+SCENES = Path(os.environ.get("CROSSGRAD_SCENES", "no-such-folder"))
+#: Scene -> modes, bimodality, far / near, range; the spread of gains in stops, what they take off
+#: the deviation, and the exposure. Measured on all training photos at full size (2026-11-23).
+MEASURED = {
+    "city_hybrid": ("two modes", 0.690, 4.63, 10.49, 0.063, -0.022, "none"),
+    "city_unimodal": ("one mode, continuous", 0.474, 2.94, 8.80, 0.040, -0.029, "none"),
+    "boruszyn_kap": ("one mode, continuous", 0.350, 1.64, 3.53, 0.398, 0.426, "gain"),
+    "ochota_kap_hybrid": ("two modes", 0.748, 2.14, 2.61, 1.456, 0.605, "gain"),
+    "ochota_kap_hybrid_gain": ("two modes", 0.748, 2.14, 2.61, 0.094, 0.040, "none"),
+    "brighton_beach": ("one mode, one distance", 0.436, 1.03, 1.05, 0.433, 0.589, "gain"),
+}
+TABLE = Path(__file__).with_name("log_distances.csv")
+PARTS_OF_THE_TABLE = [
+    *("modes", "pairs of views", "views per step", "operator", "exposure", "SH degree"),
+    *("scale filter", "resolution", "primitives", "length", "densifier", "start"),
+    *("undistortion", "masks", "background"),
+]
+
+
+def log_distances(name):
+    """The logarithms of depth over focal length of the training views, as they were measured."""
+    with TABLE.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    # The copy with other brightness has the same cameras.
+    own = name.removesuffix("_gain")
+    return np.array([float(row["log_distance"]) for row in rows if row["scene"] == own])
+
+
+def config_of(**given):
+    return configured({"scene": "nowhere", **given})
+
+
+def evidence_of(name, probe=None, **given):
+    """The evidence of a scene that was measured, by its table."""
+    evidence = Evidence(config_of(**given), posed_scene([]))
+    vars(evidence)["modes"] = Modes("depth over focal length", log_distances(name), np.nan)
+    vars(evidence)["probe"] = probe
+    return evidence
+
+
+def plan_for(scene, **given):
+    return plan_of(config_of(**given), scene)
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_modes_as_measured(name):
+    choice, bimodality, ratio, spread, *_ = MEASURED[name]
+    found = groups.modes(evidence_of(name))
+    assert found.choice == choice
+    assert found.basis == "decided"
+    assert found.figures["bimodality"] == pytest.approx(bimodality, abs=0.002)
+    assert found.figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
+    assert found.figures["range"] == pytest.approx(spread, rel=0.01)
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_exposure_as_measured(name, monkeypatch):
+    *_, spread, reduction, choice = MEASURED[name]
+    fit = Fit(np.array([-spread, spread]), 1.0, 1.0 - reduction)
+    measured = TrackGains(fit.gains, np.array([99, 99]), fit)
+    monkeypatch.setattr(tracks, "training_gains", lambda scene: measured)
+    scene = posed_scene([posed_view((0, 0, 0), seen=[0])], [(0, 1, 0)])
+    found = looks.exposure(Evidence(config_of(), scene))
+    assert (found.choice, found.basis) == (choice, "decided")
+    assert found.figures["spread_stops"] == pytest.approx(spread)
+    assert found.figures["reduction"] == pytest.approx(reduction)
+    assert dict(found.settings) == ({"exposure": "gain"} if choice == "gain" else {})
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_the_scenes_themselves(name):
+    if not (SCENES / name).is_dir():
+        pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
+    config = configured({"scene": str(SCENES / name)})
+    plan = plan_of(config, read_scene(config)[0])
+    choice, bimodality, ratio, spread, *_, exposure = MEASURED[name]
+    figures = plan.of_part("modes").figures
+    assert plan.of_part("modes").choice == choice
+    assert plan.of_part("exposure").choice == exposure
+    assert figures["bimodality"] == pytest.approx(bimodality, abs=0.002)
+    assert figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
+    assert figures["range"] == pytest.approx(spread, rel=0.01)
+    assert plan.seconds < 20.0
+
+
+@pytest.fixture(scope="module")
+def bundled():
+    config = configured({"scene": str(bundled_scene()), "reading": {"max_size": 100}})
+    return config, read_scene(config)[0]
+
+
+def test_the_bundled_scene(bundled):
+    plan = plan_of(*bundled)
+    assert [each.part for each in plan.decisions] == PARTS_OF_THE_TABLE
+    assert plan.of_part("modes").choice == "one mode, continuous"
+    assert plan.of_part("pairs of views").basis == "decided"
+    assert plan.of_part("exposure").choice == "gain"
+    assert plan.settings == {"exposure": "gain"}
+    assert plan.seconds == pytest.approx(sum(each.seconds for each in plan.decisions), abs=0.1)
+
+
+def test_what_the_user_set_stays_and_the_table_says_so(bundled):
+    config, scene = bundled
+    mine = config.model_copy(update={"exposure": config.exposure})
+    plan = plan_of(mine, scene)
+    assert plan.of_part("exposure").basis == "given"
+    assert plan.of_part("exposure").choice == "none"
+    decided, _ = planned(mine, scene)
+    assert decided == mine
+
+
+def test_decisions_become_settings(bundled):
+    config, scene = bundled
+    decided, plan = planned(config, scene)
+    assert decided.exposure.name == "gain"
+    assert decided.model_copy(update={"exposure": config.exposure}) == config
+    assert json.loads(json.dumps(plan)) == plan
+
+
+def test_pairs_need_the_probe():
+    found = groups.pairs(evidence_of("city_hybrid"))
+    assert found.basis == "default"
+    assert "--probe" in found.evidence
+    assert not found.settings
+
+
+@pytest.mark.parametrize(
+    ("low", "rho", "high", "status", "changes"),
+    [
+        (0.2, 0.5, 0.9, "decided", {"sampler": "near-far", "grouping": "footprint"}),
+        (0.0, 0.02, 0.04, "decided", {}),
+        (0.0, 0.2, 0.6, "default", {}),
+        (np.nan, np.nan, np.nan, "default", {}),
+    ],
+)
+def test_pairs_by_the_whole_interval(low, rho, high, status, changes):
+    probe = Probe(rho=rho, rho_low=low, rho_high=high, noise_scale=50.0, conflict=0.5)
+    found = groups.pairs(evidence_of("city_hybrid", probe))
+    assert found.basis == status
+    assert dict(found.settings) == changes
+    assert not groups.pairs(evidence_of("city_unimodal", probe)).settings
+
+
+def test_pairs_are_not_drawn_by_an_odd_number_of_views():
+    probe = Probe(rho=0.5, rho_low=0.2, rho_high=0.9)
+    found = groups.pairs(evidence_of("city_hybrid", probe, views_per_step=3))
+    assert not found.settings
+    assert "even" in found.evidence
+
+
+@pytest.mark.parametrize(
+    ("noise", "choice"), [(0.4, "1"), (1.99, "1"), (2.0, "2"), (640.0, "2"), (np.inf, "2")]
+)
+def test_views_by_the_noise_of_gradients(noise, choice):
+    probe = Probe(noise_scale=noise, rho=0.0, rho_low=0.0, rho_high=0.0)
+    found = groups.views_per_step(evidence_of("city_unimodal", probe))
+    assert (found.choice, found.basis) == (choice, "decided")
+    assert dict(found.settings) == ({} if choice == "2" else {"views_per_step": 1})
+
+
+@pytest.mark.parametrize(
+    ("conflict_low", "rho_low", "choice"),
+    [(0.6, 0.2, "symmetric"), (0.45, 0.2, "sum"), (0.6, 0.0, "sum")],
+)
+def test_projection_needs_conflict_beyond_chance_and_pairs(conflict_low, rho_low, choice):
+    probe = Probe(rho=0.5, rho_low=rho_low, rho_high=0.9, conflict=0.7, conflict_low=conflict_low)
+    assert groups.operator(evidence_of("city_hybrid", probe)).choice == choice
+    assert groups.operator(evidence_of("city_unimodal", probe)).choice == "sum"
+
+
+def test_a_probe_that_fails_decides_nothing():
+    probe = Probe(problem="a probe needs two training views of each group")
+    evidence = evidence_of("city_hybrid", probe)
+    for part in (groups.pairs, groups.views_per_step, groups.operator):
+        found = part(evidence)
+        assert found.basis == "default"
+        assert probe.problem in found.evidence
+
+
+def orbit(count=40):
+    """Cameras on a half sphere around a cloud, as Blender's scenes have them."""
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions[:, 2] = np.abs(directions[:, 2])
+    cloud = rng.uniform(-0.5, 0.5, (60, 3))
+    views = [
+        posed_view(4.0 * d, f"{i:03}.png", forward=-d, seen=range(60))
+        for i, d in enumerate(directions)
+    ]
+    return posed_scene(views, cloud)
+
+
+def street(count=30):
+    """A walk along one street: photos of both sides, between 4 and 25 units away."""
+    rng = np.random.default_rng(3)
+    depths = np.exp(rng.uniform(np.log(4.0), np.log(25.0), count))
+    cloud, views = [], []
+    for i, depth in enumerate(depths):
+        side = 1.0 if i % 2 else -1.0
+        first = len(cloud)
+        cloud += [(2.0 * i + x, side * depth, z) for x in (-0.5, 0.0, 0.5) for z in (0.5, 1.5)]
+        seen = range(first, first + 6)
+        views.append(posed_view((2.0 * i, 0, 1.7), f"{i:03}.png", forward=(0, side, 0), seen=seen))
+    return posed_scene(views, cloud)
+
+
+def test_an_orbit_has_one_distance():
+    plan = plan_for(orbit())
+    assert plan.of_part("modes").choice == "one mode, one distance"
+    assert plan.of_part("pairs of views").choice == "random"
+    assert plan.of_part("scale filter").basis == "decided"
+    assert not plan.settings
+
+
+def test_a_transparent_render_gets_the_colour_behind_it():
+    note = "photos: 40 of 40 photos with transparency: blended over RGB (1.0, 1.0, 1.0)"
+    scene = replace(orbit(), notes=(note,))
+    assert plan_for(scene).settings == {"background": "white"}
+    assert plan_for(scene, background="black").of_part("background").basis == "given"
+    assert not plan_for(scene, background="black").settings
+
+
+def test_a_street_alone_has_one_mode():
+    plan = plan_for(street())
+    assert plan.of_part("modes").choice == "one mode, continuous"
+    assert plan.of_part("modes").figures["range"] > 3.0
+    assert plan.of_part("operator").choice == "sum"
+    assert not plan.settings
+
+
+def test_street_and_air_have_two_modes():
+    low = street(15)
+    cloud = low.points
+    high = [
+        posed_view((x, y, 90.0), f"a{x}{y}.png", forward=(0, 0.1, -1), seen=range(len(cloud)))
+        for x in (0.0, 10.0, 20.0, 30.0)
+        for y in (-9.0, 0.0, 9.0)
+    ]
+    plan = plan_for(posed_scene([*low.views, *high], cloud))
+    assert plan.of_part("modes").choice == "two modes"
+    assert plan.of_part("modes").figures["far_over_near"] > 4.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_few_photos_without_points(count):
+    scene = posed_scene([posed_view((i, i * i, 0), f"{i}.png") for i in range(count)])
+    plan = plan_for(scene)
+    changes = {"reading.init": "random"} if count == 1 else {"start": "triangulated"}
+    assert plan.settings == changes
+    assert plan.of_part("exposure").basis == "default"
+    assert planned(config_of(), scene)[0].reading.init == ("random" if count == 1 else "points")
+
+
+@pytest.mark.parametrize(("steps", "choice"), [(100, "none"), (3_000, "adc")])
+def test_a_run_too_short_for_edits_has_no_density_control(steps, choice):
+    assert plan_for(orbit(), steps=steps).of_part("densifier").choice == choice
+    assert not plan_for(orbit(), steps=steps, densify_from=10).of_part("densifier").settings
+    assert plan_for(orbit(), seconds=5.0).of_part("densifier").basis == "default"
+
+
+@pytest.mark.parametrize("backbone", ["scaffold", "mip"])
+def test_a_backbone_that_the_user_chose_is_left_alone(backbone):
+    plan = plan_for(orbit(), backbone={"name": backbone})
+    assert not plan.settings
+    assert plan.of_part("scale filter").basis == "given"
+
+
+@pytest.mark.parametrize("width", [60, 80, 109, 110, 120, 200])
+def test_the_table_keeps_to_the_terminal(width):
+    lines = list(lines_of(plan_for(street(), steps=50), width))
+    assert max(map(len, lines)) <= width
+    text = " ".join(lines)
+    assert all(part in text for part in PARTS_OF_THE_TABLE)
+    assert "changed: densifier = none" in text
+
+
+def test_every_decision_says_why_and_how_to_overrule_it():
+    for decision in plan_for(street()).decisions:
+        assert decision.evidence
+        assert decision.rule
+        assert decision.source
+        assert decision.force
+        assert decision.seconds >= 0.0
+
+
+_COORDINATE = st.floats(-1e6, 1e6, allow_nan=False, width=32)
+_POINT = st.tuples(_COORDINATE, _COORDINATE, _COORDINATE)
+_GIVEN = st.fixed_dictionaries(
+    {},
+    optional={
+        "steps": st.integers(1, 40_000),
+        "views_per_step": st.sampled_from([1, 2, 3, "1..2@0.5"]),
+        "exposure": st.sampled_from(["none", "gain"]),
+        "backbone": st.sampled_from(["vanilla", "scaffold", "mip"]),
+        "background": st.sampled_from(["white", "0.1,0.2,0.3"]),
+        "max_gaussians": st.sampled_from([10, "auto"]),
+        "backbone.sh_degree": st.integers(0, 3),
+    },
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(_POINT, min_size=1, max_size=14),
+    st.lists(_POINT, max_size=6),
+    _GIVEN,
+    st.lists(st.text(max_size=30), max_size=3),
+)
+def test_no_scene_breaks_the_planner(centers, points, asked, notes):
+    if asked.get("backbone") == "scaffold":
+        asked.pop("backbone.sh_degree", None)
+    views = [
+        posed_view(center, f"{i}.png", seen=range(len(points) if i % 2 else 0))
+        for i, center in enumerate(centers)
+    ]
+    scene = replace(posed_scene(views, points), notes=tuple(notes))
+    config = configured(layered([{"scene": "nowhere", **asked}]))
+    decided, plan = planned(config, scene)
+    json.dumps(plan, allow_nan=False)
+    assert len(plan["decisions"]) == len(PARTS)
+    for name in config.model_fields_set - {"backbone", "scene"}:
+        assert getattr(decided, name) == getattr(config, name)
