@@ -90,7 +90,7 @@ def plan(  # noqa: PLR0913, PLR0917 - one parameter per option of the command li
         ),
     ] = None,
 ) -> None:
-    """Decide by evidence what a run on a scene needs, and what is left out.
+    """Decide on evidence what a run on a scene needs.
 
     Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
     stands in a table with the decision, the figure it rests on, what it saves, and the option that
