@@ -14,7 +14,10 @@ PIP_FLAGS = --quiet --disable-pip-version-check --constraint constraints.txt
 # The commit that `make bits` holds this checkout against.
 BASE ?= HEAD~1
 
-.PHONY: demo install test bits slow matrix exposures compat faults fuzz lint bench clean
+# What `make paper` hands on, such as PAPER="--scenes DIR --workers 1".
+PAPER ?=
+
+.PHONY: demo install test bits slow matrix exposures compat faults fuzz lint bench paper clean
 
 demo: install  ## Train the bundled real scene for two minutes and print the results
 	$(BIN)/crossgrad run
@@ -64,6 +67,9 @@ bench: install  ## Loss, optimizer and operators of docs/benchmarks.md, which na
 	$(BIN)/python benchmarks/loss.py
 	$(BIN)/python benchmarks/adam.py
 	$(BIN)/python benchmarks/operators.py
+
+paper: install  ## The paper's tables and claims on our scenes: tunes, runs what is missing, writes the page
+	nice -n 10 $(BIN)/python benchmarks/paper.py run $(PAPER)
 
 clean:  ## Remove environments and caches; keeps runs/
 	rm -rf $(VENV) $(TEST_VENV) .venv-compat build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis fuzz-findings

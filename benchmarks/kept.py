@@ -15,8 +15,11 @@ from pathlib import Path
 
 from crossgrad_core.commands import UserError, summary_of
 
-#: Files of a run that are kept.
-FILES = ("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json")
+#: Files of a run that are kept; the last three are those of the observer `diagnostics`.
+FILES = (
+    *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
+    *("diagnostics.csv", "cameras.csv", "groupings.csv"),
+)
 
 
 def pack(sweep: Path, archive: Path) -> int:

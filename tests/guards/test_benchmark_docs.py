@@ -58,7 +58,7 @@ def test_the_table_of_backbones_has_a_commit_in_every_row():
 
 
 @pytest.mark.parametrize(
-    "path", sorted(BENCHMARKS.glob("grids/*.yaml")), ids=lambda path: path.stem
+    "path", sorted(BENCHMARKS.glob("grids/**/*.yaml")), ids=lambda path: path.stem
 )
 def test_each_grid_is_one_and_has_settings_that_there_are(path):
     grid = read_grid(path)

@@ -1,0 +1,370 @@
+"""The page docs/results/paper.md: every table and claim with our figure and the verdict."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from math import isnan
+from statistics import fmean
+
+from _paper_data import Check, Claims, Expected, Pairing, Reading, Table, Tables, values
+from _paper_runs import CAMERAS, Results, number, probe_rows, probed
+from _paper_verdicts import PSNR, Answer, Outcome, answers, figure_of, paired
+
+from crossgrad_plugins.compare.contrasts import judged
+from crossgrad_plugins.compare.ranking import noise, standings
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.words import claim
+
+#: Arms whose runs carry probes of the gradients.
+WATCHED = ("one view, 2x stretched", "symmetric")
+#: What the second view is compared at, and with which arms.
+EQUAL = {
+    "equal steps": ("two random views", "one view, 1x"),
+    "equal views": ("two random views", "one view, 2x stretched"),
+    "equal seconds": ("two random views, 60 s", "one view, 60 s"),
+    "equal views, published rates": (
+        "two random views, published rates",
+        "one view, 2x stretched, published rates",
+    ),
+}
+#: Differences of the paper below this count as none.
+_SAME = 0.1
+_HEAD = "| {} | the paper | command | ours | verdict |"
+
+
+def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] = ()) -> str:
+    """The page.
+
+    Args:
+        claims: What the paper says.
+        results: What the grids came to.
+        tables: The figures of the paper.
+        extra: Arms of the other backbones, in pairs by backbone.
+    """
+    blocks = [_table(table, claims, results, tables) for table in claims.tables]
+    sections = [
+        (section.title, _section(section.claims, results, tables)) for section in claims.sections
+    ]
+    outcomes = Counter(
+        answer.outcome
+        for _, found in (*blocks, *(found for _, found in sections))
+        for answer in found
+    )
+    lines = [
+        *_opening(claims, results, outcomes),
+        "## Its tables",
+        "",
+        *(line for text, _ in blocks for line in text),
+        "## Its claims, and what it did not ask",
+        "",
+        *(line for title, (text, _) in sections for line in (f"### {title}", "", *text, "")),
+        *_second_view(results),
+        *_other_backbones(results, extra),
+        *_by_scene(results),
+        *_trajectories(results),
+        *_noise(results),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _opening(claims: Claims, results: Results, outcomes: Mapping[Outcome, int]) -> Iterator[str]:
+    planned = sum(len(each) for each in results.planned.values())
+    finished = sum(len(each) for each in results.runs.values())
+    yield from (
+        "# The paper, row by row",
+        "",
+        f"Tables and claims of {claims.source}, tested on our scenes. `make paper` runs what is "
+        "missing and writes this page; do not edit it.",
+        "",
+        f"**{finished:,} of {planned:,} runs have finished.** "
+        + (" ".join(f"{outcomes.get(each, 0)} {each.value}," for each in Outcome).rstrip(","))
+        + ".",
+        "",
+        "Ours are differences of PSNR in dB after colour correction (`psnr_cc`, "
+        "[metrics](../metrics.md)), first arm minus second: estimate with its 95 % interval over n "
+        "pairs of runs on one scene with one seed, by the statistics of "
+        "[`crossgrad compare`](../compare.md). `plain` is the estimate for plain PSNR, which on "
+        "scenes of uneven exposure is mostly the guess at the exposure of held-out photos, so that "
+        "arms look alike in it. The margin is 0.1 dB. A statement of equality holds where the 90 % "
+        "interval lies within the margin, one of order where the 95 % interval excludes zero; "
+        "p-values of a table are corrected together. Every arm has its own best factor of the "
+        "learning rates, found on a seed that is not counted, or that of an arm with as many views "
+        "per step (`benchmarks/paper_data/plan.yaml`).",
+        "",
+        *_machines(results),
+        "Recipes for those who have the data:",
+        "",
+        *(f"- {name}: {text}" for name, text in claims.recipes.items()),
+        "",
+    )
+
+
+def _machines(results: Results) -> Iterator[str]:
+    runs = [run for by in results.runs.values() for run in by.values()]
+    facts = {
+        f"{env.get('cpu')}, crossgrad {env.get('crossgrad')}"
+        for run in runs
+        if (env := run.summary.get("environment"))
+    }
+    if facts:
+        spent = [run.number("cpu_seconds") or run.number("train_seconds") or 0.0 for run in runs]
+        hours = f"Training took {sum(spent) / 3600:.1f} core hours."
+        yield f"Machines: {'; '.join(sorted(facts))}. {hours}"
+        yield ""
+
+
+def _table(
+    table: Table, claims: Claims, results: Results, tables: Tables
+) -> tuple[list[str], list[Answer]]:
+    methods = tables[table.id]
+    checks = {
+        method: row.check(_expected(tables, table, method)) for method, row in table.rows.items()
+    }
+    found = answers(list(checks.values()), results, tables)
+    lines = [f"### {table.title} (`{table.id}`)", ""]
+    lines += [table.note, ""] if table.note else []
+    lines += [_HEAD.format("row"), "|---" * 5 + "|"]
+    for method in methods:
+        if method == table.reference:
+            text = f"{_figures(tables, table.id, method)}; the reference of the other rows"
+            lines.append(_row(method, text, "", Answer(Outcome.UNTESTABLE)))
+        elif method in checks:
+            answer = found[list(checks).index(method)]
+            text = _published(tables, table, method)
+            lines.append(_row(method, text, _command(checks[method], results), answer))
+    metrics = dict.fromkeys(each.metric for figures in methods.values() for each in figures)
+    itself = Answer(Outcome.UNTESTABLE, "", claims.untestable)
+    text = f"the figures themselves ({', '.join(metrics)})"
+    lines += [_row("all", text, "", itself), ""]
+    return lines, found
+
+
+def _row(name: str, text: str, command: str, answer: Answer) -> str:
+    verdict = answer.outcome.value if command or answer.detail else ""
+    detail = f": {answer.detail}" if answer.detail else ""
+    return f"| {name} | {text} | {command} | {answer.figure} | {verdict}{detail} |"
+
+
+def _section(
+    section: Sequence[Check], results: Results, tables: Tables
+) -> tuple[list[str], list[Answer]]:
+    found = answers(section, results, tables)
+    lines = [_HEAD.format("where"), "|---" * 5 + "|"]
+    for each, answer in zip(section, found, strict=True):
+        where, says = getattr(each, "where", ""), getattr(each, "says", "")
+        lines.append(_row(where, says, _command(each, results), answer))
+    return lines, found
+
+
+def _command(check: Check, results: Results) -> str:
+    """What runs the arms of a check."""
+    if check.arithmetic is not None:
+        return "`python benchmarks/paper.py page`"
+    grids = dict.fromkeys(results.grids[arm] for arm in check.arms if arm in results.grids)
+    return f"`python benchmarks/paper.py run --only {','.join(grids)}`" if grids else ""
+
+
+def _expected(tables: Tables, table: Table, method: str) -> Expected:
+    """What the mean difference of a row to the table's reference says."""
+    found = _differences(tables, table, method)
+    mean = fmean(found.values()) if found else 0.0
+    if abs(mean) < _SAME:
+        return "equal"
+    return "better" if mean > 0 else "worse"
+
+
+def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
+    """Scene -> PSNR of a method above the reference; the figures of a table of gains."""
+    gains = values(tables, table.id, method, "PSNR_gain")
+    if gains or table.reference is None:
+        return gains
+    own = values(tables, table.id, method, "PSNR")
+    reference = values(tables, table.id, table.reference, "PSNR")
+    return {scene: own[scene] - reference[scene] for scene in own if scene in reference}
+
+
+def _published(tables: Tables, table: Table, method: str) -> str:
+    found = _differences(tables, table, method)
+    if not found:
+        return _figures(tables, table.id, method)
+    shown = ", ".join(f"{scene} {value:+.2f}" for scene, value in found.items())
+    return f"{shown}: {_expected(tables, table, method)} (mean {fmean(found.values()):+.2f})"
+
+
+def _figures(tables: Tables, table: str, method: str) -> str:
+    figures = [each for each in tables[table][method] if each.metric not in {"SSIM", "LPIPS"}]
+    several = len({each.metric for each in figures}) > 1
+    return ", ".join(
+        f"{each.scene}{f' {each.metric}' if several else ''} "
+        f"{'none' if each.value is None else format(each.value, 'g')}"
+        for each in figures
+    )
+
+
+def _second_view(results: Results) -> Iterator[str]:
+    """The gain of the second view on each scene, at equal steps, views and seconds."""
+    yield from ("## What the second view buys, scene by scene", "")
+    contrasts = {
+        (scene, name): paired(Pairing(first=a, second=b, scenes=(scene,)), results)
+        for scene in _scenes(results)
+        for name, (a, b) in EQUAL.items()
+    }
+    verdicts = {
+        (each.pairs[0].scene, name): each.verdict.value
+        for name in EQUAL
+        for each in judged(contrasts[scene, name] for scene in _scenes(results))
+    }
+    yield from ("| scene | at | two views minus one | by regime | verdict |", "|---" * 5 + "|")
+    for (scene, name), each in contrasts.items():
+        regimes = _regimes(results, EQUAL[name], scene)
+        verdict = verdicts.get((scene, name), Outcome.NOT_RUN.value)
+        yield f"| {scene} | {name} | {figure_of(each)} | {regimes} | {verdict} |"
+    yield ""
+
+
+def _regimes(results: Results, arms: tuple[str, str], scene: str) -> str:
+    runs = [run for (at, _), run in results.runs.get(arms[0], {}).items() if at == scene]
+    names = sorted({name for run in runs for name in run.results.regimes})
+    pairing = Pairing(first=arms[0], second=arms[1], scenes=(scene,))
+    found = [(name, paired(pairing, results, regime=name).estimate) for name in names]
+    return ", ".join(f"{n} {PSNR.difference(e.center)}" for n, e in found if e is not None)
+
+
+def _scenes(results: Results) -> list[str]:
+    return sorted({scene for pairs in results.planned.values() for scene, _ in pairs})
+
+
+def _other_backbones(results: Results, extra: Sequence[str]) -> Iterator[str]:
+    yield from ("## Other backbones", "", "The two methods that ended best on vanilla.", "")
+    table = standings({arm: results.runs.get(arm, {}) for arm in extra}, PSNR)
+    if not any(table.values()):
+        yield from ("not run", "")
+        return
+    yield from ("| arm | PSNR by scene |", "|---|---|")
+    for arm, by in table.items():
+        cells = ", ".join(
+            f"{scene} {PSNR.shown(each.mean)}"
+            + ("" if isnan(each.spread) else f" ± {each.spread:.2f}")
+            + f" (n = {each.seeds})"
+            for scene, each in by.items()
+        )
+        yield f"| {arm} | {cells or Outcome.NOT_RUN.value} |"
+    yield ""
+    for contrast in judged(
+        paired(Pairing(first=first, second=second), results)
+        for first, second in zip(extra[::2], extra[1::2], strict=True)
+    ):
+        yield f"- {claim(contrast)} ({figure_of(contrast)})"
+    yield ""
+
+
+def _by_scene(results: Results) -> Iterator[str]:
+    """Cameras, gradients and gains beside one another, a row for each scene."""
+    yield from ("## Cameras and gradients by scene", "")
+    watched = results.runs.get(WATCHED[0], {})
+    if not any(probe_rows(run) for run in watched.values()):
+        yield from ("not run", "")
+        return
+    yield from (
+        "Sarle's coefficient in the finite-sample form and that of plain moments (0.555 is that of "
+        "a uniform sample, and the former grows with the number of views); means over the probes "
+        "and seeds of one view per step, `all` blocks.",
+        "",
+        "| scene | quantity: bimodality | Var(r)/mean(r)^2 | conflict rate | sigma_b^2/sigma_w^2 "
+        "| exponent of positions | projection minus random pairs |",
+        "|---" * 7 + "|",
+    )
+    for scene in sorted({scene for scene, _ in watched}):
+        runs = [run for (at, _), run in sorted(watched.items()) if at == scene]
+        cells = (
+            *_cameras(runs[0]),
+            _mean(runs, Reading(column="conflict_rate", block="all")),
+            _mean(runs, Reading(column="rho", block="all")),
+            _mean(runs, Reading(column="exponent_depth", block="means")),
+            figure_of(paired(_gain(scene), results)) or Outcome.NOT_RUN.value,
+        )
+        yield f"| {scene} | {' | '.join(cells)} |"
+    yield ""
+
+
+def _gain(scene: str) -> Pairing:
+    return Pairing(first="symmetric", second="two random views", scenes=(scene,))
+
+
+def _cameras(run: Run) -> tuple[str, str]:
+    rows = probe_rows(run, CAMERAS)
+    shown = [
+        f"{row['quantity']}: {_cell(row, 'bimodality_sample')} / "
+        f"{_cell(row, 'bimodality_population')} (n = {row['views']})"
+        for row in rows
+    ]
+    spread = [_cell(r, "relative_variance") for r in rows if r["relative_variance"]]
+    return "; ".join(shown), "; ".join(spread)
+
+
+def _mean(runs: Sequence[Run], reading: Reading) -> str:
+    known = [value for run in runs if (value := probed(run, reading)) is not None]
+    return f"{fmean(known):.3g}" if known else ""
+
+
+def _cell(row: Mapping[str, str], column: str) -> str:
+    value = number(row, column)
+    return "" if value is None else f"{value:.3g}"
+
+
+def _trajectories(results: Results) -> Iterator[str]:
+    """Conflict, ratios and variances over training, a row for each probe."""
+    yield from ("## Trajectories", "")
+    rows = [line for arm in WATCHED for line in _trajectory(arm, results)]
+    if not rows:
+        yield from ("not run", "")
+        return
+    yield from (
+        "Probes at frozen parameters; the mean over seeds, except that variances and their 95 % "
+        "intervals are those of the first seed, the probed views taken as a sample. Conflict is "
+        "that of all blocks as one vector and, in brackets, averaged over blocks. A negative "
+        "sigma_b^2 is an estimate that cannot be told from 0.",
+        "",
+        "| arm | scene | step | conflict rate | ratio of positions | ratio of opacity + DC "
+        "| sigma_w^2 | sigma_b^2 | sigma_b^2/sigma_w^2 | the same, Adam's metric |",
+        "|---" * 10 + "|",
+        *rows,
+        "",
+    )
+
+
+def _trajectory(arm: str, results: Results) -> Iterator[str]:
+    runs = results.runs.get(arm, {})
+    for scene in sorted({scene for scene, _ in runs}):
+        own = [run for (at, _), run in sorted(runs.items()) if at == scene]
+        tables = [rows for run in own if (rows := probe_rows(run))]
+        for step in sorted({int(row["step"]) for row in tables[0]} if tables else ()):
+            cells = _probe([[r for r in rows if int(r["step"]) == step] for rows in tables], own[0])
+            yield f"| {arm} | {scene} | {step} | {' | '.join(cells)} |"
+
+
+def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[str]:
+    """The cells of one probe; a table of its rows for each seed."""
+
+    def over_seeds(column: str, block: str) -> str:
+        reading = Reading(column=column, block=block)
+        known = [v for rows in tables if (v := probed(run, reading, rows)) is not None]
+        return f"{fmean(known):.3g}" if known else ""
+
+    yield f"{over_seeds('conflict_rate', 'all')} ({over_seeds('conflict_rate', 'each')})"
+    yield over_seeds("ratio_of_means", "means")
+    yield over_seeds("ratio_of_means", "opacities+f_dc")
+    for metric, columns in (("plain", ("sigma_w2", "sigma_b2", "rho")), ("adam", ("rho",))):
+        row = next((r for r in tables[0] if r["block"] == "all" and r["metric"] == metric), {})
+        for column in columns:
+            low, high = _cell(row, f"{column}_low"), _cell(row, f"{column}_high")
+            yield f"{_cell(row, column)} ({low} to {high})" if low and high else _cell(row, column)
+
+
+def _noise(results: Results) -> Iterator[str]:
+    yield from ("## Noise", "", "Standard deviation of a run over seeds, pooled over all arms.", "")
+    found = noise(standings(results.runs, PSNR))
+    if not found:
+        yield "not run"
+        return
+    yield from ("| scene | dB | degrees of freedom |", "|---|---|---|")
+    yield from (f"| {scene} | {sd:.3f} | {free} |" for scene, (sd, free) in found.items())

@@ -1,0 +1,232 @@
+"""Verdicts on the paper's claims, from pairs of runs with the statistics of `crossgrad compare`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import isinf
+
+from _paper_data import Arithmetic, Check, Expected, Pairing, Probe, Tables, values
+from _paper_runs import Results, probed
+
+from crossgrad_plugins.compare.contrasts import Contrast, Pair, contrast
+from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
+from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+from crossgrad_plugins.compare.words import interval_text, needed_text
+
+#: What verdicts are about: where the exposure of a held-out photo is guessed wrongly, plain PSNR is
+#: the guess more than the scene, and arms look alike that are not.
+PSNR = Quantity.of("psnr_cc")
+PLAIN = Quantity.of("psnr")
+
+
+class Outcome(StrEnum):
+    """The verdict on a claim."""
+
+    HOLDS = "holds"
+    FAILS = "does not hold"
+    OPEN = "inconclusive"
+    NOT_RUN = "not run"
+    UNTESTABLE = "not testable"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a claim.
+
+    Attributes:
+        outcome: The verdict.
+        figure: Our figure with its interval; empty without one.
+        detail: What else is to be said of the verdict; empty where nothing is.
+    """
+
+    outcome: Outcome
+    figure: str = ""
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """A test with its contrast; None where there are no runs."""
+
+    test: Check
+    contrast: Contrast | None
+    figure: str
+    wanted: int
+    missing: int
+
+
+def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[Answer]:
+    """The answers to checks that are shown in one table, whose p-values are corrected together."""
+    measured = [_measured(check, results) for check in checks]
+    done = [each for each in measured if _is_whole(each)]
+    family = [_estimate(each) for each in done]
+    found = dict(zip(map(id, done), verdicts(family), strict=True))
+    return [
+        _judged(each, found[id(each)]) if id(each) in found else _unjudged(each, tables)
+        for each in measured
+    ]
+
+
+def _is_whole(each: _Measured) -> bool:
+    return each.contrast is not None and each.contrast.estimate is not None and not each.missing
+
+
+def _estimate(each: _Measured) -> Estimate:
+    if each.contrast is None or each.contrast.estimate is None:
+        raise ValueError("only what was measured is judged")
+    return each.contrast.estimate
+
+
+def _measured(test: Check, results: Results) -> _Measured:
+    if test.test is not None:
+        found = paired(test.test, results)
+        scenes, figure = test.test.scenes, with_plain(test.test, results, found)
+    elif test.probe is not None:
+        found = _of_gradients(test.probe, results, test.margin or 0.1)
+        scenes, figure = test.probe.scenes, figure_of(found, signed=test.within is None)
+    else:
+        return _Measured(test, None, "", 0, 0)
+    wanted, missing = results.missing(test.arms, scenes)
+    return _Measured(test, found, figure, wanted, missing)
+
+
+def paired(
+    pairing: Pairing, results: Results, quantity: Quantity = PSNR, regime: str | None = None
+) -> Contrast:
+    """Two arms at the ends of their runs."""
+
+    def reading(run: Run) -> float | None:
+        hidden = pairing.scenes and run.scene not in pairing.scenes
+        return None if hidden else run.final(quantity.name, regime)
+
+    names = pairing.first, pairing.second
+    runs = results.runs.get(names[0], {}), results.runs.get(names[1], {})
+    return contrast(names, runs, quantity, reading, regime or "at the end")
+
+
+def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
+    """A figure of the gradients, or its difference to another one, run by run."""
+    pairs = []
+    for (scene, seed), run in sorted(results.runs.get(probe.arm, {}).items()):
+        if probe.scenes and scene not in probe.scenes:
+            continue
+        first = probed(run, probe.first)
+        second = 0.0 if probe.second is None else probed(run, probe.second)
+        if first is not None and second is not None:
+            pairs.append(Pair(scene, seed, first, second))
+    quantity = Quantity(probe.first.column, probe.first.column, "", 3, margin)
+    second_name = "0" if probe.second is None else probe.second.block
+    found = None
+    if pairs:
+        differences = [pair.difference for pair in pairs]
+        found = estimate(differences, [pair.scene for pair in pairs], margin)
+    return Contrast(probe.first.block, second_name, "probes", quantity, tuple(pairs), found)
+
+
+def figure_of(found: Contrast, *, signed: bool = True) -> str:
+    """An estimate with its 95 % interval and its pairs; empty without a pair."""
+    if found.estimate is None:
+        return ""
+    quantity, center = found.quantity, found.estimate.center
+    text = quantity.difference(center) if signed else f"{quantity.shown(center)} {quantity.unit}"
+    low, high = found.estimate.wide
+    if isinf(low):
+        between = "one pair"
+    elif signed:
+        between = interval_text(found, (low, high))
+    else:
+        between = f"{quantity.shown(low)} to {quantity.shown(high)}"
+    return f"{text.rstrip()} ({between}; n = {found.estimate.pairs})"
+
+
+def with_plain(pairing: Pairing, results: Results, found: Contrast) -> str:
+    """The figure, and beside it the estimate of plain PSNR."""
+    text = figure_of(found)
+    plain = paired(pairing, results, PLAIN)
+    if not text or plain.estimate is None:
+        return text
+    return f"{text}; plain {PLAIN.difference(plain.estimate.center)}"
+
+
+def _unjudged(each: _Measured, tables: Tables) -> Answer:
+    if each.test.arithmetic is not None:
+        return _calculated(each.test.arithmetic, tables)
+    if each.test.none is not None:
+        return Answer(Outcome.UNTESTABLE, "", each.test.none)
+    if not each.wanted:
+        return Answer(Outcome.NOT_RUN, "", "no grid has these runs on a common scene and seed")
+    ended = each.wanted - each.missing
+    if each.missing:
+        detail = f"{ended} of {each.wanted} pairs so far" if ended else ""
+        return Answer(Outcome.NOT_RUN, each.figure, detail)
+    return Answer(Outcome.OPEN, "", "all runs ended, and none of the pairs has the figure")
+
+
+def _judged(each: _Measured, verdict: Verdict) -> Answer:
+    found = each.contrast
+    if found is None or found.estimate is None:
+        raise ValueError("only what was measured is judged")
+    if each.test.within is not None:
+        return Answer(_located(each.test.within, found.estimate.wide), each.figure)
+    outcome = outcome_of(each.test.expected or "equal", verdict, found)
+    details = []
+    if outcome is Outcome.OPEN:
+        details.append(needed_text(found))
+    elif verdict is Verdict.DIFFERENT and found.is_small:
+        details.append("by less than the margin")
+    lost = each.wanted - found.estimate.pairs
+    if lost > 0:
+        details.append(f"{lost} of {each.wanted} pairs failed or have no figure")
+    return Answer(outcome, each.figure, "; ".join(details))
+
+
+def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outcome:
+    """Whether a value lies within bounds, by its 95 % interval."""
+    low, high = interval
+    if within[0] <= low and high <= within[1]:
+        return Outcome.HOLDS
+    return Outcome.FAILS if high < within[0] or low > within[1] else Outcome.OPEN
+
+
+def outcome_of(expected: Expected, verdict: Verdict, found: Contrast) -> Outcome:
+    """The verdict on a statement about two arms, from the verdict on their difference."""
+    if verdict is Verdict.INCONCLUSIVE:
+        return _of_an_open_one(expected, found)
+    if verdict is Verdict.EQUIVALENT:
+        return Outcome.HOLDS if expected in {"equal", "not better"} else Outcome.FAILS
+    ahead = found.favours == found.first
+    holds = {
+        "better": ahead,
+        "worse": not ahead,
+        "equal": found.is_small,
+        "not better": not ahead or found.is_small,
+    }
+    return Outcome.HOLDS if holds[expected] else Outcome.FAILS
+
+
+def _of_an_open_one(expected: Expected, found: Contrast) -> Outcome:
+    """What has one side only can be settled where the other side is open."""
+    if expected != "not better" or found.estimate is None:
+        return Outcome.OPEN
+    below = found.estimate.narrow[1] < found.quantity.margin
+    return Outcome.HOLDS if below else Outcome.OPEN
+
+
+def _calculated(claim: Arithmetic, tables: Tables) -> Answer:
+    """A statement about shares of a gap, from the paper's own figures."""
+    method = values(tables, claim.table, claim.method, "PSNR")
+    base = values(tables, claim.table, claim.base, "PSNR")
+    target = values(tables, claim.target_table, claim.target, "PSNR")
+    shares = {
+        scene: (method[scene] - base[scene]) / (target[scene] - base[scene])
+        for scene in method
+        if target[scene] > base[scene]
+    }
+    inside = sum(claim.low <= share <= claim.high for share in shares.values())
+    shown = ", ".join(f"{scene} {share:.0%}" for scene, share in shares.items())
+    none = [scene for scene in method if scene not in shares]
+    lacking = f"; no gap on {', '.join(none)}" if none else ""
+    outcome = Outcome.HOLDS if inside >= claim.scenes else Outcome.FAILS
+    return Answer(outcome, f"{shown}{lacking}", "from the paper's own tables")

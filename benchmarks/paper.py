@@ -1,0 +1,407 @@
+"""The paper's tables and claims on our scenes: tuning, runs, and the page that says what came out.
+
+    python benchmarks/paper.py run [--only GRID,...] [--scenes DIR] [--workers N]
+    python benchmarks/paper.py page        # only writes the page, from the runs that there are
+    python benchmarks/paper.py estimate    # core hours of each grid
+
+`run` says how long it takes, tunes the learning rates, carries out the grids of
+benchmarks/grids/paper and writes docs/results/paper.md. It can be stopped and started at any time:
+what has finished is not repeated. Tables of finished runs are kept in benchmarks/results/paper,
+from where the next call takes them, on another machine, too.
+"""
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import yaml
+from _paper_data import BEST, GRIDS, Plan, read_claims, read_plan, read_tables
+from _paper_page import page
+from _paper_runs import Results, read_results
+from _paper_verdicts import PSNR
+from kept import pack, unpack
+
+from crossgrad_core.commands import (
+    UserError,
+    available_cores,
+    exit_code,
+    find_runs,
+    write_atomically,
+    write_mapping,
+)
+from crossgrad_plugins.compare.ranking import ranked, standings
+from crossgrad_plugins.sweep.grid import Arm, Grid, choices, read_grid, scene_name, with_scenes
+
+ROOT = Path(__file__).parents[1]
+#: Tuned arm -> scene -> factor of the learning rates.
+Factors: TypeAlias = Mapping[str, Mapping[str, float]]
+CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
+#: CPU seconds of a view of 400 px (0.059 city_hybrid, 0.049 city_unimodal, 0.046 boruszyn_kap,
+#: 0.040 ochota_kap_hybrid) and of a run besides its views: libraries, scene, evaluation, results.
+#: One run of 1,200 views each, two views per step, one core of an AMD EPYC that other work shared.
+VIEW, BESIDES = 0.049, 12.0
+#: The cost of a view beside vanilla's (docs/benchmarks.md, Cost of backbones).
+COSTS = {
+    "scaffold": 1.5,
+    "octree": 1.6,
+    "analytic": 1.9,
+    "mip": 1.15,
+    "pixel": 1.1,
+    "distance": 1.35,
+}
+#: Seconds that the probes of a run take.
+PROBES = 25.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where things are.
+
+    Attributes:
+        out: Sweeps and the grids that they are run from.
+        kept: Packed tables of finished runs.
+        page: The page.
+    """
+
+    out: Path
+    kept: Path
+    page: Path
+
+    def sweep(self, grid: str) -> Path:
+        """The folder of a grid's sweep."""
+        return self.out / grid
+
+    def grid(self, grid: str) -> Path:
+        """The grid as it is run, with scenes and rates filled in."""
+        return self.out / "grids" / f"{grid}.yaml"
+
+    @property
+    def tuned(self) -> Path:
+        """The grid with the best rates, as `crossgrad sweep --best` writes it."""
+        return self.out / "grids" / "tuned.yaml"
+
+    def archive(self, grid: str) -> Path:
+        """The packed tables of a grid."""
+        return self.kept / f"{grid}.tar.xz"
+
+
+class Paper:
+    """All grids, on the scenes that the user has.
+
+    Args:
+        given: The options of the command line.
+    """
+
+    def __init__(self, given: argparse.Namespace) -> None:
+        self.given = given
+        self.place = Place(given.out.absolute(), given.kept.absolute(), given.page.absolute())
+        self.plan: Plan = read_plan()
+
+    def check(self) -> None:
+        """Refuses grids that there are not."""
+        if unknown := [name for name in self.given.only or () if name not in self.plan.grids]:
+            raise UserError(
+                "there is no such grid",
+                where="--only",
+                expected=", ".join(self.plan.grids),
+                found=", ".join(unknown),
+                todo="copy a name, without .yaml",
+            )
+
+    @property
+    def names(self) -> list[str]:
+        """The measured grids that the user wants, in their order."""
+        only = self.given.only
+        return [name for name in self.plan.grids if not only or name in only]
+
+    def source(self, name: str) -> Grid:
+        """A grid of the repository, on the user's scenes."""
+        grid = read_grid(GRIDS / f"{name}.yaml")
+        folder = self.given.scenes
+        wanted = self.given.scene or [folder / scene_name(each) for each in grid.scenes]
+        grid = with_scenes(grid, [Path(each) for each in wanted])
+        seeds = self.given.seed if name != self.plan.tuning else None
+        return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
+
+    def grids(self) -> dict[str, Grid]:
+        """Every measured grid: as it was run last, or else as the repository has it."""
+        found = {
+            name: read_grid(path) if path.is_file() else self.source(name)
+            for name in self.plan.grids
+            for path in (self.place.grid(name),)
+        }
+        last = self.plan.best_of.grid
+        if not self.place.grid(last).is_file():
+            best = self._best(self._read(found), found)
+            found[last] = with_methods(found[last], best) if len(best) == BEST else found[last]
+        return found
+
+    def results(self) -> Results:
+        """What all grids came to so far."""
+        return self._read(self.grids())
+
+    def _read(self, grids: Mapping[str, Grid]) -> Results:
+        return read_results({name: self.place.sweep(name) for name in grids}, grids)
+
+    # The steps of `run`.
+
+    def unpack(self) -> None:
+        """Takes finished runs from the packed tables."""
+        for name in (self.plan.tuning, *self.plan.grids):
+            if self.place.archive(name).is_file():
+                unpack(self.place.archive(name), self.place.sweep(name))
+
+    def run(self) -> int:
+        """Tunes, runs what is not finished, and writes the page; answers the exit code."""
+        self.unpack()
+        self.tell()
+        worst = self._swept(self.plan.tuning, _as_mapping(self.source(self.plan.tuning)))
+        if worst > 2:  # Stopped by a signal.
+            return worst
+        factors = self._factors()
+        for name in self.names:
+            content = self._content(name, factors)
+            if content is None:
+                continue
+            code = self._swept(name, content)
+            if code > 2:  # Stopped by a signal.
+                return code
+            worst = max(worst, code)
+            self.write_page()
+        return worst
+
+    def _swept(self, name: str, content: Mapping[str, Any]) -> int:
+        """Runs a grid and packs what finished."""
+        path = self.place.grid(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        write_mapping(path, content)
+        command = ["sweep", str(path), "--out", str(self.place.sweep(name))]
+        for text in self.given.set or ():
+            command += ["--set", text]
+        if self.given.workers:
+            command += ["--workers", str(self.given.workers)]
+        print(f"\n== {name}", flush=True)
+        code = _call(command)
+        if find_runs(self.place.sweep(name) / "runs"):
+            _packed(self.place.sweep(name), self.place.archive(name))
+        return code
+
+    def _factors(self) -> Factors:
+        """The best factors of the learning rates."""
+        self.place.tuned.unlink(missing_ok=True)
+        tuning = self.place.grid(self.plan.tuning)
+        command = ["sweep", str(tuning), "--out", str(self.place.sweep(self.plan.tuning))]
+        for text in self.given.set or ():
+            command += ["--set", text]
+        if code := _call([*command, "--best", str(self.place.tuned)]):
+            raise SystemExit(code)
+        content = yaml.safe_load(self.place.tuned.read_text(encoding="utf-8"))
+        return {
+            arm["name"].removesuffix(", best"): {
+                scene: settings["rate_factor"] for scene, settings in arm["by_scene"].items()
+            }
+            for arm in content["arms"]
+            if arm["name"].endswith(", best")
+        }
+
+    def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
+        """A grid with rates; None for one that has to wait for the others."""
+        grid = self.source(name)
+        if name == self.plan.best_of.grid:
+            best = self._best(self.results(), self.grids())
+            if len(best) < BEST:
+                print(f"\n== {name}: waits until the candidates have finished", flush=True)
+                return None
+            grid = with_methods(grid, best)
+            rates = {arm.name: rate_of(arm, best, self.plan) for arm in grid.arms}
+        else:
+            rates = {arm.name: own_rate(arm.name, self.plan, factors) for arm in grid.arms}
+        if name in self.plan.fixed_rates:
+            return _as_mapping(grid)
+        return _as_mapping(with_rates(grid, rates, factors))
+
+    def _best(self, results: Results, grids: Mapping[str, Grid]) -> list[Arm]:
+        """The best of the candidates; none before all their runs have ended."""
+        candidates = self.plan.best_of.candidates
+        if any(results.missing([name])[1] for name in candidates):
+            return []
+        runs = {name: results.runs.get(name, {}) for name in candidates}
+        known = {name: by for name, by in runs.items() if by}
+        order = ranked(standings(known, PSNR), PSNR)[:BEST]
+        arms = {arm.name: arm for grid in grids.values() for arm in grid.arms}
+        return [arms[name] for name in order]
+
+    def write_page(self) -> None:
+        """Writes the page from what there is."""
+        results, grids = self.results(), self.grids()
+        extra = [arm.name for arm in grids[self.plan.best_of.grid].arms]
+        text = page(read_claims(), results, read_tables(), extra)
+        self.place.page.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.place.page, text.encode())
+        print(f"the page is in {self.place.page}", flush=True)
+
+    def tell(self) -> None:
+        """Prints how many core hours each grid takes, and what is left."""
+        results, total = self.results(), 0.0
+        tuning = {self.plan.tuning: self.source(self.plan.tuning)}
+        for name, grid in {**tuning, **{n: self.source(n) for n in self.names}}.items():
+            runs, seconds, left = self._cost(name, grid, results)
+            total += left
+            print(
+                f"{name:16} {runs:4} runs {seconds / 3600:6.2f} core hours, {left / 3600:6.2f} left"
+            )
+        cores, hours = self.given.workers or len(available_cores()), total / 3600
+        print(f"left: about {hours:.1f} core hours, {hours / cores:.1f} h on {cores} cores")
+
+    def _cost(self, name: str, grid: Grid, results: Results) -> tuple[int, float, float]:
+        """Runs of a grid, their seconds, and seconds of those that are left."""
+        cells = len(grid.scenes) * len(grid.seeds)
+        count = BEST if name == self.plan.best_of.grid else 1
+        runs, seconds, left = 0, 0.0, 0.0
+        for choice in choices(grid):
+            each = run_seconds({**grid.base, **choice.arm.settings})
+            done = len(results.runs.get(choice.label, ()))
+            runs, seconds = runs + count * cells, seconds + count * cells * each
+            left += (count * cells - done) * each
+        if name == self.plan.tuning and runs:
+            finished = len(find_runs(self.place.sweep(name) / "runs"))
+            left = seconds * max(0, runs - finished) / runs
+        elif name == self.plan.best_of.grid and runs:
+            done = sum(len(by) for arm, by in results.runs.items() if results.grids[arm] == name)
+            left = seconds * max(0, runs - done) / runs
+        return runs, seconds, left
+
+
+def own_rate(name: str, plan: Plan, factors: Mapping[str, object]) -> str:
+    """The tuned arm whose factors an arm takes."""
+    return name if name in factors else plan.rates.get(name, plan.rates["default"])
+
+
+def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
+    """The grid with the factors of tuned arms, by scene.
+
+    Args:
+        grid: A grid.
+        rates: Its arms -> the tuned arms whose factors they take.
+        factors: Tuned arm -> scene -> factor.
+
+    Raises:
+        UserError: A scene was not tuned on.
+    """
+    arms = []
+    for arm in grid.arms:
+        own = factors[rates[arm.name]]
+        by_scene = {}
+        for scene in map(scene_name, grid.scenes):
+            if scene not in own:
+                raise UserError(
+                    "the learning rates of a scene are not tuned",
+                    where=scene,
+                    expected=f"one of {', '.join(own)}",
+                    todo="name the scene with --scene for all grids, the tuning included",
+                )
+            by_scene[scene] = {"rate_factor": own[scene], **arm.by_scene.get(scene, {})}
+        arms.append(arm.model_copy(update={"by_scene": by_scene}))
+    return grid.model_copy(update={"arms": tuple(arms)})
+
+
+def with_methods(grid: Grid, methods: Sequence[Arm]) -> Grid:
+    """The grid with each arm once for each method, `BACKBONE, METHOD`."""
+    arms = [
+        Arm(
+            name=f"{backbone.name}, {method.name}",
+            settings={**_without_probes(method.settings), **backbone.settings},
+        )
+        for backbone in grid.arms
+        for method in methods
+    ]
+    return grid.model_copy(update={"arms": tuple(arms)})
+
+
+def _without_probes(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name != "observers"}
+
+
+def rate_of(arm: Arm, methods: Sequence[Arm], plan: Plan) -> str:
+    """The tuned arm whose factors a method on another backbone takes."""
+    backbone, _, name = arm.name.partition(", ")
+    method = next(each for each in methods if each.name == name)
+    if (like := plan.best_of.scaffold_like.get(backbone)) is not None:
+        return like["one" if method.settings["views"] == 1 else "more"]
+    if name in {"four random views", "one view, 2x stretched", "two random views"}:
+        return name
+    return plan.rates.get(name, plan.rates["default"])
+
+
+def run_seconds(settings: Mapping[str, Any]) -> float:
+    """About how many core seconds a run of these settings takes."""
+    backbone = COSTS.get(str(settings.get("backbone")), 1.0)
+    train = settings.get("seconds") or backbone * VIEW * float(settings["max_views"])
+    return float(train) + BESIDES + (PROBES if "observers" in settings else 0.0)
+
+
+def _as_mapping(grid: Grid) -> dict[str, Any]:
+    return grid.model_dump(mode="json", exclude_defaults=True)
+
+
+def _packed(sweep: Path, archive: Path) -> None:
+    try:
+        pack(sweep, archive)
+    except UserError as error:  # No run has finished: what failed is on the screen.
+        print(error.what, file=sys.stderr)
+
+
+def _call(arguments: Sequence[str]) -> int:
+    """A command of crossgrad in a process of its own, which hears of Ctrl-C, too."""
+    process = subprocess.Popen([*CROSSGRAD, *arguments])
+    while True:
+        try:
+            code = process.wait()
+        except KeyboardInterrupt:
+            continue  # It stops its runs with checkpoints, and then ends.
+        return exit_code(-code) if code < 0 else code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("what", choices=("run", "page", "estimate"))
+    parser.add_argument(
+        "--only", type=lambda text: text.split(","), help="grids, with commas between"
+    )
+    parser.add_argument("--scenes", type=Path, default=ROOT.parent / "shared" / "scenes",
+                        help="folder of the scenes that the grids name")  # fmt: skip
+    parser.add_argument("--scene", action="append", help="a scene instead, repeatable")
+    parser.add_argument("--seed", action="append", type=int, help="a seed instead, repeatable")
+    parser.add_argument(
+        "--set", action="append", help="KEY=VALUE, a setting of all runs, repeatable"
+    )
+    parser.add_argument("--workers", type=int, help="runs at a time")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "paper")
+    parser.add_argument("--kept", type=Path, default=ROOT / "benchmarks" / "results" / "paper")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "paper.md")
+    return parser
+
+
+def main() -> int:
+    """Runs, writes the page, or estimates; answers the exit code."""
+    given = _parser().parse_args()
+    paper = Paper(given)
+    try:
+        paper.check()
+        if given.what == "run":
+            return paper.run()
+        paper.unpack()
+        paper.write_page() if given.what == "page" else paper.tell()
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
