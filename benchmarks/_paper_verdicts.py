@@ -50,7 +50,7 @@ class Answer:
 class _Measured:
     """A test with its contrast; None where there are no runs."""
 
-    test: Check
+    check: Check
     contrast: Contrast | None
     figure: str
     wanted: int
@@ -60,13 +60,26 @@ class _Measured:
 def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[Answer]:
     """The answers to checks that are shown in one table, whose p-values are corrected together."""
     measured = [_measured(check, results) for check in checks]
-    done = [each for each in measured if _is_whole(each)]
-    family = [_estimate(each) for each in done]
-    found = dict(zip(map(id, done), verdicts(family), strict=True))
-    return [
-        _judged(each, found[id(each)]) if id(each) in found else _unjudged(each, tables)
-        for each in measured
-    ]
+    # Two statements about the same two arms are one comparison.
+    family = {_key(each): _estimate(each) for each in measured if _is_judged(each)}
+    found = dict(zip(family, verdicts(list(family.values())), strict=True))
+    return [_answer(each, found.get(_key(each)), tables) for each in measured]
+
+
+def _key(each: _Measured) -> tuple[Pairing | None, Probe | None]:
+    return each.check.test, each.check.probe
+
+
+def _answer(each: _Measured, verdict: Verdict | None, tables: Tables) -> Answer:
+    if not _is_whole(each):
+        return _unjudged(each, tables)
+    if each.check.within is not None:
+        return Answer(_located(each.check.within, _estimate(each).wide), each.figure)
+    return _judged(each, verdict or Verdict.INCONCLUSIVE)
+
+
+def _is_judged(each: _Measured) -> bool:
+    return _is_whole(each) and each.check.within is None
 
 
 def _is_whole(each: _Measured) -> bool:
@@ -79,17 +92,17 @@ def _estimate(each: _Measured) -> Estimate:
     return each.contrast.estimate
 
 
-def _measured(test: Check, results: Results) -> _Measured:
-    if test.test is not None:
-        found = paired(test.test, results)
-        scenes, figure = test.test.scenes, with_plain(test.test, results, found)
-    elif test.probe is not None:
-        found = _of_gradients(test.probe, results, test.margin or 0.1)
-        scenes, figure = test.probe.scenes, figure_of(found, signed=test.within is None)
+def _measured(check: Check, results: Results) -> _Measured:
+    if check.test is not None:
+        found = paired(check.test, results)
+        scenes, figure = check.test.scenes, with_plain(check.test, results, found)
+    elif check.probe is not None:
+        found = _of_gradients(check.probe, results, check.margin or 0.1)
+        scenes, figure = check.probe.scenes, figure_of(found, signed=check.within is None)
     else:
-        return _Measured(test, None, "", 0, 0)
-    wanted, missing = results.missing(test.arms, scenes)
-    return _Measured(test, found, figure, wanted, missing)
+        return _Measured(check, None, "", 0, 0)
+    wanted, missing = results.missing(check.arms, scenes)
+    return _Measured(check, found, figure, wanted, missing)
 
 
 def paired(
@@ -151,10 +164,10 @@ def with_plain(pairing: Pairing, results: Results, found: Contrast) -> str:
 
 
 def _unjudged(each: _Measured, tables: Tables) -> Answer:
-    if each.test.arithmetic is not None:
-        return _calculated(each.test.arithmetic, tables)
-    if each.test.none is not None:
-        return Answer(Outcome.UNTESTABLE, "", each.test.none)
+    if each.check.arithmetic is not None:
+        return _calculated(each.check.arithmetic, tables)
+    if each.check.none is not None:
+        return Answer(Outcome.UNTESTABLE, "", each.check.none)
     if not each.wanted:
         return Answer(Outcome.NOT_RUN, "", "no grid has these runs on a common scene and seed")
     ended = each.wanted - each.missing
@@ -168,9 +181,7 @@ def _judged(each: _Measured, verdict: Verdict) -> Answer:
     found = each.contrast
     if found is None or found.estimate is None:
         raise ValueError("only what was measured is judged")
-    if each.test.within is not None:
-        return Answer(_located(each.test.within, found.estimate.wide), each.figure)
-    outcome = outcome_of(each.test.expected or "equal", verdict, found)
+    outcome = outcome_of(each.check.expected or "equal", verdict, found)
     details = []
     if outcome is Outcome.OPEN:
         details.append(needed_text(found))
