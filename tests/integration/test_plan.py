@@ -81,6 +81,7 @@ def test_the_configuration_repeats_the_run_without_the_planner(trained, tmp_path
     assert ended("run", "--config", file, "--set", "stop_after=null", "-q", "--out", again) == 0
     assert (again / "point_cloud.ply").read_bytes() == (trained / "point_cloud.ply").read_bytes()
     assert summary(again)["plan"] is None
+    assert not (again / "plan.json").exists()
 
 
 def test_what_the_user_set_wins(scene, tmp_path):
@@ -107,6 +108,18 @@ def test_a_single_photo_trains(tmp_path):
     out = tmp_path / "run"
     assert ended("run", tmp_path / "one", *FEW, "--plan", "auto", "--out", out) == 0
     assert settings(out)["reading"]["init"] == "random"
+
+
+def test_a_probe_measures_what_cameras_cannot_tell(tmp_path, capsys):
+    hybrid = write_tiny_scene(tmp_path / "hybrid", views=8, points=120, folders=("low", "high"))
+    torch = ("--set", "rasterizer=torch", "--threads", 1, "--max-size", 24)
+    assert ended("plan", hybrid, *torch, "--probe", 1, "--json") == 0
+    parts = {each["part"]: each for each in json.loads(capsys.readouterr().out)["decisions"]}
+    assert parts["modes"]["decision"] == "two modes"
+    pairs = parts["pairs of views"]["figures"]
+    assert pairs["rho_low"] <= pairs["rho"] <= pairs["rho_high"]
+    assert parts["views per step"]["figures"]["noise_scale"] != 0.0
+    assert 0.0 <= parts["operator"]["figures"]["conflict"] <= 1.0
 
 
 def test_nothing_is_overwritten_and_bad_input_writes_nothing(scene, tmp_path, capsys):
@@ -163,9 +176,9 @@ def test_bands_that_are_left_out_are_not_allocated(scene, tmp_path, monkeypatch)
 
 
 def test_without_a_plan_the_planner_is_not_imported(scene, tmp_path):
-    out = tmp_path / "run"
-    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
-    done = subprocess.run(list(map(str, arguments)), capture_output=True, text=True, check=True)
+    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--dry-run"]
+    done = subprocess.run(
+        list(map(str, arguments)), capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert "crossgrad_plugins.densifiers.adc" in done.stdout
     assert not [name for name in done.stdout.splitlines() if ".planner" in name]
-    assert summary(out)["plan"] is None
-    assert not (out / "plan.json").exists()

@@ -27,7 +27,7 @@ def plan(
     assignments: Sequence[str],
     probe_seconds: float | None,
     write: Path | None,
-) -> tuple[Plan, str | None]:
+) -> tuple[Plan, str]:
     """What the scene calls for, and how to run it.
 
     Args:
@@ -38,7 +38,7 @@ def plan(
         write: Where the run's settings go, or None.
 
     Returns:
-        The plan, and the command that carries it out; None where nothing was written.
+        The plan, and the command that carries it out.
 
     Raises:
         UserError: The input is bad, or the file cannot be written; nothing was written.
@@ -49,21 +49,23 @@ def plan(
     config = configured(settings)
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
-    if write is None:
-        return made, None
-    whole = {"scene": str(config.scene), **made.applied_to(settings), "plan": "off"}
-    write_settings(write, whole)
-    return made, f"crossgrad run --config {quote(str(write))}"
+    if write is not None:
+        whole = {"scene": str(config.scene), **made.applied_to(settings), "plan": "off"}
+        write_settings(write, whole)
+        return made, f"run it: crossgrad run --config {quote(str(write))}"
+    if probe_seconds is not None:
+        return made, "--write FILE keeps this for crossgrad run --config FILE"
+    return made, f"run it: crossgrad run {quote(str(config.scene))} --plan auto"
 
 
-def show(made: Plan, way: str | None, *, as_json: bool) -> None:
+def show(made: Plan, way: str, *, as_json: bool) -> None:
     """Prints a plan, and the command that carries it out."""
     if as_json:
         print(json.dumps(made.as_data(), indent=2, ensure_ascii=False))  # noqa: T201
         return
     for line in lines_of(made, get_terminal_size((_COLUMNS, 0)).columns):
         print(line)  # noqa: T201 - the result of the command
-    print(way or "crossgrad run SCENE --plan auto decides the same and trains")  # noqa: T201
+    print(way)  # noqa: T201
 
 
 def _check_free(file: Path) -> None:

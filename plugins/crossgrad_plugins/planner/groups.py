@@ -82,8 +82,8 @@ def views_per_step(evidence: Evidence) -> Decision:
     rule = "1 where the gradient noise scale is below K: further views of a step add nothing"
     source = "McCandlish et al. 2018, the simple noise scale"
     plain = Decision(part, str(most), "default", "", rule, source, "--views K")
-    if evidence.is_given("sampler", "operator"):
-        return plain.found("as the sampler and operator that you set have it")
+    if evidence.is_given("sampler", "operator", "batch_rule", "density_views", "backward"):
+        return plain.found("as suits what you set of sampler, operator and steps")
     probe = evidence.probe
     if probe is None:
         return plain.found(f"the gradient noise scale is {_NOT_KNOWN}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import nan, sqrt
 from typing import Final, cast
 
-from crossgrad_core.commands import RunConfig, TrainingFailedError, UserError
+from crossgrad_core.commands import Progress, RunConfig, TrainingFailedError, UserError
 from crossgrad_plugins.diagnostics.command import Options, diagnose_scene
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
@@ -46,6 +46,7 @@ def probed(config: RunConfig, seconds: float, grouping: str) -> Probe:
         seconds: Training seconds.
         grouping: Which views are near and far.
     """
+    Progress().tell(f"training {seconds:g} seconds to measure gradients")
     length = {"steps": None, "max_views": None, "seconds": seconds, "plan": "off"}
     options = Options(grouping=grouping, probes=1, seconds=seconds, seed=config.seed)
     try:
