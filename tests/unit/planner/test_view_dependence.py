@@ -101,17 +101,17 @@ def test_directions_of_a_narrow_cone_decide_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("tracks", "share", "low", "high", "choice", "basis"),
+    ("figures", "choice", "basis"),
     [
-        (500, 0.0, -0.01, 0.01, "0", "decided"),
-        (500, 0.01, -0.01, 0.03, "3", "default"),
-        (500, 0.05, 0.03, 0.08, "3", "decided"),
-        (view_dependence.FEWEST_TRACKS - 1, 0.0, -0.01, 0.01, "3", "default"),
-        (500, np.nan, np.nan, np.nan, "3", "default"),
+        ((500, 0.0, -0.01, 0.01), "0", "decided"),
+        ((500, 0.01, -0.01, 0.03), "3", "default"),
+        ((500, 0.05, 0.03, 0.08), "3", "decided"),
+        ((view_dependence.FEWEST_TRACKS - 1, 0.0, -0.01, 0.01), "3", "default"),
+        ((500, np.nan, np.nan, np.nan), "3", "default"),
     ],
 )
-def test_the_whole_interval_decides(tracks, share, low, high, choice, basis, monkeypatch):
-    measured = view_dependence.ViewDependence(tracks, share, low, high)
+def test_the_whole_interval_decides(figures, choice, basis, monkeypatch):
+    measured = view_dependence.ViewDependence(*figures)
     monkeypatch.setattr(view_dependence, "view_dependence", lambda scene: measured)
     found = looks.degree(Evidence(configured({"scene": "nowhere"}), ring()))
     assert (found.choice, found.basis) == (choice, basis)
