@@ -17,6 +17,7 @@ from crossgrad_plugins.compare.figures.style import (
     literal,
     looks,
     new_figure,
+    panel_title,
     styled,
 )
 from crossgrad_plugins.compare.quantity import Quantity
@@ -47,7 +48,7 @@ def draw_curves(comparison: Comparison, cost: Cost) -> Drawn:
         for index, scene in enumerate(scenes):
             ax = axes.flat[index]
             _panel(ax, comparison, cost, scene, look)
-            ax.set_title(literal(scene), loc="left")
+            panel_title(ax, scene)
             if index % columns == 0:
                 ax.set_ylabel(comparison.quantity.with_unit)
             if index + columns >= len(scenes):

@@ -12,6 +12,7 @@ from crossgrad_plugins.compare.figures.style import (
     MARKERS,
     PAGE,
     Drawn,
+    columns_for,
     drawn,
     literal,
     new_figure,
@@ -126,7 +127,8 @@ def _key(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
                markersize=3, label=literal(scene))
         for index, scene in enumerate(scenes)
     ]  # fmt: skip
-    ax.figure.legend(handles=handles, loc="outside upper left", ncols=6, borderaxespad=0.0)
+    columns = columns_for([str(handle.get_label()) for handle in handles], 6)
+    ax.figure.legend(handles=handles, loc="outside upper left", ncols=columns, borderaxespad=0.0)
     _limit(ax, rows)
 
 
@@ -135,5 +137,5 @@ def _limit(ax: "Axes", rows: Sequence[Contrast]) -> None:
     dots = [pair.difference for row in rows for pair in row.pairs]
     margin = rows[0].quantity.margin
     low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
-    room = 0.25 * (high - low)
+    room = 0.1 * (high - low)
     ax.set_xlim(low - room, high + room)

@@ -15,6 +15,7 @@ from crossgrad_plugins.compare.figures.style import (
     literal,
     looks,
     new_figure,
+    panel_title,
     styled,
 )
 
@@ -67,7 +68,7 @@ def _panel(ax: "Axes", comparison: Comparison, cost: Cost, scene: str) -> None:
             capsize=2.0,
             label=literal(arm),
         )
-    ax.set_title(literal(scene), loc="left")
+    panel_title(ax, scene)
     ax.set_xscale("log")
     _plain_ticks(ax)
 

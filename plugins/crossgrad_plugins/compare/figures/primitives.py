@@ -15,6 +15,7 @@ from crossgrad_plugins.compare.figures.style import (
     literal,
     looks,
     new_figure,
+    panel_title,
     styled,
 )
 from crossgrad_plugins.compare.quantity import Quantity
@@ -42,7 +43,7 @@ def draw_primitives(comparison: Comparison, cost: Cost) -> Drawn:
                                 linewidth=0)  # fmt: skip
                 ax.plot(x, middle / 1e3, color=look[arm].color, linestyle=look[arm].dash,
                         label=literal(arm))  # fmt: skip
-            ax.set_title(literal(scene), loc="left")
+            panel_title(ax, scene)
             ax.set_xlim(left=0.0)
             ax.set_ylim(bottom=0.0)
             ax.locator_params(axis="x", nbins=5)

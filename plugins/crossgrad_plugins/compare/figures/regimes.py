@@ -14,6 +14,7 @@ from crossgrad_plugins.compare.figures.style import (
     literal,
     looks,
     new_figure,
+    panel_title,
     styled,
 )
 
@@ -37,7 +38,7 @@ def draw_regimes(comparison: Comparison) -> Drawn:
         for index, scene in enumerate(scenes):
             ax = axes.flat[index]
             _panel(ax, comparison, scene)
-            ax.set_title(literal(scene), loc="left")
+            panel_title(ax, scene)
             if index % columns == 0:
                 ax.set_ylabel(comparison.quantity.with_unit)
         for ax in axes.flat[len(scenes) :]:

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from crossgrad_plugins.compare.figures.fonts import fall_back, family
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -49,6 +51,10 @@ _RC: Final[Any] = {
     "ytick.labelsize": 7.5,
 }
 _DPI: Final = 220
+#: About how many letters a page is wide.
+_LETTERS: Final = 110
+#: A name may go on in the next line behind these signs, and anywhere in a part of this length.
+_PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
 _SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
 _ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
 
@@ -102,7 +108,7 @@ def styled() -> Iterator[None]:
     """Figures inside have this style; signs that a font lacks are no warning."""
     from matplotlib import rc_context
 
-    with rc_context(_RC), warnings.catch_warnings():
+    with rc_context({**_RC, "font.family": family()}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
@@ -123,6 +129,7 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+    fall_back(figure)
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
@@ -171,17 +178,35 @@ def literal(text: str) -> str:
     return f"'{text}'" if text.startswith("_") else text
 
 
+def panel_title(ax: "Axes", scene: str) -> None:
+    """Writes a scene's name above its panel, on several lines where the panel is too narrow."""
+    place = ax.get_subplotspec()
+    beside = 1 if place is None else place.get_gridspec().ncols
+    room = _LETTERS // beside - 8
+    lines = [""]
+    for part in _PARTS.findall(scene):
+        if lines[-1] and len(lines[-1] + part) > room:
+            lines.append("")
+        lines[-1] += part
+    ax.set_title(literal("\n".join(lines)), loc="left")
+
+
+def columns_for(labels: Sequence[str], most: int) -> int:
+    """How many columns of a legend with these labels a page is wide enough for."""
+    longest = max((len(label) for label in labels), default=1)
+    return max(1, min(most, len(labels), _LETTERS // (longest + 8)))
+
+
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
     """The arms above all panels, as they are called in `axes`."""
     handles, labels = axes.get_legend_handles_labels()
     known = dict(zip(labels, handles, strict=True))
     shown = [literal(arm) for arm in arms if literal(arm) in known]
-    longest = max((len(label) for label in shown), default=1)
     figure.legend(
         [known[label] for label in shown],
         shown,
         loc="outside upper left",
-        ncols=max(1, min(columns, len(shown), 110 // (longest + 8))),
+        ncols=columns_for(shown, columns),
         handlelength=2.6,
         columnspacing=1.4,
         borderaxespad=0.0,

@@ -1,0 +1,60 @@
+"""What figures are drawn with: letters of a small font, legends that a page has room for."""
+
+import warnings
+
+import pytest
+
+from crossgrad_plugins.compare.figures.fonts import FULL, SMALL
+from crossgrad_plugins.compare.figures.style import (
+    PAGE,
+    columns_for,
+    drawn,
+    new_figure,
+    panel_title,
+    styled,
+)
+
+
+def text_of(figure, word):
+    return next(text for text in figure.texts if text.get_text() == word)
+
+
+def test_signs_that_the_small_font_lacks_come_from_the_full_one():
+    with styled(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        figure = new_figure(3.0, 1.0)
+        figure.text(0.1, 0.1, "Zażółć ±3 dB")
+        figure.text(0.1, 0.5, "Ωμέγα")
+        made = drawn(figure, "name", "title", "caption")
+    assert not [warning for warning in caught if "Glyph" in str(warning.message)]
+    assert text_of(figure, "Zażółć ±3 dB").get_fontfamily() == [SMALL]
+    assert text_of(figure, "Ωμέγα").get_fontfamily() == [SMALL, FULL]
+    assert "Ωμέγα" in made.svg
+
+
+@pytest.mark.parametrize("length", [1, 8, 20, 45, 200])
+def test_a_legend_fits_a_page_whatever_its_labels(length):
+    labels = [("ochota_kap_hybrid, gain " * 9)[:length] for _ in range(9)]
+    with styled():
+        figure = new_figure(PAGE, 2.0)
+        lines = [figure.add_subplot().plot([0], [0], label=label)[0] for label in labels]
+        columns = columns_for(labels, 6)
+        legend = figure.legend(handles=lines, loc="upper left", ncols=columns)
+        box = legend.get_window_extent()
+    assert columns == 1 or box.width <= figure.bbox.width
+    assert (columns > 1) == (length <= 45)
+
+
+@pytest.mark.parametrize("beside", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    "scene", ["city", "ochota_kap_hybrid_gain", "a b c" * 30, "x" * 90, "_", "$y_$", "城" * 5]
+)
+def test_a_title_fits_its_panel_and_keeps_every_letter(beside, scene):
+    with styled():
+        figure = new_figure(PAGE, 2.0)
+        ax = figure.subplots(1, beside, squeeze=False)[0, 0]
+        panel_title(ax, scene)
+        figure.get_layout_engine().execute(figure)
+        title = ax.get_title(loc="left")
+    assert title.replace("\n", "").strip("'") == scene.strip("'")
+    assert all(len(line) <= 110 // beside - 8 + 1 for line in title.split("\n"))
