@@ -173,7 +173,10 @@ class RunConfig(BaseModel):
     densify_until: int | None = Field(None, ge=0, description="... and before this")
     densify_every: int | None = Field(None, ge=1, description="interval of its edits, likewise")
     fewest_edits: int | None = Field(
-        None, ge=1, description="edits that any run has, warm-up and interval giving way"
+        None,
+        ge=0,
+        description="edits that any run has, warm-up and interval giving way. Default: 6 where "
+        "growth follows a curve, from 600 views on, else none",
     )
     reset_every: int | None = Field(
         None, ge=1, description="interval of opacity resets, counted in --events"

@@ -24,6 +24,9 @@ SHORTEST_RUN_WITH_RESET = 10_000
 #: Where edits are counted in views, an interval is a pass over the training photos as far as that
 #: leaves room for so many edits.
 USUAL_EDITS = 6
+#: Growth along a curve has so many edits in runs of so many views or more; below, what it adds has
+#: no time to settle and costs 0.1 to 1 dB (docs/schedules.md).
+SHORTEST_RUN_WITH_EDITS = 600
 #: A run that is to have edits however short it is has no shorter interval than this: what fewer
 #: views say of gradients makes nearly everything grow.
 LEAST_INTERVAL = 8
@@ -47,6 +50,7 @@ class Counting:
             published one.
         fewest_edits: So many edits of density control there are in any run, however short: warm-up
             and interval, which are the least of a longer run, give way. Counted in views only.
+        edits_from: They are asked for from this length on.
     """
 
     unit: Unit = "steps"
@@ -54,6 +58,7 @@ class Counting:
     photos: int = 1
     reference: int | None = None
     fewest_edits: int = 0
+    edits_from: int = 0
 
 
 IN_STEPS = Counting()
@@ -130,7 +135,8 @@ class Schedule:
             counting=counting,
             pace=pace,
         )
-        if counting.unit == "views" and not schedule.published:
+        long = counting.unit == "views" and length >= counting.edits_from
+        if long and not schedule.published:
             schedule = replace(schedule, fewest_edits=counting.fewest_edits)
         return schedule.with_edits(until=length // 2)
 
@@ -154,7 +160,9 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.fewest_edits:
-            start, every = _fitted(start, last, max(every, photos), photos, self.fewest_edits)
+            # A pass over more photos than there is room for does not shorten the warm-up.
+            whole = max(every, photos) if photos <= last // self.fewest_edits else every
+            start, every = _fitted(start, last, whole, photos, self.fewest_edits)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
 
     @property
@@ -230,7 +238,8 @@ class Schedule:
         )
         if over:
             return longer
-        if self.fewest_edits:
+        longer = replace(longer, fewest_edits=wanted.fewest_edits)
+        if longer.fewest_edits:
             return _with_edits_ahead(longer, wanted, step)
         return replace(longer, densify_until=max(self.counted(step), wanted.densify_until))
 

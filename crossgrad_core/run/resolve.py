@@ -6,7 +6,8 @@ from typing import Any
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
-from crossgrad_core.training.room import bound_of, growth_of
+from crossgrad_core.training.room import bound_of
+from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import average_of, final_decay_of
 
@@ -47,7 +48,7 @@ def resolved(setup: Setup) -> RunConfig:
             "events": setup.schedule.counting.unit,
             "final_decay": _final_decay(config, setup),
             "average": average_of(config),
-            "growth": growth_of(setup),
+            "growth": growth_of(setup.config, setup.densifier),
             "max_gaussians": bound_of(setup),
         }
     )

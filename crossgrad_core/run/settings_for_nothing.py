@@ -118,7 +118,7 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
         yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not in seconds; add --seconds"
-    if config.fewest_edits is not None and not setup.schedule.fewest_edits:
+    if config.fewest_edits and not setup.schedule.fewest_edits:
         why = "are published or have times that were set are not made to fit"
         yield "fewest_edits", f"edits that count steps, {why}"
 

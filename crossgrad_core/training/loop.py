@@ -11,7 +11,7 @@ from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.foresight import Foresight
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.model import model_of
-from crossgrad_core.training.room import growth_of
+from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import take_step
@@ -154,7 +154,7 @@ def _rewind(
 
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
-    if held_back > 0 and growth_of(setup) == "free":
+    if held_back > 0 and growth_of(setup.config, setup.densifier) == "free":
         setup.hook.crossgrad_message(
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"

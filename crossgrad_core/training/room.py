@@ -8,6 +8,7 @@ from crossgrad_core.config import AUTO
 from crossgrad_core.contract.schedule import REFERENCE
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
+from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import average_of
@@ -31,7 +32,8 @@ def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
 
 def _most(setup: Setup, state: TrainState) -> int:
     """The most primitives that there may be after this step's edit."""
-    schedule, growth, given = setup.schedule, growth_of(setup), bound_of(setup)
+    schedule, given = setup.schedule, bound_of(setup)
+    growth = growth_of(setup.config, setup.densifier)
     if growth == "free" and given != AUTO:
         return given or sys.maxsize
     # Nothing is added before the first edit: what is there then is the start.
@@ -44,20 +46,11 @@ def _most(setup: Setup, state: TrainState) -> int:
     return min(budget, curve(events - schedule.edits(state.step), events, start, budget))
 
 
-def growth_of(setup: Setup) -> Literal["free", "curve"]:
-    """How the number of primitives grows: as was asked for, else as suits the densifier."""
-    if setup.config.growth is not None:
-        return setup.config.growth
-    # A bound that somebody names is a bound and no aim, and published times have published growth.
-    named = setup.config.max_gaussians not in {None, AUTO}
-    led = setup.densifier.budgeted and setup.schedule.counting.unit == "views"
-    return "curve" if led and not named else "free"
-
-
 def bound_of(setup: Setup) -> int | Literal["auto"] | None:
     """The bound on the number of primitives; a curve to nowhere leads to what suits the length."""
     given = setup.config.max_gaussians
-    return AUTO if given is None and growth_of(setup) == "curve" else given
+    led = growth_of(setup.config, setup.densifier) == "curve"
+    return AUTO if given is None and led else given
 
 
 def usual_budget(start: int, length: int) -> int:

@@ -2,29 +2,49 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
-from crossgrad_core.config import RunConfig
+from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
-from crossgrad_core.contract.schedule import Counting, Schedule, Unit, is_published
-from crossgrad_core.training.room import growth_of
+from crossgrad_core.contract.schedule import (
+    SHORTEST_RUN_WITH_EDITS,
+    USUAL_EDITS,
+    Counting,
+    Schedule,
+    Unit,
+    is_published,
+)
 from crossgrad_core.training.setup import Setup
 
 #: Times of density control that the user may set.
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
-def counting_of(config: RunConfig, views: ViewPlan, photos: int) -> Counting:
+def counting_of(config: RunConfig, densifier: Densifier, views: ViewPlan, photos: int) -> Counting:
     """What the schedule of a run counts.
 
     Args:
         config: Its configuration.
+        densifier: Its density control.
         views: How many views its steps have.
         photos: Its training photos.
     """
-    fewest = config.fewest_edits or 0
-    return Counting(unit_of(config), views, photos, config.reference, fewest)
+    plain = Counting(unit_of(config), views, photos, config.reference, config.fewest_edits or 0)
+    # Without a budget early growth copies nearly everything, and a short run ends lower.
+    if config.fewest_edits is not None or growth_of(config, densifier) == "free":
+        return plain
+    return replace(plain, fewest_edits=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
+
+
+def growth_of(config: RunConfig, densifier: Densifier) -> Literal["free", "curve"]:
+    """How the number of primitives grows: as was asked for, else as suits the densifier."""
+    if config.growth is not None:
+        return config.growth
+    # A bound that somebody names is a bound and no aim, and published times have published growth.
+    named = config.max_gaussians not in {None, AUTO}
+    led = densifier.budgeted and unit_of(config) == "views"
+    return "curve" if led and not named else "free"
 
 
 def unit_of(config: RunConfig) -> Unit:
@@ -58,7 +78,8 @@ def notes_on_length(setup: Setup) -> tuple[str, ...]:
 
 def _curve_note(setup: Setup) -> tuple[str, ...]:
     """Says that growth follows the curve, where nobody asked for it."""
-    if not setup.schedule.grows or setup.config.growth or growth_of(setup) == "free":
+    free = growth_of(setup.config, setup.densifier) == "free"
+    if not setup.schedule.grows or setup.config.growth or free:
         return ()
     return (
         "growth follows a curve to the number of primitives that suits the length (--max-gaussians "

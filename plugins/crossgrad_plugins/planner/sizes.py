@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Final
 
 from crossgrad_core.commands import counting_of, usual_budget
-from crossgrad_core.plugin import Resolution, Schedule, build_component
+from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
 from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 
@@ -104,7 +104,9 @@ def densifier(evidence: Evidence) -> Decision:
         return plain.found("the length follows the clock, and edits follow the length")
     if evidence.is_given(*_EDITS):
         return plain.found("edits are as you set them")
-    counting = counting_of(config, evidence.view_plan, len(evidence.scene.train_views))
+    control = build_component(Densifier, usual, {} if named is None else named.options)
+    photos = len(evidence.scene.train_views)
+    counting = counting_of(config, control, evidence.view_plan, photos)
     edits = Schedule.for_run(steps, config.schedule, counting).edits()
     shown = plain.found(f"{edits} edits in {steps:,} steps", decided=True, figures={"edits": edits})
     if edits:

@@ -159,6 +159,13 @@ def test_any_run_has_six_edits_of_a_pass_each_where_it_is_long_enough(text, step
         assert schedule.densify_every >= SHORTEST_INTERVAL
 
 
+@pytest.mark.parametrize("photos", [250, 3000])
+def test_more_photos_than_edits_have_room_for_leave_the_warm_up_as_it_is(photos):
+    schedule = Schedule.for_run(1250, counting=in_views("2", photos))
+    assert schedule.densify_from == SHORTEST_WARM_UP
+    assert schedule.edits() == FEWEST_EDITS
+
+
 def test_floors_hold_in_views_where_no_edits_are_asked_for():
     def default(steps, photos=24):
         return Schedule.for_run(steps, counting=Counting("views", ViewPlan.parsed("2"), photos))

@@ -23,7 +23,8 @@ from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import room
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.room import bound_of, curve, growth_of, usual_budget
+from crossgrad_core.training.room import bound_of, curve, usual_budget
+from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.start import first_state
 
 #: Densifiers that want more than any curve gives them, and their backbones.
@@ -136,9 +137,11 @@ def test_what_growth_a_run_has(settings, growth, bound):
     """And the resolved configuration asks for the same, in so many words."""
     config = RunConfig.model_validate({"steps": 2_000, **settings})
     setup = assemble(config, sample_scene(), "none")
-    assert (growth_of(setup), bound_of(setup)) == (growth, bound)
+    assert (growth_of(setup.config, setup.densifier), bound_of(setup)) == (growth, bound)
     written = resolved(setup)
     assert (written.growth, written.max_gaussians) == (growth, bound)
+    led = growth == "curve" and setup.schedule.counting.unit == "views"
+    assert setup.schedule.fewest_edits == (6 if led else 0)
     assert any("follows a curve" in note for note in setup.notes) == (
         growth == "curve" and "growth" not in settings
     )
@@ -184,7 +187,8 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
             schedule = first.lengthened(wanted, turn)
         state.step = step
         if step <= schedule.total and schedule.densifies(step):
-            setup = SimpleNamespace(config=config, schedule=schedule)
+            densifier = SimpleNamespace(budgeted=True)
+            setup = SimpleNamespace(config=config, schedule=schedule, densifier=densifier)
             present = max(present, room._most(setup, state))
             reached.append(present)
     assert len(reached) >= 3
