@@ -166,6 +166,15 @@ def test_more_photos_than_edits_have_room_for_leave_the_warm_up_as_it_is(photos)
     assert schedule.edits() == FEWEST_EDITS
 
 
+def test_edits_that_are_asked_for_from_a_length_on_follow_the_clock_there_and_back():
+    counting = replace(in_views("1"), edits_from=600)
+    short, long = (Schedule.for_run(views, counting=counting) for views in (599, 600))
+    assert short.edits() == 0
+    assert long.edits() == FEWEST_EDITS
+    assert short.lengthened(long, 100).edits() == FEWEST_EDITS
+    assert long.lengthened(short, 100).fewest_edits == 0
+
+
 def test_floors_hold_in_views_where_no_edits_are_asked_for():
     def default(steps, photos=24):
         return Schedule.for_run(steps, counting=Counting("views", ViewPlan.parsed("2"), photos))
