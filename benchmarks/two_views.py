@@ -1,4 +1,4 @@
-"""What the second view of a step is worth: the tables of docs/results/two-views.md.
+"""The worth of the second view of a step: the tables of docs/results/two-views.md.
 
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml --best benchmarks/grids/two_views.yaml

@@ -178,7 +178,12 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
     config = _with_steps(config, selection.views)
-    counting = counting_of(config, selection.densifier, selection.views, len(scene.train_views))
+    counting = counting_of(
+        config,
+        selection.views,
+        len(scene.train_views),
+        budgeted=selection.densifier.budgeted,
+    )
     steps = config.steps or DEFAULT_STEPS
     setup = Setup(
         config=config,

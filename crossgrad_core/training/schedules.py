@@ -21,29 +21,29 @@ from crossgrad_core.training.setup import Setup
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
-def counting_of(config: RunConfig, densifier: Densifier, views: ViewPlan, photos: int) -> Counting:
+def counting_of(config: RunConfig, views: ViewPlan, photos: int, *, budgeted: bool) -> Counting:
     """What the schedule of a run counts.
 
     Args:
         config: Its configuration.
-        densifier: Its density control.
         views: How many views its steps have.
         photos: Its training photos.
+        budgeted: Whether its density control is led along a curve by itself.
     """
     plain = Counting(unit_of(config), views, photos, config.reference, config.fewest_edits or 0)
     # Without a budget early growth copies nearly everything, and a short run ends lower.
-    if config.fewest_edits is not None or growth_of(config, densifier) == "free":
+    if config.fewest_edits is not None or growth_of(config, budgeted=budgeted) == "free":
         return plain
     return replace(plain, fewest_edits=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
 
 
-def growth_of(config: RunConfig, densifier: Densifier) -> Literal["free", "curve"]:
+def growth_of(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
     """How the number of primitives grows: as was asked for, else as suits the densifier."""
     if config.growth is not None:
         return config.growth
     # A bound that somebody names is a bound and no aim, and published times have published growth.
     named = config.max_gaussians not in {None, AUTO}
-    led = densifier.budgeted and unit_of(config) == "views"
+    led = budgeted and unit_of(config) == "views"
     return "curve" if led and not named else "free"
 
 
@@ -78,7 +78,7 @@ def notes_on_length(setup: Setup) -> tuple[str, ...]:
 
 def _curve_note(setup: Setup) -> tuple[str, ...]:
     """Says that growth follows the curve, where nobody asked for it."""
-    free = growth_of(setup.config, setup.densifier) == "free"
+    free = growth_of(setup.config, budgeted=setup.densifier.budgeted) == "free"
     if not setup.schedule.grows or setup.config.growth or free:
         return ()
     return (

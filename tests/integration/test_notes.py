@@ -65,7 +65,9 @@ def test_they_are_no_settings(scene, tmp_path):
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
 
 
-@pytest.mark.parametrize(("length", "known"), [({"max_views": 1000}, 1), ({"seconds": 60.0}, 0)])
+@pytest.mark.parametrize(
+    ("length", "known"), [({"max_views": 599}, 1), ({"max_views": 600}, 0), ({"seconds": 60.0}, 0)]
+)
 def test_a_dry_run_says_that_there_is_no_density_control(scene, capsys, length, known):
     assert app.run({"scene": str(scene), **length}, dry_run=True, verbosity=-1) == 0
     assert capsys.readouterr().out.count(f"# {GROWTH}") == known

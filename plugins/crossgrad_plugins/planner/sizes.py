@@ -104,15 +104,23 @@ def densifier(evidence: Evidence) -> Decision:
         return plain.found("the length follows the clock, and edits follow the length")
     if evidence.is_given(*_EDITS):
         return plain.found("edits are as you set them")
-    control = build_component(Densifier, usual, {} if named is None else named.options)
-    photos = len(evidence.scene.train_views)
-    counting = counting_of(config, control, evidence.view_plan, photos)
-    edits = Schedule.for_run(steps, config.schedule, counting).edits()
+    edits = _edits(evidence, steps, budgeted=True)
+    if edits != _edits(evidence, steps, budgeted=False):
+        # Not before: what a run has no use for is not imported.
+        control = build_component(Densifier, usual, {} if named is None else named.options)
+        edits = _edits(evidence, steps, budgeted=control.budgeted)
     shown = plain.found(f"{edits} edits in {steps:,} steps", decided=True, figures={"edits": edits})
     if edits:
         return shown
     saved = "its screen statistics, and its module"
     return shown.changed("none", {"densifier": "none"}, f"--densifier {usual}", saved)
+
+
+def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:
+    """The edits of a run, whose density control is led by a budget or not."""
+    photos = len(evidence.scene.train_views)
+    counting = counting_of(evidence.config, evidence.view_plan, photos, budgeted=budgeted)
+    return Schedule.for_run(steps, evidence.config.schedule, counting).edits()
 
 
 #: Settings that only make sense with density control.

@@ -56,7 +56,7 @@ class Run:
 
 def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
     return Run(
-        RunConfig(steps=steps, schedule=mode),
+        RunConfig(steps=steps, schedule=mode, events="steps"),
         build("densifiers", densifier, {}),
         SimpleNamespace(
             names={"densifier": densifier},
