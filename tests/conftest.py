@@ -1,11 +1,15 @@
 """What all tests share.
 
 Runs do not draw their curve. Threads that wait do not spin: the processes of the tests share the
-cores, and spinning took as much time as the work.
+cores, and spinning took as much time as the work. Ctrl-C is not ignored, as it is in what a script
+starts in the background.
 """
 
 import os
+import signal
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Before torch and numba are imported.
 
 import pytest
