@@ -9,6 +9,7 @@ what is missing: on another machine, too. The same sweep gives the same file.
 """
 
 import argparse
+import sys
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,15 +34,15 @@ def pack(sweep: Path, archive: Path) -> int:
         How many runs it holds.
 
     Raises:
-        UserError: No run of the sweep has finished.
+        UserError: The folder is no sweep, or none of its runs has finished.
     """
     runs = [each for each in sorted((sweep / "runs").glob("*")) if _is_finished(each)]
-    if not runs:
+    if not runs or not (sweep / "runs.csv").is_file():
         raise UserError(
             "nothing to keep",
             where=sweep,
-            expected="the folder of a sweep with runs that finished",
-            found="none",
+            expected="the folder of a sweep, with runs that finished and their table runs.csv",
+            found=f"{len(runs)} finished runs" if runs else "none",
             todo="name the folder that `crossgrad sweep` printed",
         )
     archive.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +100,11 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
     given = parser.parse_args()
-    done = {"pack": pack, "unpack": unpack}[given.what](given.source, given.target)
+    try:
+        done = {"pack": pack, "unpack": unpack}[given.what](given.source, given.target)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
     print(f"{given.target}: {done} runs")
 
 

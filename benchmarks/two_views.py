@@ -11,17 +11,22 @@ published rates. Differences are paired by scene and seed; verdicts are those of
 """
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+from _paper_verdicts import figure_of
+
+from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.checks.scenes import check_scenes
 from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.source import read_runs
-from crossgrad_plugins.compare.words import interval_text, needed_text
+from crossgrad_plugins.compare.statistics.verdict import Verdict
+from crossgrad_plugins.compare.words import needed_text
 
 PSNR = Quantity.of("psnr")
 ONE, TWO = "one view", "two views"
@@ -103,14 +108,10 @@ def differences(runs: Runs, ending: str) -> Iterator[str]:
 
 def pooled(found: Contrast) -> str:
     """The pooled difference with its interval and its verdict, as two cells."""
-    if found.estimate is None:
-        return " | "
-    center = PSNR.difference(found.estimate.center)
-    interval = interval_text(found, found.estimate.wide)
     verdict = str(found.verdict)
-    if verdict == "inconclusive":
+    if found.verdict is Verdict.INCONCLUSIVE:
         verdict += f": {needed_text(found)}"
-    return f"{center} ({interval}; n = {found.estimate.pairs}) | {verdict}"
+    return f"{figure_of(found)} | {verdict}"
 
 
 def arms(runs: Runs) -> Iterator[str]:
@@ -158,7 +159,12 @@ def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweeps", type=Path, nargs="+")
-    runs = Runs.read(parser.parse_args().sweeps)
+    given = parser.parse_args()
+    try:
+        runs = Runs.read(given.sweeps)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
     for title, ending in RATES.items():
         print(f"### Two views minus one, {title}\n")
         print("\n".join(differences(runs, ending)), end="\n\n")

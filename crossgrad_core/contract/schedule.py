@@ -25,7 +25,7 @@ SHORTEST_RUN_WITH_RESET = 10_000
 #: leaves room for so many edits.
 USUAL_EDITS = 6
 #: Growth along a curve has so many edits in runs of so many views or more; below, what it adds has
-#: no time to settle and costs 0.1 to 1 dB (docs/schedules.md).
+#: no time to settle and can cost 1 dB (docs/schedules.md).
 SHORTEST_RUN_WITH_EDITS = 600
 #: A run that is to have edits however short it is has no shorter interval than this: what fewer
 #: views say of gradients makes nearly everything grow.

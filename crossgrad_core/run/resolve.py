@@ -48,7 +48,7 @@ def resolved(setup: Setup) -> RunConfig:
             "events": setup.schedule.counting.unit,
             "final_decay": _final_decay(config, setup),
             "average": average_of(config),
-            "growth": growth_of(setup.config, budgeted=setup.densifier.budgeted),
+            "growth": growth_of(setup),
             "max_gaussians": bound_of(setup),
         }
     )

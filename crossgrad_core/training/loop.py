@@ -154,7 +154,7 @@ def _rewind(
 
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
-    if held_back > 0 and growth_of(setup.config, budgeted=setup.densifier.budgeted) == "free":
+    if held_back > 0 and growth_of(setup) == "free":
         setup.hook.crossgrad_message(
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"

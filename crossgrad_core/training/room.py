@@ -32,8 +32,7 @@ def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
 
 def _most(setup: Setup, state: TrainState) -> int:
     """The most primitives that there may be after this step's edit."""
-    schedule, given = setup.schedule, bound_of(setup)
-    growth = growth_of(setup.config, budgeted=setup.densifier.budgeted)
+    schedule, growth, given = setup.schedule, growth_of(setup), bound_of(setup)
     if growth == "free" and given != AUTO:
         return given or sys.maxsize
     # Nothing is added before the first edit: what is there then is the start.
@@ -49,8 +48,7 @@ def _most(setup: Setup, state: TrainState) -> int:
 def bound_of(setup: Setup) -> int | Literal["auto"] | None:
     """The bound on the number of primitives; a curve to nowhere leads to what suits the length."""
     given = setup.config.max_gaussians
-    led = growth_of(setup.config, budgeted=setup.densifier.budgeted) == "curve"
-    return AUTO if given is None and led else given
+    return AUTO if given is None and growth_of(setup) == "curve" else given
 
 
 def usual_budget(start: int, length: int) -> int:

@@ -32,13 +32,17 @@ def counting_of(config: RunConfig, views: ViewPlan, photos: int, *, budgeted: bo
     """
     plain = Counting(unit_of(config), views, photos, config.reference, config.fewest_edits or 0)
     # Without a budget early growth copies nearly everything, and a short run ends lower.
-    if config.fewest_edits is not None or growth_of(config, budgeted=budgeted) == "free":
+    if config.fewest_edits is not None or _growth(config, budgeted=budgeted) == "free":
         return plain
     return replace(plain, fewest_edits=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
 
 
-def growth_of(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
+def growth_of(setup: Setup) -> Literal["free", "curve"]:
     """How the number of primitives grows: as was asked for, else as suits the densifier."""
+    return _growth(setup.config, budgeted=setup.densifier.budgeted)
+
+
+def _growth(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
     if config.growth is not None:
         return config.growth
     # A bound that somebody names is a bound and no aim, and published times have published growth.
@@ -78,8 +82,7 @@ def notes_on_length(setup: Setup) -> tuple[str, ...]:
 
 def _curve_note(setup: Setup) -> tuple[str, ...]:
     """Says that growth follows the curve, where nobody asked for it."""
-    free = growth_of(setup.config, budgeted=setup.densifier.budgeted) == "free"
-    if not setup.schedule.grows or setup.config.growth or free:
+    if not setup.schedule.grows or setup.config.growth or growth_of(setup) == "free":
         return ()
     return (
         "growth follows a curve to the number of primitives that suits the length (--max-gaussians "

@@ -92,8 +92,7 @@ def length(evidence: Evidence) -> Decision:
 
 def densifier(evidence: Evidence) -> Decision:
     """Whether there is density control."""
-    part, config = "densifier", evidence.config
-    named = config.densifier
+    part, named = "densifier", evidence.config.densifier
     usual = evidence.backbone.default_densifier if named is None else named.name
     if evidence.is_given("densifier", "backbone"):
         return given(part, usual, "--densifier NAME")
@@ -107,7 +106,7 @@ def densifier(evidence: Evidence) -> Decision:
     edits = _edits(evidence, steps, budgeted=True)
     if edits != _edits(evidence, steps, budgeted=False):
         # Not before: what a run has no use for is not imported.
-        control = build_component(Densifier, usual, {} if named is None else named.options)
+        control = build_component(Densifier, usual, {})
         edits = _edits(evidence, steps, budgeted=control.budgeted)
     shown = plain.found(f"{edits} edits in {steps:,} steps", decided=True, figures={"edits": edits})
     if edits:

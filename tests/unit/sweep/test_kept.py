@@ -58,6 +58,13 @@ def test_runs_that_did_not_finish_are_left_out(script, sweep, tmp_path):
         script.pack(sweep, tmp_path / "grid.tar.xz")
 
 
+def test_runs_that_belong_to_no_sweep_are_refused_and_nothing_is_left(script, sweep, tmp_path):
+    (sweep / "runs.csv").unlink()
+    with pytest.raises(UserError, match="nothing to keep"):
+        script.pack(sweep, tmp_path / "results" / "grid.tar.xz")
+    assert not (tmp_path / "results").exists()
+
+
 def test_what_is_there_stays(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     (sweep / "runs" / "r0" / "metrics.csv").write_text("newer")

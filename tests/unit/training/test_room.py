@@ -137,8 +137,7 @@ def test_what_growth_a_run_has(settings, growth, bound):
     """And the resolved configuration asks for the same, in so many words."""
     config = RunConfig.model_validate({"steps": 2_000, **settings})
     setup = assemble(config, sample_scene(), "none")
-    assert bound_of(setup) == bound
-    assert growth_of(config, budgeted=setup.densifier.budgeted) == growth
+    assert (growth_of(setup), bound_of(setup)) == (growth, bound)
     written = resolved(setup)
     assert (written.growth, written.max_gaussians) == (growth, bound)
     led = growth == "curve" and setup.schedule.counting.unit == "views"
