@@ -188,12 +188,19 @@ class Schedule:
 
     def edits(self, after: int = 0) -> int:
         """Number of the run's steps behind step `after` that density control follows."""
-        first = self.next_edit(self.counted(after))
-        end = min(self.densify_until, self.counted(self.total) + 1)
-        ahead = range(first, end, self.densify_every)
+        ahead = self._edits_ahead(after)
         if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
             return len(ahead)
-        return len({self.pace.step_of(count) for count in ahead})
+        return len(self.edit_steps(after))
+
+    def edit_steps(self, after: int = 0) -> list[int]:
+        """The steps behind step `after` that density control follows, in order."""
+        return sorted({self.step_of(count) for count in self._edits_ahead(after)})
+
+    def _edits_ahead(self, after: int) -> range:
+        """The counts behind a step at which an edit is due."""
+        end = min(self.densify_until, self.counted(self.total) + 1)
+        return range(self.next_edit(self.counted(after)), end, self.densify_every)
 
     @property
     def grows(self) -> bool:

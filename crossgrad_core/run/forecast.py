@@ -47,7 +47,7 @@ class Forecast:
         self._told = True
         step, seconds = self._first or (0, 0.0)
         each = (state.clock.train - seconds) / (state.step - step)
-        ahead = seconds_ahead(setup, state.step, each)
+        ahead = seconds_ahead(setup, state, each)
         if ahead < WORTH_A_LINE:
             return
         left = setup.schedule.total - state.step

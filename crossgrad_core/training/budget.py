@@ -8,8 +8,16 @@ from typing import Protocol
 
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.training.clock import ClockKind
+from crossgrad_core.training.expected_cost import (
+    Crowd,
+    cost_ahead,
+    cost_of_run,
+    growth_ahead,
+    schedule_for,
+    views_of,
+)
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.schedules import growth_note, notes_on_length, schedule_of
+from crossgrad_core.training.schedules import growth_note, notes_on_length
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import TrainState
@@ -19,11 +27,6 @@ _LOG = logging.getLogger(__name__)
 PROBE_STEPS = 12
 #: ... and the share of the budget that the probe takes beyond that.
 PROBE_SHARE = 0.01
-#: What each edit of density control adds to the mean cost of a step, in units of a step at the
-#: start: chosen on runs with four edits. The clock corrects it as a run goes.
-COST_PER_EDIT = 0.2
-#: Growth slows down: more edits than these are not counted.
-COUNTED_EDITS = 5
 #: Share of the budget between two looks at the clock.
 LOOK_SHARE = 0.02
 #: A length that is off by a smaller share of what is left stays.
@@ -54,8 +57,8 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         steps, each = _probed(probed, state, seconds)
         note += f", {steps} at full size {each * pace.at(_NEVER) * 1000:.1f} ms"
         share = min(1.0, max(0.0, (1.0 - first / each) / (1.0 - pixels)))
-    measured = replace(setup, pixel_share=share)
-    total = _fitting(lambda steps: _cost(measured, steps), seconds / each)
+    measured, crowd = replace(setup, pixel_share=share), Crowd.of(setup, state)
+    total = _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
     return total, f"{text}the length follows the clock as the run goes", share
@@ -134,12 +137,13 @@ class Timed:
         """The setup with the length that now fits; its configuration says so."""
         # Of a view, as a step may have another number of them later.
         seconds = state.clock.trained(self._kind) - self._clock
-        newest = seconds / _work(setup, setup.schedule, self._step, state.step)
+        newest = seconds / views_of(setup, setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
         self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
         affordable = (self._seconds - state.clock.trained(self._kind)) / each
-        total = state.step + _fitting(lambda left: _cost_ahead(setup, state.step, left), affordable)
+        crowd, step = Crowd.of(setup, state), state.step
+        total = step + _fitting(lambda left: cost_ahead(setup, crowd, step, left), affordable)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
         revisions = (*setup.config.revisions, (state.step, total))
@@ -150,23 +154,23 @@ class Timed:
         self._step, self._clock = state.step, state.clock.trained(self._kind)
 
 
-def seconds_ahead(setup: Setup, step: int, each: float) -> float:
-    """Training seconds that the steps after `step` are going to take, growth included.
+def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
+    """Training seconds that the steps still to be taken are going to take, growth included.
 
     Args:
         setup: The run.
-        step: Steps done.
+        state: What it has reached.
         each: Seconds that a step takes now.
     """
-    schedule = setup.schedule
-    now = _work(setup, schedule, max(0, step - 1), max(1, step))
-    steps = _work(setup, schedule, step, schedule.total) / now
-    return steps * each * _growth(setup, schedule, step)
+    schedule, step = setup.schedule, state.step
+    now = views_of(setup, schedule, max(0, step - 1), max(1, step))
+    steps = views_of(setup, schedule, step, schedule.total) / now
+    return steps * each * growth_ahead(setup, Crowd.of(setup, state), schedule, step)
 
 
 def lengthened(setup: Setup, step: int, total: int) -> Setup:
     """The setup of a run that has reached `step` and is to have `total` steps in all."""
-    wanted = _schedule_of(setup, total)
+    wanted = schedule_for(setup, total)
     setup.hook.crossgrad_length(step=step, total=total)
     schedule = setup.schedule.lengthened(wanted, step)
     return _with_notes(replace(setup, schedule=schedule), instead_of=setup)
@@ -219,39 +223,6 @@ def _without_edits(schedule: Schedule) -> Schedule:
         densify_every=_NEVER,
         reset_every=None,
     )
-
-
-def _schedule_of(setup: Setup, steps: int) -> Schedule:
-    """The schedule that the run would have, were it so long from its start."""
-    return schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
-
-
-def _work(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
-    """Expected cost of the steps after one and up to another one, in views of full size."""
-    resolution = setup.selection.resolution
-    views = schedule.pace.views(until) - schedule.pace.views(after)
-    pixels = resolution.pixels(schedule, until) - resolution.pixels(schedule, after)
-    return views + setup.pixel_share * (pixels - views)
-
-
-def _cost(setup: Setup, steps: int) -> float:
-    """Expected cost of a run of so many steps, in units of a view of full size at its start."""
-    schedule = _schedule_of(setup, steps)
-    return _work(setup, schedule, 0, steps) * _growth(setup, schedule, 0)
-
-
-def _cost_ahead(setup: Setup, step: int, left: int) -> float:
-    """Expected cost of the `left` steps after `step`, in units of a view of full size now."""
-    schedule = setup.schedule.lengthened(_schedule_of(setup, step + left), step)
-    return _work(setup, schedule, step, step + left) * _growth(setup, schedule, step)
-
-
-def _growth(setup: Setup, schedule: Schedule, step: int) -> float:
-    if not setup.densifier.edits:
-        return 1.0
-    ahead = schedule.edits(step)
-    done = schedule.edits_before + schedule.edits() - ahead
-    return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
 def _fitting(cost: Callable[[int], float], affordable: float) -> int:

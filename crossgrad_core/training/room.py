@@ -5,7 +5,7 @@ from math import exp, log
 from typing import Literal, cast
 
 from crossgrad_core.config import AUTO
-from crossgrad_core.contract.schedule import REFERENCE
+from crossgrad_core.contract.schedule import REFERENCE, Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.schedules import growth_of
@@ -32,17 +32,36 @@ def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
 
 def _most(setup: Setup, state: TrainState) -> int:
     """The most primitives that there may be after this step's edit."""
-    schedule, growth, given = setup.schedule, growth_of(setup), bound_of(setup)
-    if growth == "free" and given != AUTO:
+    given = bound_of(setup)
+    if growth_of(setup) == "free" and given != AUTO:
         return given or sys.maxsize
-    # Nothing is added before the first edit: what is there then is the start.
-    first = PluginState({"start": state.primitives(setup)})
-    start = cast("int", state.states.setdefault(STATE, first).values["start"])
+    start = started_with(setup, state)
+    state.states.setdefault(STATE, PluginState({"start": start}))
+    return most_after(setup, setup.schedule, state.step, start)
+
+
+def started_with(setup: Setup, state: TrainState) -> int:
+    """The number of primitives at the start of a run, where growth depends on it."""
+    kept = state.states.get(STATE)
+    # Nothing is added before the first edit: what is there until then is the start.
+    return state.primitives(setup) if kept is None else cast("int", kept.values["start"])
+
+
+def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
+    """The most primitives that there may be after an edit in a run that began with `start`.
+
+    Args:
+        setup: The run; its growth follows the curve, or its budget is `auto`.
+        schedule: Its schedule.
+        step: The step of the edit.
+        start: Primitives at the start.
+    """
+    given = bound_of(setup)
     budget = usual_budget(start, schedule.length) if given == AUTO else given or sys.maxsize
-    if growth == "free" or budget == sys.maxsize:
+    if growth_of(setup) == "free" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
-    return min(budget, curve(events - schedule.edits(state.step), events, start, budget))
+    return min(budget, curve(events - schedule.edits(step), events, start, budget))
 
 
 def bound_of(setup: Setup) -> int | Literal["auto"] | None:

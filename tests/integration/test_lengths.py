@@ -17,7 +17,8 @@ from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.settings import merged
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.budget import _cost, _cost_ahead, seconds_ahead
+from crossgrad_core.training.budget import seconds_ahead
+from crossgrad_core.training.expected_cost import Crowd, cost_ahead, cost_of_run
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -162,11 +163,18 @@ def test_what_is_no_k_is_refused_with_its_form(text, form):
 def test_views_that_are_ahead_cost_what_they_cost():
     settings = {"steps": 1000, "densifier": {"name": "none"}}
     plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
-    assert _cost(plain, 500) == _cost(changing, 500) == 1000
-    assert _cost_ahead(changing, 500, 400) == 1200
-    assert seconds_ahead(plain, 200, 0.5) == 400.0
-    assert seconds_ahead(changing, 200, 0.5) == (300 + 1500) * 0.5
-    assert seconds_ahead(changing, 500, 0.5) == 1500 * 0.5
+    crowd = Crowd(start=100, present=100)
+    assert cost_of_run(plain, crowd, 500) == cost_of_run(changing, crowd, 500) == 1000
+    assert cost_ahead(changing, crowd, 500, 400) == 1200
+
+    def ahead(run, step):
+        state = first_state(run)
+        state.step = step
+        return seconds_ahead(run, state, 0.5)
+
+    assert ahead(plain, 200) == 400.0
+    assert ahead(changing, 200) == (300 + 1500) * 0.5
+    assert ahead(changing, 500) == 1500 * 0.5
 
 
 def test_runs_of_before_go_on_in_steps(scene, tmp_path):

@@ -16,7 +16,6 @@ from crossgrad_core.training import budget
 from crossgrad_core.training.budget import (
     Planned,
     Timed,
-    _cost,
     _fitting,
     _without_edits,
     caught_up,
@@ -25,6 +24,8 @@ from crossgrad_core.training.budget import (
     steps_for,
 )
 from crossgrad_core.training.clock import Clock
+from crossgrad_core.training.expected_cost import Crowd, cost_of_run, growth_ahead
+from crossgrad_core.training.room import curve, usual_budget
 from crossgrad_core.training.schedules import growth_note
 
 
@@ -66,6 +67,17 @@ def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
     )
 
 
+#: As many primitives as at the start.
+CROWD = Crowd(start=1000, present=1000)
+
+
+def reached(step, present=1000):
+    """What of a state decides about a length."""
+    return SimpleNamespace(
+        step=step, rewinds=0, clock=Clock(), states={}, primitives=lambda setup: present
+    )
+
+
 @pytest.mark.parametrize(
     ("affordable", "steps"),
     [
@@ -77,7 +89,7 @@ def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
     ],
 )
 def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
-    assert _fitting(partial(_cost, setup()), affordable) == steps
+    assert _fitting(partial(cost_of_run, setup(), CROWD), affordable) == steps
 
 
 @pytest.mark.parametrize(
@@ -86,7 +98,7 @@ def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
 )
 def test_edits_that_a_run_never_reaches_cost_nothing(affordable, steps):
     run = setup(mode="absolute")
-    assert _fitting(partial(_cost, run), affordable) == steps
+    assert _fitting(partial(cost_of_run, run, CROWD), affordable) == steps
     assert bool(growth_note(setup(steps=steps, mode="absolute"))) == (steps < 600)
 
 
@@ -100,14 +112,49 @@ def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
     assert schedule.coarse_until == 0 == schedule.densify_from
 
 
+def along_the_curve(steps, start):
+    """A run whose growth follows the curve, on the sample scene."""
+    run = assemble(RunConfig(steps=steps), sample_scene(), "none")
+    return run, Crowd(start, start)
+
+
+def test_growth_along_the_curve_costs_what_the_curve_adds():
+    run, crowd = along_the_curve(1000, 30_000)
+    camera = run.train_views[0].camera
+    empty = camera.width * camera.height / 8.0
+    budget = usual_budget(30_000, 2000)
+    ends = [*run.schedule.edit_steps(), 1000]
+    edits = run.schedule.edits()
+    assert edits == len(ends) - 1 > 5
+    counts = [30_000, *(curve(edit, edits, 30_000, budget) for edit in range(1, edits + 1))]
+    steps = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    mean = sum(n * (empty + count) for n, count in zip(steps, counts, strict=True)) / 1000
+    assert growth_ahead(run, crowd, run.schedule, 0) == pytest.approx(mean / (empty + 30_000))
+    # What was not added is not counted on: half-way the run has fewer than the curve allows.
+    behind = growth_ahead(run, Crowd(30_000, 31_000), run.schedule, ends[-4])
+    left = zip(steps[-3:], [31_000, *counts[-2:]], strict=True)
+    mean = sum(n * (empty + count) for n, count in left) / sum(steps[-3:])
+    assert behind == pytest.approx(mean / (empty + 31_000))
+
+
+def test_growth_along_the_curve_is_never_taken_for_more_than_free_growth():
+    run, _ = along_the_curve(2000, 1)
+    assert growth_ahead(run, Crowd(1, 1), run.schedule, 0) == 2.0
+
+
+def test_once_density_control_is_over_every_step_costs_the_same():
+    run, _ = along_the_curve(2000, 30_000)
+    assert growth_ahead(run, Crowd(30_000, 60_000), run.schedule, 1000) == 1.0
+
+
 def test_without_density_control_every_step_costs_the_same():
-    assert _fitting(partial(_cost, setup("none")), 18_000.0) == 18_000
+    assert _fitting(partial(cost_of_run, setup("none"), CROWD), 18_000.0) == 18_000
 
 
 def timed(seconds, planned, cost, **of_setup):
     """A run whose step s takes cost(s, schedule) seconds, and its clock at the end."""
     run = setup(steps=planned, **of_setup)
-    state = SimpleNamespace(step=0, rewinds=0, clock=Clock())
+    state = reached(0)
     length = Timed(seconds)
     while state.step < run.schedule.total:
         state.step += 1
@@ -190,7 +237,7 @@ def test_notes_that_the_clock_overtakes_are_withdrawn():
 
 @pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
 def test_the_user_is_told_once_that_density_control_takes_place_after_all(length):
-    run, state = noted(setup(steps=935)), SimpleNamespace(step=0, rewinds=0, clock=Clock())
+    run, state = noted(setup(steps=935)), reached(0)
     while state.step < run.schedule.total:
         state.step += 1
         state.clock.train += 0.04
@@ -203,13 +250,13 @@ def test_the_user_is_told_once_that_density_control_takes_place_after_all(length
 
 def test_the_user_is_told_where_density_control_is_left_out_later():
     run = noted(setup(steps=3000))
-    Planned(((20, 900),)).revised(run, SimpleNamespace(step=20))
+    Planned(((20, 900),)).revised(run, reached(20))
     assert run.hook.texts == list(growth_note(setup(steps=900)))
 
 
 def test_the_user_is_told_of_no_step_behind_the_end():
     run = noted(setup(steps=550, mode="absolute"))
-    Planned(((20, 700),)).revised(run, SimpleNamespace(step=20))
+    Planned(((20, 700),)).revised(run, reached(20))
     assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
 
 
@@ -236,10 +283,10 @@ def test_the_length_of_a_run_whose_photos_grow_is_planned_with_that(name):
     run, seconds, cost = setup("none"), 60.0, with_pixels(GROWING[name])
     run.selection.resolution = GROWING[name]
     run = replace(run, pixel_share=0.75)
-    planned = _fitting(partial(_cost, run), seconds / 0.04)
+    planned = _fitting(partial(cost_of_run, run, CROWD), seconds / 0.04)
     assert planned > 1.2 * seconds / 0.04
     run = replace(run, schedule=Schedule.for_run(planned))
-    state, length = SimpleNamespace(step=0, rewinds=0, clock=Clock()), Timed(seconds)
+    state, length = reached(0), Timed(seconds)
     while state.step < run.schedule.total:
         state.step += 1
         state.clock.train += cost(state.step, run.schedule)
@@ -255,8 +302,8 @@ def test_a_step_ahead_costs_more_where_photos_grow():
     run = replace(setup("none"), pixel_share=1.0, schedule=Schedule.for_run(100))
     run.selection.resolution = GROWING["octaves"]
     # 20 steps of 1/16, 20 of 1/4, 60 of all pixels.
-    assert seconds_ahead(run, 10, 1.0) == pytest.approx(10 + 20 * 4 + 60 * 16)
-    assert seconds_ahead(run, 50, 1.0) == pytest.approx(50)
+    assert seconds_ahead(run, reached(10), 1.0) == pytest.approx(10 + 20 * 4 + 60 * 16)
+    assert seconds_ahead(run, reached(50), 1.0) == pytest.approx(50)
 
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])

@@ -10,8 +10,9 @@ from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.forecast import LOOK_STEPS, Forecast
 from crossgrad_core.run.results.lines import roughly
-from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
+from crossgrad_core.training.budget import Planned
 from crossgrad_core.training.clock import Clock
+from crossgrad_core.training.expected_cost import COST_PER_EDIT, COUNTED_EDITS
 
 RUN = make_dataclass(
     "Run",
@@ -28,7 +29,7 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
         crossgrad_length=lambda step, total: revised.append((step, total)),
     )
     run = RUN(
-        config=RunConfig(steps=steps),
+        config=RunConfig(steps=steps, growth="free"),
         densifier=build("densifiers", densifier, {}),
         selection=SimpleNamespace(
             names={"densifier": densifier}, resolution=build("resolutions", "full", {})
@@ -39,7 +40,12 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
         pixel_share=0.6,
     )
     length = Forecast(Planned(revisions))
-    state = SimpleNamespace(step=first, clock=Clock(train=100.0 * bool(first) + wait))
+    state = SimpleNamespace(
+        step=first,
+        clock=Clock(train=100.0 * bool(first) + wait),
+        states={},
+        primitives=lambda setup: 1000,
+    )
     for _ in range(min(steps - first - 1, 200)):
         state.step += 1
         state.clock.train += each
