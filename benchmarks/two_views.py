@@ -11,24 +11,17 @@ published rates. Differences are paired by scene and seed; verdicts are those of
 """
 
 import argparse
-import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 
 from _paper_verdicts import figure_of
+from arms import REGIMES, Runs, arms, head, read
 
-from crossgrad_core.commands import UserError
-from crossgrad_plugins.compare.checks.scenes import check_scenes
-from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
-from crossgrad_plugins.compare.quantity import Quantity
-from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.contrasts import Contrast, judged
 from crossgrad_plugins.compare.statistics.verdict import Verdict
 from crossgrad_plugins.compare.words import needed_text
 
-PSNR = Quantity.of("psnr")
 ONE, TWO = "one view", "two views"
 #: What is held equal -> two arms, the one with two views first.
 PAIRS = {
@@ -52,48 +45,12 @@ PAIRS = {
 }
 #: How the two grids of rates are told apart: the title and what the names of arms end with.
 RATES = {"each at its best rates": ", best", "at the published rates": ""}
-#: Overall, and the regimes as scenes call them.
-REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
-
-#: Numbers of summary.json, and what they are called.
-NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Runs by arm, scene and seed."""
-
-    by_arm: dict[str, dict[tuple[str, int], Run]]
-
-    @classmethod
-    def read(cls, places: Sequence[Path]) -> "Runs":
-        """All finished runs at or below the places."""
-        found = read_runs(places, skip_broken=False)
-        check_scenes(found.runs)
-        by_arm: dict[str, dict[tuple[str, int], Run]] = {}
-        for run in found.runs:
-            by_arm.setdefault(run.label or "", {})[run.scene, run.seed] = run
-        return cls(by_arm)
-
-    @property
-    def scenes(self) -> list[str]:
-        """Scenes that any arm has."""
-        return sorted({scene for runs in self.by_arm.values() for scene, _ in runs})
-
-    def of(self, arm: str, scene: str) -> list[Run]:
-        """The runs of an arm on a scene, by seed."""
-        return [run for (at, _), run in sorted(self.by_arm.get(arm, {}).items()) if at == scene]
-
-    def difference(self, first: str, second: str, regime: str) -> Contrast:
-        """The first arm minus the second at the end of their runs."""
-        runs = self.by_arm.get(first, {}), self.by_arm.get(second, {})
-        return contrast((first, second), runs, PSNR, lambda run: _figure(run, regime), regime)
 
 
 def differences(runs: Runs, ending: str) -> Iterator[str]:
     """The table of differences: rows by what is held equal and by regime."""
     scenes = runs.scenes
-    yield from _head("two views minus one, at equal ...", "regime", *scenes, "pooled", "verdict")
+    yield from head("two views minus one, at equal ...", "regime", *scenes, "pooled", "verdict")
     wanted = [
         (title, runs.difference(first + ending, second + ending, regime))
         for title, (first, second) in PAIRS.items()
@@ -114,57 +71,12 @@ def pooled(found: Contrast) -> str:
     return f"{figure_of(found)} | {verdict}"
 
 
-def arms(runs: Runs) -> Iterator[str]:
-    """The table of arms: how good, with which rates, at what cost."""
-    yield from _head("scene", "arm", "rates", "seeds", "PSNR", "far", "near", *NUMBERS.values())
-    for scene in runs.scenes:
-        for arm in sorted(runs.by_arm):
-            if own := runs.of(arm, scene):
-                yield f"| {scene} | {arm.removesuffix(', best')} | {' | '.join(_cells(own))} |"
-
-
-def _head(*titles: str) -> Iterator[str]:
-    yield f"| {' | '.join(titles)} |"
-    yield "|---" * len(titles) + "|"
-
-
-def _cells(own: Sequence[Run]) -> list[str]:
-    factors = {f"x {run.config['rate_factor']:g}" for run in own}
-    return [
-        ", ".join(sorted(factors)),
-        str(len(own)),
-        *(_spread([_figure(run, regime) for run in own]) for regime in REGIMES),
-        *(_number(own, name) for name in NUMBERS),
-    ]
-
-
-def _figure(run: Run, regime: str) -> float | None:
-    found = (run.final(PSNR.name, name) for name in REGIMES[regime])
-    return next((value for value in found if value is not None), None)
-
-
-def _spread(values: Sequence[float | None]) -> str:
-    known = [value for value in values if value is not None]
-    if not known:
-        return ""
-    return f"{fmean(known):.2f}" + (f" ± {stdev(known):.2f}" if len(known) > 1 else "")
-
-
-def _number(own: Sequence[Run], name: str) -> str:
-    known = [value for run in own if (value := run.number(name)) is not None]
-    return f"{fmean(known):,.0f}" if known else ""
-
-
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweeps", type=Path, nargs="+")
     given = parser.parse_args()
-    try:
-        runs = Runs.read(given.sweeps)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    runs = read(given.sweeps)
     for title, ending in RATES.items():
         print(f"### Two views minus one, {title}\n")
         print("\n".join(differences(runs, ending)), end="\n\n")

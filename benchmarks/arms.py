@@ -1,0 +1,139 @@
+"""The arms of a sweep, scene by scene: how good, at what cost, and by which code.
+
+    crossgrad sweep benchmarks/grids/backbones.yaml
+    python benchmarks/arms.py runs/sweeps/backbones > tables.md
+
+Means over seeds and, where there are several, standard deviations. Imports no torch.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.compare.checks.scenes import check_scenes
+from crossgrad_plugins.compare.contrasts import Contrast, contrast
+from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.source import read_runs
+
+PSNR = Quantity.of("psnr")
+#: Overall, and the regimes as scenes call them.
+REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
+#: Numbers of summary.json, and what they are called.
+NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs by arm, scene and seed."""
+
+    by_arm: dict[str, dict[tuple[str, int], Run]]
+
+    @classmethod
+    def read(cls, places: Sequence[Path]) -> "Runs":
+        """All finished runs at or below the places."""
+        found = read_runs(places, skip_broken=False)
+        check_scenes(found.runs)
+        by_arm: dict[str, dict[tuple[str, int], Run]] = {}
+        for run in found.runs:
+            by_arm.setdefault(run.label or "", {})[run.scene, run.seed] = run
+        return cls(by_arm)
+
+    @property
+    def scenes(self) -> list[str]:
+        """Scenes that any arm has."""
+        return sorted({scene for runs in self.by_arm.values() for scene, _ in runs})
+
+    def of(self, arm: str, scene: str) -> list[Run]:
+        """The runs of an arm on a scene, by seed."""
+        return [run for (at, _), run in sorted(self.by_arm.get(arm, {}).items()) if at == scene]
+
+    def difference(self, first: str, second: str, regime: str) -> Contrast:
+        """The PSNR of the first arm minus that of the second at the end of their runs."""
+        runs = self.by_arm.get(first, {}), self.by_arm.get(second, {})
+        return contrast((first, second), runs, PSNR, lambda run: figure(run, regime), regime)
+
+
+def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
+    """The table of arms: how good, with which rates, at what cost.
+
+    Args:
+        runs: The runs.
+        figures: Metrics that are shown; of the first one, each regime, too.
+    """
+    regimes = [name for name in REGIMES if name != "overall"]
+    titles = ("scene", "arm", "rates", "seeds", *figures[:1], *regimes, *figures[1:])
+    yield from head(*titles, *NUMBERS.values(), "PLY, dB", "commit")
+    for scene in runs.scenes:
+        for arm in sorted(runs.by_arm):
+            if own := runs.of(arm, scene):
+                cells = " | ".join(_cells(own, figures))
+                yield f"| {scene} | {arm.removesuffix(', best')} | {cells} |"
+
+
+def head(*titles: str) -> Iterator[str]:
+    """The lines above the rows of a table."""
+    yield f"| {' | '.join(titles)} |"
+    yield "|---" * len(titles) + "|"
+
+
+def figure(run: Run, regime: str, name: str = PSNR.name) -> float | None:
+    """What a run ended at, in a regime as `REGIMES` calls it; None where it has none."""
+    found = (run.final(name, each) for each in REGIMES[regime])
+    return next((value for value in found if value is not None), None)
+
+
+def _cells(own: Sequence[Run], figures: Sequence[str]) -> list[str]:
+    factors = {run.config.get("rate_factor") for run in own}
+    places = [(regime, figures[0]) for regime in REGIMES]
+    places += [("overall", name) for name in figures[1:]]
+    lost = [(run.summary.get("ply") or {}).get("loss") for run in own]
+    commits = {str((run.summary.get("environment") or {}).get("commit")) for run in own}
+    return [
+        ", ".join(sorted("by length" if each is None else f"x {each:g}" for each in factors)),
+        str(len(own)),
+        *(_spread([figure(run, *place) for run in own]) for place in places),
+        *(_number(own, name) for name in NUMBERS),
+        _spread([-each for each in lost if each is not None]) or "0",
+        ", ".join(sorted(commits)),
+    ]
+
+
+def _spread(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    digits = 4 if max(map(abs, known)) <= 1.0 else 2
+    mean = f"{fmean(known):.{digits}f}"
+    return mean + (f" ± {stdev(known):.{digits}f}" if len(known) > 1 else "")
+
+
+def _number(own: Sequence[Run], name: str) -> str:
+    known = [value for run in own if (value := run.number(name)) is not None]
+    return f"{fmean(known):,.0f}" if known else ""
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sweeps", type=Path, nargs="+")
+    parser.add_argument("--figures", nargs="+", default=["psnr", "ssim"], metavar="METRIC")
+    given = parser.parse_args()
+    print("\n".join(arms(read(given.sweeps), given.figures)))
+
+
+def read(places: Sequence[Path]) -> Runs:
+    """The runs at or below the places; what cannot be read ends the program with one message."""
+    try:
+        return Runs.read(places)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
