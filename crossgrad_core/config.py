@@ -62,7 +62,7 @@ class RunConfig(BaseModel):
     )
     sampler: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.SAMPLER),
-        description=f"Which views a step renders. Default: {defaults.SAMPLER} (two views).",
+        description=f"Which views a step renders. Default: {defaults.SAMPLER}.",
     )
     grouping: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None, description="How views are labelled near or far. Default: what the sampler needs."
@@ -126,7 +126,7 @@ class RunConfig(BaseModel):
     views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
         None,
         description="Views per step, K; 1..2@0.5 changes it after that share of the steps. "
-        "Default: the sampler's.",
+        "Default: the sampler's, or the fewest that give the operator something to do.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None, ge=1, description="Optimizer steps; every schedule stretches with them."

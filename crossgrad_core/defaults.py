@@ -7,7 +7,7 @@ from typing import Final
 
 #: What a run takes where the user names nothing.
 BACKBONE: Final = "vanilla"
-SAMPLER: Final = "random"
+SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 EXPOSURE: Final = "none"

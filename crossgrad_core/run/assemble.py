@@ -45,6 +45,7 @@ from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
+from crossgrad_core.run.usual_views import usual_views
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
@@ -60,8 +61,6 @@ _LOG = logging.getLogger(__name__)
 C = TypeVar("C", bound=Component)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
-#: Up to which K one that suits both sampler and operator is looked for.
-_MOST_VIEWS = 13
 #: Settings that name one component.
 SINGLE = (
     *("backbone", "sampler", "grouping", "densifier", "rasterizer", "loss"),
@@ -278,7 +277,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes += choosing
     options = _rasterizer_options(config, scene, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, options)
-    views = config.view_plan or ViewPlan((_usual_views(sampler, operator, notes),))
+    views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     fitted = _built(Exposure, config.exposure).fitted_to(scene)
     notes += fitted.notes
@@ -396,17 +395,6 @@ def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str,
         # The published near plane is 0.2 units of the input frame.
         options.setdefault("near", 0.2 * scene.similarity.scale)
     return options
-
-
-def _usual_views(sampler: Sampler, operator: Operator, notes: list[str]) -> int:
-    """K where the user names none: the sampler's, or the least that the operator allows, too."""
-    usual = sampler.usual_views
-    both = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
-    found = usual if operator.views.admits(usual) else next(filter(operator.views.admits, both), 0)
-    if found and found != usual:
-        notes.append(f"K = {found}: the operator needs {operator.views}")
-    # Where no K suits both, the objections say so.
-    return found or usual
 
 
 def _grouping_choice(

@@ -144,7 +144,7 @@ def test_options_alone_belong_to_the_component_that_is_taken_by_default():
     assignments = ["rasterizer.max_alpha=0.999", "sampler.order=epoch", "densifier.x=1"]
     assert merged(None, {}, assignments) == {
         "rasterizer": {"name": "auto", "max_alpha": 0.999},
-        "sampler": {"name": "random", "order": "epoch"},
+        "sampler": {"name": "epoch", "order": "epoch"},
         "densifier": {"name": "auto", "x": 1},
     }
 

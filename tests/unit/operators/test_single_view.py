@@ -57,8 +57,38 @@ def notes_of(operator, sampler=None, views=None):
     return [note for note in notes if "does nothing" in note]
 
 
+def views_of(operator, sampler=None):
+    links = tuple({"name": name} for name in operator.split("+"))
+    operators = {"operator": links if len(links) > 1 else links[0]}
+    config = RunConfig.model_validate({"sampler": sampler or {"name": "epoch"}, **operators})
+    setup = assemble(config, sample_scene(), "none")
+    return setup.selection.views_per_step, [n for n in setup.notes if n.startswith("K = ")]
+
+
+@pytest.mark.parametrize(
+    ("operator", "sampler", "views"),
+    [
+        ("sum", None, 1),
+        ("preconditioner", None, 1),
+        ("sum", {"name": "near-far"}, 2),
+        ("pcgrad", {"name": "near-far", "alternating": True}, 1),
+    ],
+)
+def test_views_are_those_of_the_sampler_where_the_operator_works_with_them(
+    operator, sampler, views
+):
+    assert views_of(operator, sampler) == (views, [])
+
+
+@pytest.mark.parametrize("operator", ["pcgrad", "mean", "preconditioner+symmetric", "anchors"])
+def test_an_operator_that_is_named_gets_so_many_views_that_it_works(operator):
+    views, (note,) = views_of(operator)
+    assert views == 2
+    assert note.startswith("K = 2: the operator ")
+
+
 def test_an_operator_without_a_second_view_is_noted_once_with_the_way_out():
-    (note,) = notes_of({"name": "pcgrad"})
+    (note,) = notes_of({"name": "pcgrad"}, views=1)
     assert "operator pcgrad does nothing at K = 1" in note
     assert "--views 2" in note
 
@@ -86,7 +116,7 @@ def test_the_noted_run_is_the_plain_one():
     def trained(operator):
         config = RunConfig(
             reading={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
-            sampler=ComponentChoice(name="epoch"), operator=ComponentChoice(name=operator),
+            sampler=ComponentChoice(name="epoch"), operator=ComponentChoice(name=operator), views=1,
         )  # fmt: skip
         state = first_state(setup := assemble(config, sample_scene(), "none"))
         timed_step(setup, state)

@@ -175,14 +175,26 @@ def test_pairs_are_not_drawn_by_an_odd_number_of_views():
     assert "even" in found.evidence
 
 
-@pytest.mark.parametrize(
-    ("noise", "choice"), [(0.4, "1"), (1.99, "1"), (2.0, "2"), (640.0, "2"), (np.inf, "2")]
-)
-def test_views_by_the_noise_of_gradients(noise, choice):
+@pytest.mark.parametrize("noise", [0.4, 2.0, 640.0, np.inf])
+def test_one_view_whatever_the_noise_of_gradients(noise):
     probe = Probe(noise_scale=noise, rho=0.0, rho_low=0.0, rho_high=0.0)
     found = groups.views_per_step(evidence_of("city_unimodal", probe))
-    assert (found.choice, found.basis) == (choice, "decided")
-    assert dict(found.settings) == ({} if choice == "2" else {"views_per_step": 1})
+    assert (found.choice, found.basis, found.settings) == ("1", "decided", {})
+    assert found.figures == {"noise_scale": noise}
+
+
+def test_pairs_bring_two_views():
+    probe = Probe(rho=0.5, rho_low=0.2, rho_high=0.9)
+    found = groups.views_per_step(evidence_of("city_hybrid", probe))
+    # The sampler brings them: nothing else is to be set.
+    assert (found.choice, found.basis, found.settings) == ("2", "decided", {})
+
+
+@pytest.mark.parametrize("name", ["sampler", "operator"])
+def test_views_are_left_to_components_that_were_chosen(name):
+    chosen = {"sampler": "near-far", "operator": "pcgrad"}[name]
+    evidence = evidence_of("city_hybrid", **{name: {"name": chosen}})
+    assert groups.views_per_step(evidence).basis == "default"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +210,7 @@ def test_projection_needs_conflict_beyond_chance_and_pairs(conflict_low, rho_low
 def test_a_probe_that_fails_decides_nothing():
     probe = Probe(problem="a probe needs two training views of each group")
     evidence = evidence_of("city_hybrid", probe)
-    for part in (groups.pairs, groups.views_per_step, groups.operator):
+    for part in (groups.pairs, groups.operator):
         found = part(evidence)
         assert found.basis == "default"
         assert probe.problem in found.evidence
@@ -235,7 +247,7 @@ def street(count=30):
 def test_an_orbit_has_one_distance():
     plan = plan_for(orbit())
     assert plan.of_part("modes").choice == "one mode, one distance"
-    assert plan.of_part("pairs of views").choice == "random"
+    assert plan.of_part("pairs of views").choice == "epoch"
     assert plan.of_part("scale filter").basis == "decided"
     assert not plan.settings
 

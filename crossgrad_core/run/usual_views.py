@@ -1,0 +1,37 @@
+"""Views per step where the user names no number."""
+
+from typing import Final
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.sampler import Sampler
+
+#: Up to which K one that suits both is looked for.
+_MOST_VIEWS: Final = 13
+
+
+def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]) -> int:
+    """K where the user names none: the sampler's, or the least with which the operator works.
+
+    Args:
+        config: The configuration.
+        sampler: Its sampler.
+        operator: Its operator.
+        notes: Gets a line where K is not the sampler's.
+    """
+    usual = sampler.usual_views
+    both = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
+    both = [k for k in both if operator.views.admits(k)]
+    # Who names no operator expects no more than a sum of one gradient.
+    named = config.operator != RunConfig.model_fields["operator"].default
+    if usual not in both:
+        found, why = next(iter(both), 0), f"the operator needs {operator.views}"
+    elif named and operator.does_nothing(usual):
+        found = next((k for k in both if not operator.does_nothing(k)), usual)
+        why = "the operator leaves the gradient of a single view as it is"
+    else:
+        found, why = usual, ""
+    if found and found != usual:
+        notes.append(f"K = {found}: {why}")
+    # Where no K suits both, the objections say so.
+    return found or usual
