@@ -55,6 +55,10 @@ class Operator(Component):
         """Whether the result is the plain sum, whatever the gradients of that many views are."""
         return views == 1 and self.idle_at_one
 
+    def wants_more(self, views: int) -> bool:
+        """Whether it, or an operator that it consists of, does nothing with so many views."""
+        return self.does_nothing(views)
+
     def reads_labels(self) -> bool:
         """Whether the labels of the views make a difference to it."""
         return False

@@ -11,7 +11,7 @@ _MOST_VIEWS: Final = 13
 
 
 def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]) -> int:
-    """K where the user names none: the sampler's, or the least with which the operator works.
+    """K where the user names none: the sampler's, or the least that leaves no operator idle.
 
     Args:
         config: The configuration.
@@ -26,9 +26,9 @@ def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: 
     named = config.operator != RunConfig.model_fields["operator"].default
     if usual not in both:
         found, why = next(iter(both), 0), f"the operator needs {operator.views}"
-    elif named and operator.does_nothing(usual):
-        found = next((k for k in both if not operator.does_nothing(k)), usual)
-        why = "the operator leaves the gradient of a single view as it is"
+    elif named and operator.wants_more(usual):
+        found = next((k for k in both if not operator.wants_more(k)), usual)
+        why = "with fewer views an operator that you named does nothing"
     else:
         found, why = usual, ""
     if found and found != usual:

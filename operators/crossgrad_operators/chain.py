@@ -45,6 +45,10 @@ class Chain(GramianOperator):
     def does_nothing(self, views: int) -> bool:
         return views == 1 and all(link.does_nothing(views) for link in self.links)
 
+    @override
+    def wants_more(self, views: int) -> bool:
+        return any(link.wants_more(views) for link in self.links)
+
     @property
     @override
     def usual_grouping(self) -> str | None:

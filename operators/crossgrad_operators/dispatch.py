@@ -79,6 +79,10 @@ class Dispatch(GramianOperator):
     def does_nothing(self, views: int) -> bool:
         return all(operator.does_nothing(views) for operator in self._operators().values())
 
+    @override
+    def wants_more(self, views: int) -> bool:
+        return any(each.wants_more(views) for each in self._operators().values())
+
     @property
     @override
     def usual_grouping(self) -> str | None:
