@@ -116,10 +116,12 @@ class Late:
         if behind.steps and (rows is None or len(rows)):
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
-            which = None if rows is None else rows.numpy()
+            # Of one type in any case: for another one the kernel would be compiled once more.
+            which = np.empty(0, np.int32) if rows is None else rows.numpy()
             flat, width = _flat(name, param, adam), _width(param)
             steps, before = behind.table(), behind.before
-            catch_up(which, width, flat[0], flat[1], flat[2], behind.done, before, steps)
+            whole = rows is None
+            catch_up(whole, which, width, flat[0], flat[1], flat[2], behind.done, before, steps)
             _changed(name, param, adam)
         if rows is None:
             del self._behind[name]

@@ -143,7 +143,8 @@ def _bring_near(rows: Ints, k: int, width: int, p: Floats, m: Floats, v: Floats)
 
 @parallel_kernel
 def catch_up(
-    rows: Ints | None,
+    whole: bool,
+    rows: Ints,
     width: int,
     param: Floats,
     exp_avg: Floats,
@@ -155,7 +156,8 @@ def catch_up(
     """Takes the steps without gradient that rows of a tensor are behind.
 
     Args:
-        rows: [R] the rows, each once; None: all.
+        whole: Whether all rows are meant.
+        rows: [R] the rows, each once, where not all are meant.
         width: Elements of a row.
         param: [N * width].
         exp_avg: [N * width].
@@ -164,15 +166,15 @@ def catch_up(
         before: Steps before the first of the table; no row has had fewer.
         steps: [T * NUMBERS] the steps since.
     """
-    count = done.size if rows is None else rows.size
+    count = done.size if whole else rows.size
     end = steps.size // NUMBERS
     for task in prange((count + _ROWS - 1) // _ROWS):
         rest = np.empty(3 * LANES, np.float32)
         for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
             ahead = place + _AHEAD
-            if rows is not None and ahead < count and done[rows[ahead]] - before < end:
+            if not whole and ahead < count and done[rows[ahead]] - before < end:
                 _bring_near(rows, ahead, width, param, exp_avg, exp_avg_sq)
-            i = np.intp(place) if rows is None else np.intp(rows[place])
+            i = np.intp(place) if whole else np.intp(rows[place])
             first = np.intp(done[i]) - before
             if first < end:
                 _row(param, exp_avg, exp_avg_sq, i * width, width, first, end, steps, rest)
