@@ -1,4 +1,4 @@
-"""Before the first step everything that training needs is compiled: no budget pays for compilers."""
+"""Before the first step all that training needs is compiled: no budget pays for compilers."""
 
 import json
 import subprocess
@@ -44,6 +44,6 @@ def test_training_compiles_nothing_behind_the_warm_up(tmp_path, length):
         **length,
     }
     command = [sys.executable, "-c", SCRIPT, json.dumps(settings)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == []
