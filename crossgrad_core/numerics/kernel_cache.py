@@ -12,7 +12,7 @@ import logging
 import os
 import pickle
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +30,20 @@ _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
 #: What is said before and after a kernel is compiled; `system/startup.py` counts on the words.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
+
+
+#: Called before a kernel is compiled that was not on disk.
+_LISTENERS: list[Callable[[], None]] = []
+
+
+@contextmanager
+def told_of_missing(listener: Callable[[], None]) -> Iterator[None]:
+    """Calls the listener before each kernel that is not on disk and will be kept there."""
+    _LISTENERS.append(listener)
+    try:
+        yield
+    finally:
+        _LISTENERS.remove(listener)
 
 
 def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's caches are untyped
@@ -93,6 +107,8 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
             found = super().load_overload(sig, target_context)
         if found is None:
             _LOG.info(_COMPILING, _name(self._py_func))
+            for listener in _LISTENERS:
+                listener()
         return cast("object | None", found)
 
     @override

@@ -20,8 +20,8 @@ def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: 
         notes: Gets a line where K is not the sampler's.
     """
     usual = sampler.usual_views
-    both = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
-    both = [k for k in both if operator.views.admits(k)]
+    of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
+    both = [k for k in of_sampler if operator.views.admits(k)]
     # Who names no operator expects no more than a sum of one gradient.
     named = config.operator != RunConfig.model_fields["operator"].default
     if usual not in both:

@@ -15,6 +15,7 @@ from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training import photo_parameters
+from crossgrad_core.training.compile_ahead import compiling_beside
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
@@ -94,7 +95,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     if schedule.grows:
         # An edit may draw, too.
         steps.append(schedule.first_edit - 1)
-    with decoded_meanwhile(setup.scene):
+    with decoded_meanwhile(setup.scene), compiling_beside(setup):
         for step in steps:
             if step < schedule.total:
                 state = first_state(setup) if reached is None else deepcopy(reached)

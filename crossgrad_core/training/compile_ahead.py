@@ -1,0 +1,68 @@
+"""Kernels of loss and optimizer, compiled by a process beside the one that compiles the others.
+
+Numba compiles one kernel at a time in a process. A first start has as much to compile for what
+comes behind the render as for the render itself, and finds it on disk when it gets there.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from crossgrad_core.config import ComponentChoice
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.loss import Loss
+from crossgrad_core.gradients.by_rows import by_rows
+from crossgrad_core.numerics.kernel_cache import told_of_missing
+from crossgrad_core.numerics.threads import available_cores
+from crossgrad_core.registry.entries import build
+from crossgrad_core.training.adam.adam import adam_step, counted
+from crossgrad_core.training.adam.coefficients import Rule
+from crossgrad_core.training.adam.late import Late
+from crossgrad_core.training.setup import Setup
+
+
+@contextmanager
+def compiling_beside(setup: Setup) -> Iterator[None]:
+    """Starts the other process with the first kernel that is missing, and ends it at last.
+
+    Not where this one has one core, or one thread, to itself, and not for a GPU.
+    """
+    alone = setup.config.threads == 1 or available_cores() == 1
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start() -> None:
+        if processes or alone or setup.device.type != "cpu":
+            return
+        command = [sys.executable, "-m", __name__, setup.config.loss.model_dump_json()]
+        silent = subprocess.DEVNULL
+        processes.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
+
+    with told_of_missing(start):
+        try:
+            yield
+        finally:
+            for process in processes:
+                process.terminate()
+                process.wait()
+
+
+def compile_all(loss: ComponentChoice) -> None:
+    """Compiles what a loss and the optimizer need, on numbers that mean nothing."""
+    photo = torch.zeros((64, 64, 3), dtype=torch.uint8)
+    render = torch.full((64, 64, 3), 0.5, requires_grad=True)
+    measured = build(Loss, loss.name, loss.options).loss(render, photo, None, None)
+    measured.backward()  # type: ignore[no-untyped-call]
+    values, state = torch.zeros((8, 3)), AdamState()
+    adam_step({"all": values}, {"all": torch.ones_like(values)}, state, {"all": 1e-3})
+    late, rows = Late(), torch.tensor([1, 4])
+    for _ in range(2):  # What is late is caught up with from the second step on.
+        grad = by_rows(rows, torch.ones((2, 3)), values.shape)
+        late.step("rows", values, grad, state, counted("rows", values, state, 1e-3, Rule(), 1.0))
+
+
+if __name__ == "__main__":
+    compile_all(ComponentChoice.model_validate(json.loads(sys.argv[1])))
