@@ -9,6 +9,8 @@ from crossgrad_plugins.compare.figures.style import (
     PAGE,
     columns_for,
     drawn,
+    legend,
+    looks,
     new_figure,
     panel_title,
     styled,
@@ -58,3 +60,27 @@ def test_a_title_fits_its_panel_and_keeps_every_letter(beside, scene):
         title = ax.get_title(loc="left")
     assert title.replace("\n", "").strip("'") == scene.strip("'")
     assert all(len(line) <= 110 // beside - 8 + 1 for line in title.split("\n"))
+
+
+@pytest.mark.parametrize("arms", [1, 7, 14, 28])
+def test_arms_look_different(arms):
+    found = list(looks([f"arm {index}" for index in range(arms)]).values())
+    assert len({(look.color, str(look.dash)) for look in found}) == arms
+
+
+@pytest.mark.parametrize("arms", [2, 8, 14, 28])
+def test_a_legend_of_many_arms_leaves_the_panels_their_room(arms):
+    names = [f"two views, equal views, statistics of one view, {index}" for index in range(arms)]
+    with styled(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = new_figure(PAGE, 2.4)
+        ax = figure.subplots()
+        for name in names:
+            ax.plot([0, 1], [0, 1], label=name)
+        legend(figure, ax, names)
+        drawn(figure, "name", "title", "caption")
+        below = ax.get_tightbbox().y1
+        (box,) = (each.get_window_extent() for each in figure.legends)
+    assert box.y0 >= below
+    assert box.y1 <= figure.bbox.height + 1.0
+    assert ax.bbox.height > 1.0 * figure.dpi

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING, Any, Final
 
 from crossgrad_plugins.compare.figures.fonts import fall_back, family
@@ -53,6 +54,8 @@ _RC: Final[Any] = {
 _DPI: Final = 220
 #: About how many letters a page is wide.
 _LETTERS: Final = 110
+#: Lines of a legend that every figure has room for, and inches that each further one takes.
+_LEGEND_LINES, _LINE = 2, 0.18
 #: A name may go on in the next line behind these signs, and anywhere in a part of this length.
 _PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
 _SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
@@ -97,7 +100,8 @@ def looks(arms: Sequence[str]) -> dict[str, Look]:
         arm: Look(
             COLORS[index % len(COLORS)],
             MARKERS[index % len(MARKERS)],
-            DASHES[(index + index // len(COLORS)) % len(DASHES)],
+            # Where colours come again the line is another one.
+            DASHES[(index % len(COLORS) + index // len(COLORS)) % len(DASHES)],
         )
         for index, arm in enumerate(arms)
     }
@@ -197,16 +201,24 @@ def columns_for(labels: Sequence[str], most: int) -> int:
     return max(1, min(most, len(labels), _LETTERS // (longest + 8)))
 
 
+def _with_room(figure: "Figure", labels: int, columns: int) -> None:
+    """Makes a figure higher by what a legend takes beyond the lines that it has room for."""
+    lines = ceil(labels / columns) - _LEGEND_LINES
+    figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE)
+
+
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
     """The arms above all panels, as they are called in `axes`."""
     handles, labels = axes.get_legend_handles_labels()
     known = dict(zip(labels, handles, strict=True))
     shown = [literal(arm) for arm in arms if literal(arm) in known]
+    fitting = columns_for(shown, columns)
+    _with_room(figure, len(shown), fitting)
     figure.legend(
         [known[label] for label in shown],
         shown,
         loc="outside upper left",
-        ncols=columns_for(shown, columns),
+        ncols=fitting,
         handlelength=2.6,
         columnspacing=1.4,
         borderaxespad=0.0,
