@@ -66,6 +66,7 @@ def test_a_title_fits_its_panel_and_keeps_every_letter(beside, scene):
 def test_arms_look_different(arms):
     found = list(looks([f"arm {index}" for index in range(arms)]).values())
     assert len({(look.color, str(look.dash)) for look in found}) == arms
+    assert len({(look.color, look.marker) for look in found}) == arms
 
 
 @pytest.mark.parametrize("arms", [2, 8, 14, 28])

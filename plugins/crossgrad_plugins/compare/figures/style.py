@@ -99,8 +99,8 @@ def looks(arms: Sequence[str]) -> dict[str, Look]:
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
-            MARKERS[index % len(MARKERS)],
-            # Where colours come again the line is another one.
+            # Where colours come again marker and line are others.
+            MARKERS[(index + index // len(COLORS)) % len(MARKERS)],
             DASHES[(index % len(COLORS) + index // len(COLORS)) % len(DASHES)],
         )
         for index, arm in enumerate(arms)
