@@ -30,6 +30,7 @@ def run(scene, out):
     settings = {"scene": str(scene), "out": str(out), "steps": STEPS, "eval_every": 4, "threads": 1}
     # A filled start would look at all photos before the first step.
     settings["start"] = {"name": "sfm"}
+    settings |= {"sampler": {"name": "random"}, "views": 2}
     return app.run(settings, verbosity=-1)
 
 

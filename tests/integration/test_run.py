@@ -65,7 +65,7 @@ def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys, drawn):
     assert str(out) in capsys.readouterr().out
     rows = quality(out)
     assert [row["step"] for row in rows] == ["6", "12"]
-    assert rows[1]["views"] == "24"
+    assert rows[1]["views"] == "12"
 
 
 def test_training_brings_the_loss_down(scene, tmp_path):

@@ -164,7 +164,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
         assert run(scene, tmp_path / "run", steps=3, exposure={"name": "stops"}) == 0
     assert len(asked) == 3
     assert all(loss == expected and differentiable for loss, expected, differentiable in asked)
-    assert rows(tmp_path / "run")[-1]["views"] == "6"
+    assert rows(tmp_path / "run")[-1]["views"] == "3"
 
 
 @pytest.mark.parametrize(("view", "scale"), [(-1, 1.0), (99, 1.0), (0, 0.0), (0, 1.5)])

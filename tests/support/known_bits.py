@@ -37,6 +37,8 @@ USUAL: Mapping[str, Any] = {
     "densify_until": 45,
     "eval_every": 50,
     "start": "sfm",
+    "sampler": "random",
+    "views": 2,
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.

@@ -263,6 +263,8 @@ EARLY = {"events": "steps", "densify_from": 1, "densify_until": 7, "densify_ever
 def setup_of(rasterizer, **options):
     config = RunConfig(
         steps=10,
+        sampler=ComponentChoice(name="random"),
+        views=2,
         densifier=ComponentChoice(name="dc4gs", **options),
         rasterizer=ComponentChoice(name=rasterizer),
         **EARLY,

@@ -53,13 +53,13 @@ def test_an_id_depends_on_what_is_trained_and_on_nothing_else(scene, tmp_path):
         ids(tmp_path, elsewhere, steps=30),
         ids(tmp_path, scene, steps=30, save_every=7),
         ids(tmp_path, scene, steps=30, operator="sum"),
-        ids(tmp_path, scene, steps=30, sampler={"name": "random"}, views_per_step=2),
+        ids(tmp_path, scene, steps=30, sampler={"name": "epoch"}, views_per_step=1),
         ids(tmp_path, scene, **{"steps": 30, "backbone.lr_opacities": 0.05}),
     ]
     assert same == [[one]] * len(same)
     others = [
         ids(tmp_path, scene, steps=31),
-        ids(tmp_path, scene, steps=30, views=1),
+        ids(tmp_path, scene, steps=30, views=2),
         ids(tmp_path, scene, seconds=4),
         ids(tmp_path, scene, steps=30, max_size=32),
         ids(tmp_path, scene, **{"steps": 30, "backbone.lr_opacities": 0.06}),

@@ -114,7 +114,7 @@ def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
 
 def along_the_curve(steps, start):
     """A run whose growth follows the curve, on the sample scene."""
-    run = assemble(RunConfig(steps=steps), sample_scene(), "none")
+    run = assemble(RunConfig(steps=steps, views=2), sample_scene(), "none")
     return run, Crowd(start, start)
 
 

@@ -16,7 +16,7 @@ from crossgrad_core.training.start import first_state
 
 STEPS, RUNS = 30, 10
 TIMES = {"events": "steps", "densify_from": 10, "densify_every": 10, "densify_until": 25}
-SETTINGS = {"steps": STEPS, **TIMES}
+SETTINGS = {"steps": STEPS, "sampler": {"name": "random"}, "views": 2, **TIMES}
 OFFSETS = [(1e6, 1e6, 1e6), (4e5, 5.6e6, 120.0), (0.0, 0.0, -1e6)]
 
 
