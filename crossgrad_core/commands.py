@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
+    from crossgrad_core.run.usual_views import view_plan_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.frozen import view_gradients
@@ -120,6 +121,7 @@ __all__ = [
     "tell",
     "usual_budget",
     "view_gradients",
+    "view_plan_of",
     "way_on",
     "with_steps",
     "write_atomically",
@@ -154,6 +156,7 @@ _LATE: Final = {
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
     "usual_budget": "training.room",
+    "view_plan_of": "run.usual_views",
     "view_gradients": "training.frozen",
 }
 

@@ -30,7 +30,6 @@ from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
 from crossgrad_core.defaults import (
     BARE_START,
-    CHAIN,
     EXPORTER,
     METRICS,
     READER,
@@ -45,7 +44,7 @@ from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
-from crossgrad_core.run.usual_views import usual_views
+from crossgrad_core.run.usual_views import operator_of, usual_views
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
@@ -261,7 +260,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
     sampler = _built(Sampler, config.sampler)
-    operator, operator_name = _operator(config)
+    operator, operator_name = operator_of(config)
     backbone = _built(Backbone, config.backbone)
     backbone, left_out = backbone.fitted_to(scene)
     notes += left_out
@@ -370,15 +369,6 @@ def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
     if choice is None:
         return ComponentChoice(name=name)
     return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
-
-
-def _operator(config: RunConfig) -> tuple[Operator, str]:
-    links = config.operators
-    if len(links) == 1:
-        return _built(Operator, links[0]), links[0].name
-    built = tuple(_built(Operator, link) for link in links)
-    chain = build(Operator, CHAIN, {"links": built})
-    return chain, "+".join(link.name for link in links)
 
 
 def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:

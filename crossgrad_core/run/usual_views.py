@@ -1,13 +1,24 @@
-"""Views per step where the user names no number."""
+"""The operator of a run, and its views per step where the user names no number."""
 
 from typing import Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.defaults import CHAIN
+from crossgrad_core.registry.entries import build
 
 #: Up to which K one that suits both is looked for.
 _MOST_VIEWS: Final = 13
+
+
+def operator_of(config: RunConfig) -> tuple[Operator, str]:
+    """The operator of a run, a chain where several are named, and its name."""
+    links = config.operators
+    built = tuple(build(Operator, link.name, link.options) for link in links)
+    operator = built[0] if len(built) == 1 else build(Operator, CHAIN, {"links": built})
+    return operator, "+".join(link.name for link in links)
 
 
 def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]) -> int:
@@ -35,3 +46,11 @@ def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: 
         notes.append(f"K = {found}: {why}")
     # Where no K suits both, the objections say so.
     return found or usual
+
+
+def view_plan_of(config: RunConfig) -> ViewPlan:
+    """K over a run of that configuration, as it will be assembled."""
+    if config.view_plan is not None:
+        return config.view_plan
+    sampler = build(Sampler, config.sampler.name, config.sampler.options)
+    return ViewPlan((usual_views(config, sampler, operator_of(config)[0], []),))

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from crossgrad_core.commands import RunConfig
-from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewPlan, build_component
+from crossgrad_core.commands import RunConfig, view_plan_of
+from crossgrad_core.plugin import Backbone, Scene, ViewPlan, build_component
 from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
 
 if TYPE_CHECKING:
@@ -60,10 +60,7 @@ class Evidence:
     @cached_property
     def view_plan(self) -> ViewPlan:
         """How many views the steps have, without decisions on it."""
-        if self.config.view_plan is not None:
-            return self.config.view_plan
-        sampler = self.config.sampler
-        return ViewPlan((build_component(Sampler, sampler.name, sampler.options).usual_views,))
+        return view_plan_of(self.config)
 
     @property
     def counts(self) -> tuple[int, ...]:

@@ -190,6 +190,11 @@ def test_pairs_bring_two_views():
     assert (found.choice, found.basis, found.settings) == ("2", "decided", {})
 
 
+def test_views_are_counted_as_the_run_will_have_them():
+    assert evidence_of("city_hybrid").counts == (1,)
+    assert evidence_of("city_hybrid", operator={"name": "pcgrad"}).counts == (2,)
+
+
 @pytest.mark.parametrize("name", ["sampler", "operator"])
 def test_views_are_left_to_components_that_were_chosen(name):
     chosen = {"sampler": "near-far", "operator": "pcgrad"}[name]
