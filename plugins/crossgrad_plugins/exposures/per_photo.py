@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, LearningRate, PerPhoto, Scene, Selection, View
 from crossgrad_plugins.exposures.exif import exposure_values
+from crossgrad_plugins.exposures.neighbours import neighbours_of
 from crossgrad_plugins.exposures.starts import Start, far_ones, starts_of
 
 
@@ -81,17 +82,26 @@ class ExposurePerPhoto(Exposure):
     def unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """By EXIF, where the view and training photos have it, else the mean of the regime."""
+        """By EXIF, where the view and training photos have it; else by neighbours or by regime.
+
+        Neighbours are the training photos nearest in pose. They are asked where they tell more of
+        each other than the mean over a regime does.
+        """
         told = exposure_values(scene)
+        own = values[self.parameter]
         rows = [row for row, each in enumerate(scene.train_views) if each.name in told]
-        if view.name not in told or not rows:
+        if view.name in told and rows:
+            # Sensors differ, and a regime often has one of its own.
+            rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
+            stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
+            moved = self.beside(own[rows], torch.tensor(stops).to(own))
+            return {self.parameter: moved.mean(dim=0)}
+        neighbours = neighbours_of(scene)
+        if not neighbours.tell(own.detach().cpu().double().reshape(len(own), -1).numpy()):
             return super().unseen(view, scene, values)
-        # Sensors differ, and a regime often has one of its own.
-        rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
-        stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
-        own = values[self.parameter][rows]
-        moved = self.beside(own, torch.tensor(stops, dtype=own.dtype, device=own.device))
-        return {self.parameter: moved.mean(dim=0)}
+        near, weights = neighbours.rows_and_weights(view.camera)
+        shares = torch.from_numpy(weights).to(own)
+        return {self.parameter: torch.tensordot(shares, own[torch.from_numpy(near)], dims=1)}
 
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
         """`decay` without a rate."""
