@@ -86,8 +86,10 @@ class ViewPlan:
         inside = (0.0, *shares, 1.0)
         if not all(a < b for a, b in pairwise(inside)):
             raise ValueError("must have ascending shares above 0 and below 1")
-        if min(counts) < 1 or any(a == b for a, b in pairwise(counts)):
-            raise ValueError("must change from one number from 1 on to another one")
+        if min(counts) < 1:
+            raise ValueError(_FORM)
+        if any(a == b for a, b in pairwise(counts)):
+            raise ValueError("must change from one number to another one")
         return cls(counts, shares)
 
     @override

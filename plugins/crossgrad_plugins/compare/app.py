@@ -1,7 +1,8 @@
 """The command `crossgrad compare`."""
 
 import os.path
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -12,6 +13,7 @@ from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import draw_curves
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.frontier import draw_frontier
+from crossgrad_plugins.compare.figures.parallel import in_parallel
 from crossgrad_plugins.compare.figures.phases import draw_phases
 from crossgrad_plugins.compare.figures.primitives import draw_primitives
 from crossgrad_plugins.compare.figures.profile import draw_profile
@@ -78,17 +80,17 @@ def compare(
 def drawn_figures(comparison: Comparison) -> list[Drawn]:
     """All figures that can be drawn, in the order of the page."""
     first, *rest = comparison.costs
-    figures = [
-        draw_curves(comparison, first),
-        draw_differences(comparison),
-        draw_frontier(comparison, first),
-        draw_regimes(comparison),
-        *(draw_curves(comparison, cost) for cost in rest),
-        draw_profile(comparison),
-        draw_primitives(comparison, first),
-        draw_phases(comparison),
+    drawings: list[Callable[[], Drawn | None]] = [
+        partial(draw_curves, comparison, first),
+        partial(draw_differences, comparison),
+        partial(draw_frontier, comparison, first),
+        partial(draw_regimes, comparison),
+        *(partial(draw_curves, comparison, cost) for cost in rest),
+        partial(draw_profile, comparison),
+        partial(draw_primitives, comparison, first),
+        partial(draw_phases, comparison),
     ]
-    return [figure for figure in figures if figure is not None]
+    return [figure for figure in in_parallel(drawings) if figure is not None]
 
 
 def _default_folder(places: Sequence[Path]) -> Path:
