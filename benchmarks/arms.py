@@ -29,7 +29,7 @@ NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_se
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs by arm, scene and seed."""
+    """Runs by arm, scene and seed; an arm with runs of several lengths is one for each of them."""
 
     by_arm: dict[str, dict[tuple[str, int], Run]]
 
@@ -38,9 +38,15 @@ class Runs:
         """All finished runs at or below the places."""
         found = read_runs(places, skip_broken=False)
         check_scenes(found.runs)
-        by_arm: dict[str, dict[tuple[str, int], Run]] = {}
+        lengths: dict[str, set[tuple[str, float]]] = {}
         for run in found.runs:
-            by_arm.setdefault(run.label or "", {})[run.scene, run.seed] = run
+            lengths.setdefault(run.label or "", set()).add(run.length)
+        by_arm: dict[str, dict[tuple[str, int], Run]] = {}
+        for run in sorted(found.runs, key=lambda run: (run.label or "", run.length)):
+            arm = run.label or ""
+            if len(lengths[arm]) > 1:
+                arm = f"{arm}, {run.length_text}".removeprefix(", ")
+            by_arm.setdefault(arm, {})[run.scene, run.seed] = run
         return cls(by_arm)
 
     @property
@@ -69,7 +75,7 @@ def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
     titles = ("scene", "arm", "rates", "seeds", *figures[:1], *regimes, *figures[1:])
     yield from head(*titles, *NUMBERS.values(), "PLY, dB", "commit")
     for scene in runs.scenes:
-        for arm in sorted(runs.by_arm):
+        for arm in runs.by_arm:
             if own := runs.of(arm, scene):
                 cells = " | ".join(_cells(own, figures))
                 yield f"| {scene} | {arm.removesuffix(', best')} | {cells} |"

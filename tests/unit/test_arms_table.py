@@ -43,6 +43,14 @@ def test_means_and_spread_over_seeds(tmp_path, printed):
     assert (beach["seeds"], beach["rates"], beach["psnr"]) == ("1", "x 2", "21.00")
 
 
+def test_each_length_of_an_arm_has_a_row(tmp_path, printed):
+    for steps, final in ((300, 20.0), (1200, 22.0)):
+        RunFolder(settings={"steps": steps}, final=final).write(tmp_path / f"{steps}")
+    rows = printed(tmp_path)
+    found = {row["arm"]: (row["seeds"], row["psnr"]) for row in rows}
+    assert found == {"300 steps": ("1", "20.00"), "1,200 steps": ("1", "22.00")}
+
+
 def test_other_figures_can_be_named(tmp_path, printed):
     RunFolder().write(tmp_path / "run")
     (row,) = printed(tmp_path, "--figures", "ssim")
