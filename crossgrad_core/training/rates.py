@@ -12,8 +12,8 @@ from crossgrad_core.training.steady import faded
 
 #: The published rates are for `REFERENCE` steps. A run of fewer has them times the ratio of the two
 #: to this power: what its rates add up to falls with its length, but not as fast as the length.
-SHORTNESS: Final = 1 / 3
-#: ... and never more than this: what a run of some 300 steps has.
+SHORTNESS: Final = 0.45
+#: ... and never more than this: what a run of some 1,000 steps has.
 MOST: Final = 4.5
 
 
@@ -32,7 +32,7 @@ def notes_on(config: RunConfig, schedule: Schedule) -> tuple[str, ...]:
     known = config.seconds is None or schedule.mode == "absolute"
     if config.rate_factor is not None or config.preset == "inria" or (known and factor == 1.0):
         return ()
-    told = f"{factor:.3g}" if known else f"({REFERENCE:,} / steps)^(1/3), at most {MOST}"
+    told = f"{factor:.3g}" if known else f"({REFERENCE:,} / steps)^{SHORTNESS}, at most {MOST}"
     return (f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times {told}",)
 
 
