@@ -13,7 +13,6 @@ from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import draw_curves
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.frontier import draw_frontier
-from crossgrad_plugins.compare.figures.parallel import in_parallel
 from crossgrad_plugins.compare.figures.phases import draw_phases
 from crossgrad_plugins.compare.figures.primitives import draw_primitives
 from crossgrad_plugins.compare.figures.profile import draw_profile
@@ -21,6 +20,7 @@ from crossgrad_plugins.compare.figures.regimes import draw_regimes
 from crossgrad_plugins.compare.figures.style import Drawn
 from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
 from crossgrad_plugins.compare.page import page_of
+from crossgrad_plugins.compare.parallel import in_parallel
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of

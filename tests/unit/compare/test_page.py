@@ -17,7 +17,7 @@ from crossgrad_plugins.compare.tables import TABLES, tables_of
 SCENE = '<b>&"x"$y_$'
 VIEW = "a/<script>alert(1)</script>.jpg"
 HELD_OUT = (VIEW, "a/2.jpg", "b/1.jpg", "b/2.jpg")
-VOID = {"meta", "link", "img", "br", "path", "use", "rect", "col"}
+VOID = {"meta", "link", "img", "br", "wbr", "path", "use", "rect", "col"}
 
 
 class Reader(HTMLParser):

@@ -9,7 +9,7 @@ import pytest
 PROGRAM = """
 import os
 from functools import partial
-from crossgrad_plugins.compare.figures.parallel import in_parallel
+from crossgrad_plugins.compare.parallel import in_parallel
 
 def drawn(number):
     if number == {fails}:
