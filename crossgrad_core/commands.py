@@ -285,9 +285,9 @@ def available_cores() -> tuple[int, ...]:
     """The numbers of the cores that this process may use, as many as its container's quota."""
     import os
 
-    from crossgrad_core.numerics import threads
+    from crossgrad_core.system import cores
 
-    count = threads.available_cores()
+    count = cores.available_cores()
     affinity = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(count)
     return tuple(affinity[:count])
 

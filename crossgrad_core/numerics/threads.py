@@ -1,16 +1,13 @@
 """How many threads run, decided in one place for Numba and torch."""
 
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import torch
 
 from crossgrad_core.errors import UserError
-
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+from crossgrad_core.system.cores import available_cores
 
 
 def configure_threads(n: int | None = None) -> int:
@@ -68,21 +65,6 @@ def _default_threads() -> int:
         if value.isdecimal() and int(value) > 0:
             return int(value)
     return available_cores()
-
-
-def available_cores() -> int:
-    """Cores this process may use: its affinity, at most its container's CPU quota rounded up."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
-
-
-def _quota(limit: Path) -> int:
-    """CPU quota of a cgroup-v2 `cpu.max` file ("quota period" or "max period"), in whole cores."""
-    try:
-        quota, period = limit.read_text(encoding="ascii").split()
-        return max(1, math.ceil(int(quota) / int(period)))
-    except (OSError, ValueError):
-        return os.cpu_count() or 1
 
 
 @contextmanager

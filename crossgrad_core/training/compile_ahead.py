@@ -17,8 +17,8 @@ from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.gradients.by_rows import by_rows
 from crossgrad_core.numerics.kernel_cache import told_of_missing
-from crossgrad_core.numerics.threads import available_cores
 from crossgrad_core.registry.entries import build
+from crossgrad_core.system.cores import available_cores
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.coefficients import Rule
 from crossgrad_core.training.adam.late import Late

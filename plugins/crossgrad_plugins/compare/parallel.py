@@ -1,6 +1,5 @@
 """Figures that are drawn at the same time."""
 
-import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -8,10 +7,9 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import TypeVar
 
-_Drawn = TypeVar("_Drawn")
+from crossgrad_core.commands import available_cores
 
-#: Drawing is done by one process alone below so many cores.
-_LEAST = 2
+_Drawn = TypeVar("_Drawn")
 
 
 def in_parallel(drawings: Sequence[Callable[[], _Drawn]]) -> list[_Drawn]:
@@ -23,9 +21,8 @@ def in_parallel(drawings: Sequence[Callable[[], _Drawn]]) -> list[_Drawn]:
     Args:
         drawings: Functions of modules with their arguments; both are pickled.
     """
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
-    if cores < _LEAST or threading.active_count() > 1:
+    workers = min(len(available_cores()), len(drawings)) if sys.platform == "linux" else 1
+    if workers == 1 or threading.active_count() > 1:
         return [draw() for draw in drawings]
-    workers = min(cores, len(drawings))
     with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
         return [future.result() for future in [pool.submit(draw) for draw in drawings]]

@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Camera, Scene, View
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 #: Photos that one is told from, at most.
 TELLING = 4
@@ -81,10 +84,14 @@ class Neighbours:
         weights[rows == np.arange(len(rows))[:, None]] = 0.0
         return rows, weights / weights.sum(axis=1, keepdims=True)
 
-    def _told(self, places: _Floats, count: int) -> tuple[NDArray[np.int64], _Floats]:
+    @cached_property
+    def _tree(self) -> "cKDTree":
         from scipy.spatial import cKDTree
 
-        distances, rows = cKDTree(self._places).query(places, k=np.arange(1, count + 1))
+        return cKDTree(self._places)
+
+    def _told(self, places: _Floats, count: int) -> tuple[NDArray[np.int64], _Floats]:
+        distances, rows = self._tree.query(places, k=np.arange(1, count + 1))
         weights = 1.0 / np.maximum(distances, _NEAREST)
         return rows, weights / weights.sum(axis=1, keepdims=True)
 

@@ -1,10 +1,11 @@
 """Figures that are drawn by several processes."""
 
-import os
 import subprocess
 import sys
 
 import pytest
+
+from crossgrad_core.commands import available_cores
 
 PROGRAM = """
 import os
@@ -32,7 +33,7 @@ def answer(fails):
 
 
 @pytest.mark.skipif(
-    sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="needs two cores of Linux"
+    sys.platform != "linux" or len(available_cores()) < 2, reason="needs two cores of Linux"
 )
 def test_other_processes_draw_in_order():
     found = answer(fails=None)

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.numerics import threads
-from crossgrad_core.numerics.threads import available_cores, configure_threads
+from crossgrad_core.numerics.threads import configure_threads
+from crossgrad_core.system import cores as machine
+from crossgrad_core.system.cores import available_cores
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +52,7 @@ def test_default_comes_from_the_environment_or_the_cores(
 def test_a_container_quota_limits_the_cores(monkeypatch, tmp_path, content, cores):
     limit = tmp_path / "cpu.max"
     limit.write_text(content)
-    monkeypatch.setattr(threads, "_CGROUP_LIMIT", limit)
+    monkeypatch.setattr(machine, "_CGROUP_LIMIT", limit)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
     assert available_cores() == cores
 
@@ -61,7 +62,7 @@ def test_no_quota_means_the_affinity(monkeypatch, tmp_path, content):
     limit = tmp_path / "cpu.max"
     if content is not None:
         limit.write_text(content)
-    monkeypatch.setattr(threads, "_CGROUP_LIMIT", limit)
+    monkeypatch.setattr(machine, "_CGROUP_LIMIT", limit)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
     assert available_cores() == 1
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.exposures import starts
 from crossgrad_plugins.exposures.gain import Gain
 from crossgrad_plugins.exposures.neighbours import TELLING, Neighbours
 
@@ -88,6 +89,22 @@ def test_neighbours_are_asked_only_where_they_tell_more():
     assert float(Gain().unseen(views[0], scene, {"stops": drawn})["stops"]) == pytest.approx(
         float(drawn.mean())
     )
+
+
+def test_photos_that_nothing_tells_of_start_as_their_neighbours(monkeypatch):
+    rng = np.random.default_rng(0)
+    kinds = np.arange(20) % 2
+    views = [
+        posed_view(np.array([10.0 * kind, 0, 0]) + rng.normal(size=3), f"{n:02}.png")
+        for n, kind in enumerate(kinds)
+    ]
+    scene = posed_scene(views)
+    told = {view.name: float(kind) for view, kind in zip(views[2:], kinds[2:], strict=True)}
+    monkeypatch.setattr(starts, "exposure_values", lambda _: told)
+    found = starts.starts_of(scene, "exif")
+    assert found.stops == pytest.approx(kinds - 0.5)
+    (note,) = (each for each in found.remarks if "2 photos start" in each)
+    assert "the photos nearest in pose" in note and "00.png, 01.png" in note
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
