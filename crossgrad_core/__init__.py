@@ -6,6 +6,7 @@ Everything is imported when it is first used; docs/python.md shows it at work.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from crossgrad_core.system.cores import let_idle_threads_sleep
 from crossgrad_core.system.version import VERSION
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ __all__ = ["Camera", "Run", "RunFailedError", "UserError", "__version__", "open"
 
 
 def __getattr__(name: str) -> object:
+    let_idle_threads_sleep()
     if name == "run":  # The room of that name, which can be called.
         return import_module("crossgrad_core.run")
     if name in _HOMES:

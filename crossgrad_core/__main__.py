@@ -1,10 +1,12 @@
 """The command `crossgrad`, and `python -m crossgrad_core`."""
 
+from crossgrad_core.system.cores import let_idle_threads_sleep
 from crossgrad_core.system.interrupts import ended_quietly
 
 
 def main() -> None:
     """Runs the command line; an interrupt is answered before anything large is imported."""
+    let_idle_threads_sleep()
     with ended_quietly():
         from crossgrad_core.cli.main import main as command
 

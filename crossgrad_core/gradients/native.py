@@ -1,6 +1,6 @@
 """Passes over float32 gradients on the CPU: all tensors of a step in one parallel kernel call."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -24,8 +24,10 @@ def _sizes(columns: Sequence[Column]) -> NDArray[np.int64]:
     return np.array([max(_size(g) for g in column) for column in columns], np.int64)
 
 
-def _worth_waking(sizes: NDArray[np.int64]) -> bool:
-    return int(sizes.sum()) > SMALL
+def _run(sizes: NDArray[np.int64]) -> Callable[..., None]:
+    from crossgrad_core.numerics.jobs import alone, share
+
+    return share if int(sizes.sum()) > SMALL else alone
 
 
 def _size(gradient: Tensor | None) -> int:
@@ -37,16 +39,25 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
     from crossgrad_core.gradients.numba_kernels import dense
 
     sizes = _sizes(columns)
-    kernel = dense.gramians if _worth_waking(sizes) else dense.gramians_serial
-    return kernel(_addresses(columns), sizes, dense.chunk_table(sizes))
+    table = dense.chunk_table(sizes)
+    views = len(columns[0])
+    partial = np.zeros((len(table), views, views))
+    _run(sizes)(dense.gramians, _addresses(columns), sizes, table, partial)
+    return dense.summed(partial, table, len(sizes))
 
 
 def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
     """[K, K] Gramian of gradients in `rows` of `count` rows, with the bits of dense ones."""
     from crossgrad_core.gradients.numba_kernels import dense
+    from crossgrad_core.numerics.jobs import share
 
     width = max(_size(g) for g in column) // max(1, len(rows))
-    return dense.spread_gramian(_addresses([column])[0], rows.numpy(), width, count * width)
+    chunks = -(-count * width // dense.CHUNK)
+    partial = np.zeros((chunks, len(column), len(column)))
+    addresses = _addresses([column])[0]
+    share(dense.spread_gramian, addresses, rows.numpy(), width, count * width, partial)
+    (found,) = dense.summed(partial, np.zeros((chunks, 1), np.int64), 1)
+    return np.asarray(found)
 
 
 def combine(
@@ -70,8 +81,8 @@ def combine(
     sizes = np.array([result.numel() for result in out], np.int64)
     places = np.array([result.data_ptr() for result in out], np.int64)
     table = dense.chunk_table(sizes)
-    kernel = dense.combine if _worth_waking(sizes) else dense.combine_serial
-    kernel(_addresses(columns), weights, plain, float(divisor), places, sizes, table)
+    addresses = _addresses(columns)
+    _run(sizes)(dense.combine, addresses, weights, plain, float(divisor), places, sizes, table)
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
@@ -87,19 +98,24 @@ def overlap(column: Column, first: int, second: int) -> bool:
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     """[N, K, K] Gramians of the rows of a block's tensors."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
+    from crossgrad_core.numerics.jobs import share
 
     sizes = _sizes(columns)
-    return kernels.row_gramians(_addresses(columns), sizes // max(rows, 1), rows)
+    out = np.zeros((rows, len(columns[0]), len(columns[0])))
+    share(kernels.row_gramians, _addresses(columns), sizes // max(rows, 1), out)
+    return out
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
     """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
+    from crossgrad_core.numerics.jobs import share
 
     if out.numel():
         width = out.numel() // len(weights)
         addresses = _addresses([column])[0]
-        kernels.row_combine(addresses, np.ascontiguousarray(weights), out.data_ptr(), width)
+        weights = np.ascontiguousarray(weights)
+        share(kernels.row_combine, addresses, weights, out.data_ptr(), width)
 
 
 def row_overlap(

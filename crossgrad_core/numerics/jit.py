@@ -55,11 +55,6 @@ def strict_part(function: Callable[P, R]) -> Callable[P, R]:
     return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-def strict_parallel_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """As `strict_kernel`, with `prange` loops on all of Numba's threads."""
-    return compiled(function, parallel=True)
-
-
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function that runs on one thread; multiplications and additions may be fused."""
     return compiled(function, fastmath=_FLAGS)
@@ -83,8 +78,3 @@ def sum_kernel(function: Callable[P, R]) -> Callable[P, R]:
 def sum_device(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles sums that kernels call, which may be split over vector lanes; signs of zero stay."""
     return inlined(function, fastmath={"reassoc", "contract"})
-
-
-def parallel_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """As `kernel`, with `prange` loops on all of Numba's threads."""
-    return compiled(function, fastmath=_FLAGS, parallel=True)

@@ -7,17 +7,19 @@ from contextlib import contextmanager
 import torch
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.allocator import keep_freed_memory
 from crossgrad_core.system.cores import available_cores
 
 
 def configure_threads(n: int | None = None) -> int:
     """Gives Numba's kernels and torch's operators the same number of threads.
 
-    The threading layer of Numba is set to OpenMP where it can be loaded, else TBB, else Numba's own
-    "workqueue", unless the environment names one (`NUMBA_THREADING_LAYER`,
-    `NUMBA_THREADING_LAYER_PRIORITY`) or a parallel kernel has run already; docs/architecture.md
-    says why. Numba's number of threads belongs to the calling thread: a second thread that runs
-    kernels has to call this function too.
+    Kernels share their jobs (`jobs.share`); for the `prange` loops of plugins Numba's threading
+    layer is set to OpenMP where it can be loaded, else TBB, else Numba's own "workqueue", unless
+    the environment names one (`NUMBA_THREADING_LAYER`, `NUMBA_THREADING_LAYER_PRIORITY`) or a
+    parallel kernel has run already. Numba's number of threads belongs to the calling thread: a
+    second thread that runs kernels has to call this function too. Freed memory stays in the process
+    from now on (`keep_freed_memory`).
 
     Args:
         n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else
@@ -45,6 +47,7 @@ def configure_threads(n: int | None = None) -> int:
             else "leave --threads out to use all cores",
         )
     _prefer_openmp()
+    keep_freed_memory()
     numba.set_num_threads(n)
     torch.set_num_threads(n)
     return n

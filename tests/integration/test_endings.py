@@ -225,6 +225,15 @@ class Signals:
             self._send(report.step)
 
 
+@pytest.fixture
+def hangup():
+    """SIGHUP as a terminal sends it, where what started the tests ignores it, as nohup does."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("hangup")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_run_after_its_step(scene, whole, tmp_path, with_plugin, capsys, number):
     out = tmp_path / "run"

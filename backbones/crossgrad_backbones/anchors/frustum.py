@@ -69,9 +69,11 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 def _fused(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     from crossgrad_backbones.anchors.numba_kernels import frustum
+    from crossgrad_core.numerics.jobs import share
 
     inside = np.empty(len(positions), np.bool_)
-    frustum.in_frustum(
+    share(
+        frustum.in_frustum,
         positions.detach().contiguous().numpy(),
         log_scales.detach().contiguous().numpy(),
         camera.world_to_camera[:3].float().numpy(),

@@ -9,12 +9,13 @@ partial sums are added in the order of the chunks: same input, same bits.
 from typing import Any
 
 import numpy as np
-from numba import carray, prange  # type: ignore[attr-defined]
+from numba import carray  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from crossgrad_core.gradients.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
 from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_parallel_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -99,9 +100,15 @@ def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, ou
             out[places[i], places[j]] = compact[i, j]
 
 
-@strict_device
-def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
-    """Adds the chunks' Gramians with Neumaier's compensation, and mirrors the upper triangle."""
+@strict_kernel
+def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
+    """[T, K, K] sums of the chunks' Gramians, with Neumaier's compensation; both triangles.
+
+    Args:
+        partial: [C, K, K], upper triangles.
+        table: [C, 1 or more], the tensor of each chunk first.
+        tensors: T.
+    """
     views = partial.shape[1]
     total = np.zeros((tensors, views, views))
     lost = np.zeros((tensors, views, views))
@@ -122,31 +129,23 @@ def _summed(partial: Floats, table: Ints, tensors: int) -> Floats:
     return total
 
 
-@strict_device
-def _gramian_task(addresses: Ints, sizes: Ints, table: Ints, c: int, partial: Floats) -> None:
-    t, start = table[c, 0], table[c, 1]
-    compact = np.empty(partial.shape[1:])
-    _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
-
-
-@strict_parallel_kernel
-def gramians(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
-    """[T, K, K] float64 Gramians in one pass; NaN or infinite where a view is not finite."""
-    tensors, views = addresses.shape
-    partial = np.zeros((table.shape[0], views, views))
-    for c in prange(table.shape[0]):
-        _gramian_task(addresses, sizes, table, c, partial)
-    return _summed(partial, table, tensors)
-
-
 @strict_kernel
-def gramians_serial(addresses: Ints, sizes: Ints, table: Ints) -> Floats:
-    """The same bits without the cost of waking up other cores."""
-    tensors, views = addresses.shape
-    partial = np.zeros((table.shape[0], views, views))
-    for c in range(table.shape[0]):
-        _gramian_task(addresses, sizes, table, c, partial)
-    return _summed(partial, table, tensors)
+def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Floats) -> None:
+    """Writes the Gramian of each chunk, in one pass; NaN or infinite where a view is not finite.
+
+    Args:
+        jobs: From `share` or `alone`.
+        addresses: [T, K].
+        sizes: [T].
+        table: [C, 2] from `chunk_table`.
+        partial: [C, K, K], zero; what `summed` adds up.
+    """
+    compact = np.empty(partial.shape[1:])
+    c = take(jobs)
+    while c < table.shape[0]:
+        t, start = table[c, 0], table[c, 1]
+        _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
+        c = take(jobs)
 
 
 @strict_device
@@ -168,32 +167,34 @@ def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, de
     return True
 
 
-@strict_parallel_kernel
-def spread_gramian(addresses: Ints, rows: Ints, width: int, size: int) -> Floats:
-    """[K, K] what `gramians` finds for gradients that are zero but in some rows, to the bit.
+@strict_kernel
+def spread_gramian(
+    jobs: Jobs, addresses: Ints, rows: Ints, width: int, size: int, partial: Floats
+) -> None:
+    """Writes what `gramians` finds for gradients that are zero but in some rows, to the bit.
 
     Args:
+        jobs: From `share`.
         addresses: [K] of the values [R * width]; 0 where a view does not touch the tensor.
         rows: [R], sorted.
         width: Elements of a row.
         size: Elements of the tensor.
+        partial: [C, K, K] for the C chunks of the tensor, zero.
     """
     views = addresses.size
-    chunks = (size + CHUNK - 1) // CHUNK
-    partial = np.zeros((chunks, views, views))
-    for c in prange(chunks):
-        dense = np.empty(views * CHUNK, np.float32)
+    dense, compact = np.empty(views * CHUNK, np.float32), np.empty((views, views))
+    c = take(jobs)
+    while c < partial.shape[0]:
         length = min(CHUNK, size - c * CHUNK)
         if _spread(addresses, rows, width, c * CHUNK, length, dense):
             places = np.zeros(views, np.int64)
             for k in range(views):
                 if addresses[k] != 0:
                     places[k] = dense.ctypes.data + 4 * k * CHUNK
-            compact = np.empty((views, views))
             _chunk_gramian(places, 0, length, compact, partial[c])
             # Numba frees an array after the last line that names it, even if its address is held.
             dense[0] = np.float32(0.0)
-    return _summed(partial, np.zeros((chunks, 2), np.int64), 1)[0]
+        c = take(jobs)
 
 
 @strict_device
@@ -336,8 +337,9 @@ def _combine_chunk(
         _combine_pieces(rows, used, count, plain, divisor, out, first, end)
 
 
-@strict_parallel_kernel
+@strict_kernel
 def combine(
+    jobs: Jobs,
     addresses: Ints,
     weights: Floats,
     plain: Flags,
@@ -349,6 +351,7 @@ def combine(
     """Writes the weighted sums of all tensors, in one pass over all views.
 
     Args:
+        jobs: From `share` or `alone`.
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T] whether to add the rows in float32 in the order of the views instead.
@@ -357,27 +360,12 @@ def combine(
         sizes: [T].
         table: From `chunk_table`.
     """
-    for c in prange(table.shape[0]):
+    c = take(jobs)
+    while c < table.shape[0]:
         t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
-
-
-@strict_kernel
-def combine_serial(
-    addresses: Ints,
-    weights: Floats,
-    plain: Flags,
-    divisor: float,
-    out: Ints,
-    sizes: Ints,
-    table: Ints,
-) -> None:
-    """The same bits without the cost of waking up other cores."""
-    for c in range(table.shape[0]):
-        t, first = table[c, 0], table[c, 1]
-        end = min(first + CHUNK, sizes[t])
-        _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
+        c = take(jobs)
 
 
 @strict_kernel

@@ -4,10 +4,10 @@ Addresses are those of `dense`; row i of a tensor of width d starts at element i
 """
 
 import numpy as np
-from numba import prange
 
 from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, row
-from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_parallel_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 
 #: Rows that one task works on.
 ROWS = 2048
@@ -35,20 +35,21 @@ def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floa
                 out[i, k, other] = out[i, other, k]
 
 
-@strict_parallel_kernel
-def row_gramians(addresses: Ints, widths: Ints, count: int) -> Floats:
-    """[N, K, K] float64 Gramians of the rows of a block of T tensors.
+@strict_kernel
+def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None:
+    """Adds the Gramians of the rows of a block of T tensors to `out`.
 
     Args:
+        jobs: From `share`.
         addresses: [T, K]; 0 where a view does not touch the tensor.
         widths: [T] elements per row.
-        count: N.
+        out: [N, K, K] float64, zero.
     """
-    views = addresses.shape[1]
-    out = np.zeros((count, views, views))
-    for task in prange((count + ROWS - 1) // ROWS):
+    count = out.shape[0]
+    task = take(jobs)
+    while task * ROWS < count:
         _gramian_task(addresses, widths, task * ROWS, min(task * ROWS + ROWS, count), out)
-    return out
+        task = take(jobs)
 
 
 @strict_device
@@ -70,20 +71,23 @@ def _combine_task(
         result[j] = np.float32(wide[j])
 
 
-@strict_parallel_kernel
-def row_combine(addresses: Ints, weights: Floats, out: int, width: int) -> None:
+@strict_kernel
+def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: int) -> None:
     """Writes sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
 
     Args:
+        jobs: From `share`.
         addresses: [K]; 0 leaves the view out.
         weights: [N, K].
         out: Address of the result; may be that of a view.
         width: Elements per row.
     """
     count = weights.shape[0]
-    for task in prange((count + ROWS - 1) // ROWS):
+    task = take(jobs)
+    while task * ROWS < count:
         end = min(task * ROWS + ROWS, count)
         _combine_task(addresses, weights, out, width, task * ROWS, end)
+        task = take(jobs)
 
 
 @strict_kernel

@@ -76,6 +76,7 @@ class Late:
             adam: Moments and counts.
             step: The coefficients of the step.
         """
+        from crossgrad_core.numerics.jobs import share
         from crossgrad_core.training.adam.numba_kernels.fused import numbers_of, update_arrays
         from crossgrad_core.training.adam.numba_kernels.late import update_rows
 
@@ -91,7 +92,7 @@ class Late:
         if len(rows) == len(behind.done):
             update_arrays(flat[0], values, flat[1], flat[2], step)
         else:
-            update_rows(rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
+            share(update_rows, rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
         behind.done[rows.numpy()] = count
         beta1, _, beta2, _, step_size, root_scale, eps, _, _ = map(float, numbers)
         behind.steps.append((beta1, beta2, step_size, root_scale, eps))
@@ -114,6 +115,7 @@ class Late:
         if behind is None:
             return
         if behind.steps and (rows is None or len(rows)):
+            from crossgrad_core.numerics.jobs import share
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
             # Of one type in any case: for another one the kernel would be compiled once more.
@@ -121,7 +123,8 @@ class Late:
             flat, width = _flat(name, param, adam), _width(param)
             steps, before = behind.table(), behind.before
             whole = rows is None
-            catch_up(whole, which, width, flat[0], flat[1], flat[2], behind.done, before, steps)
+            done = behind.done
+            share(catch_up, whole, which, width, flat[0], flat[1], flat[2], done, before, steps)
             _changed(name, param, adam)
         if rows is None:
             del self._behind[name]

@@ -238,18 +238,20 @@ def test_threads_and_chunks_change_no_bit(views):
 
 def test_one_core_and_all_cores_give_the_same_bits():
     from crossgrad_core.gradients.numba_kernels import dense
+    from crossgrad_core.numerics.jobs import alone, share
 
     rows = torch.randn(3, 50_001, generator=torch.Generator().manual_seed(0))
     addresses = np.array([[row.data_ptr() for row in rows]])
     sizes = np.array([50_001])
     table = dense.chunk_table(sizes)
-    one, other = (f(addresses, sizes, table) for f in (dense.gramians, dense.gramians_serial))
-    assert np.array_equal(one, other)
     results = [torch.empty(50_001), torch.empty(50_001)]
-    for kernel, out in zip((dense.combine, dense.combine_serial), results, strict=True):
+    partials = [np.zeros((len(table), 3, 3)) for _ in results]
+    weights = np.array([[1.5, -2.0, 0.25]])
+    for run, out, partial in zip((alone, share), results, partials, strict=True):
+        run(dense.gramians, addresses, sizes, table, partial)
         places = np.array([out.data_ptr()])
-        weights = np.array([[1.5, -2.0, 0.25]])
-        kernel(addresses, weights, np.array([False]), 1.0, places, sizes, table)
+        run(dense.combine, addresses, weights, np.array([False]), 1.0, places, sizes, table)
+    assert partials[0].any() and np.array_equal(*partials)
     assert torch.equal(*results)
 
 

@@ -7,14 +7,13 @@ import numba
 import numpy as np
 import pytest
 
+from crossgrad_core.numerics.jobs import share
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
     GaussianArrays,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
-from crossgrad_plugins.rasterizers.numba_kernels.jit import kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import share, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade
@@ -361,29 +360,6 @@ def test_bits_depend_neither_on_the_number_of_threads_nor_on_the_run(threads):
     np.testing.assert_array_equal(frame.image, again.image)
     np.testing.assert_array_equal(frame.pixels, again.pixels)
     same_bits(gradients, gradients_again)
-
-
-@kernel
-def mark(jobs, marks):
-    job = take(jobs)
-    while job < marks.shape[0]:
-        marks[job] += 1
-        job = take(jobs)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_every_job_is_done_once(threads):
-    if threads > numba.config.NUMBA_NUM_THREADS:
-        pytest.skip("fewer threads here")
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(threads)
-        for count in (0, 1, 1000):
-            marks = np.zeros(count, np.int64)
-            share(mark, marks)
-            assert (marks == 1).all()
-    finally:
-        numba.set_num_threads(before)
 
 
 def test_two_frames_live_side_by_side():

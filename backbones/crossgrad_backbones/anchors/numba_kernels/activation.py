@@ -9,11 +9,11 @@ its own rows, so that no bit depends on the number of threads.
 from typing import TypeAlias
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from crossgrad_backbones.anchors.heads import COVARIANCE
-from crossgrad_core.numerics.jit import kernel, parallel_kernel
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
@@ -36,8 +36,9 @@ def count(opacities: _Floats, starts: _Ints) -> None:
     starts[anchors] = total
 
 
-@parallel_kernel
+@kernel
 def gather(
+    jobs: Jobs,
     first: int,
     covariances: _Floats,
     colors: _Floats,
@@ -59,6 +60,7 @@ def gather(
     """Writes what belongs to the Gaussians of positive opacity.
 
     Args:
+        jobs: From `share`.
         first: The first anchor.
         covariances: [n, 7 k] raw.
         colors: [n, 3 k] raw.
@@ -78,8 +80,9 @@ def gather(
         out_colors: [G, 3] written, raw.
     """
     anchors, slots = len(covariances), opacities.shape[1]
-    for share in prange((anchors + SHARE - 1) // SHARE):
-        for n in range(share * SHARE, min(anchors, (share + 1) * SHARE)):
+    part = take(jobs)
+    while part * SHARE < anchors:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             g, p = starts[a], rows[a]
             for j in range(slots):
@@ -94,10 +97,12 @@ def gather(
                     for c in range(4):
                         out_quats[g, c] = covariances[n, COVARIANCE * j + 3 + c]
                     g += 1
+        part = take(jobs)
 
 
-@parallel_kernel
+@kernel
 def scatter(
+    jobs: Jobs,
     first: int,
     anchors: int,
     rows: _Ints,
@@ -121,6 +126,7 @@ def scatter(
     """Gradients of all inputs from those of all outputs.
 
     Args:
+        jobs: From `share`.
         first: The first anchor.
         anchors: n.
         rows: [A].
@@ -143,7 +149,8 @@ def scatter(
     """
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
-    for part in prange((anchors + SHARE - 1) // SHARE):
+    part = take(jobs)
+    while part * SHARE < anchors:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             p = rows[a]
@@ -164,10 +171,12 @@ def scatter(
                     raw[n, rgb + c] = v_colors[g, c] * color * (_ONE - color)
                 for c in range(4):
                     raw[n, cov + 3 + c] = v_quats[g, c]
+        part = take(jobs)
 
 
-@parallel_kernel
+@kernel
 def scatter_scales(
+    jobs: Jobs,
     first: int,
     anchors: int,
     rows: _Ints,
@@ -180,7 +189,8 @@ def scatter_scales(
     raw: _Floats,
 ) -> None:
     """As `scatter` where only the scales have a gradient; `raw` [n, 7 k] is by covariances."""
-    for part in prange((anchors + SHARE - 1) // SHARE):
+    part = take(jobs)
+    while part * SHARE < anchors:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             p = rows[a]
@@ -191,3 +201,4 @@ def scatter_scales(
                     by_log = v_scales[g, c] * shares[g, c] * spreads[a, 3 + c]
                     out_log_scales[p, 3 + c] += by_log
                     raw[n, cov + c] = by_log * (_ONE - shares[g, c])
+        part = take(jobs)

@@ -3,17 +3,18 @@
 import math
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import parallel_kernel
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 
 #: Anchors that one thread takes at a time.
 SHARE = 4096
 
 
-@parallel_kernel
+@kernel
 def in_frustum(
+    jobs: Jobs,
     positions: NDArray[np.float32],
     log_scales: NDArray[np.float32],
     pose: NDArray[np.float32],
@@ -26,6 +27,7 @@ def in_frustum(
     """Which anchors pass; the formulas are those of the plain filter.
 
     Args:
+        jobs: From `share`.
         positions: [P, 3].
         log_scales: [P, 3 or more].
         pose: [3, 4] world to camera.
@@ -37,8 +39,9 @@ def in_frustum(
         inside: [P] written.
     """
     count = len(positions)
-    for share in prange((count + SHARE - 1) // SHARE):
-        for p in range(share * SHARE, min(count, (share + 1) * SHARE)):
+    part = take(jobs)
+    while part * SHARE < count:
+        for p in range(part * SHARE, min(count, (part + 1) * SHARE)):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
             depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
             passes = depth > near
@@ -61,3 +64,4 @@ def in_frustum(
                 extent = reach * math.sqrt(variance * ratio * ratio + dilation)
                 passes = place + extent >= axes[k, 4] and place - extent <= axes[k, 5]
             inside[p] = passes
+        part = take(jobs)

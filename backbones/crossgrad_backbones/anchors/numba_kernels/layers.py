@@ -3,10 +3,10 @@
 from typing import TypeAlias
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import parallel_kernel
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
@@ -17,24 +17,29 @@ SHARE = 256
 _ZERO = np.float32(0)
 
 
-@parallel_kernel
-def join(features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
+@kernel
+def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
     """Writes [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
-    for share in prange((anchors + SHARE - 1) // SHARE):
-        for a in range(share * SHARE, min(anchors, (share + 1) * SHARE)):
+    part = take(jobs)
+    while part * SHARE < anchors:
+        for a in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             row = rows[a]
             for c in range(feature):
                 out[a, c] = features[row, c]
             for c in range(view):
                 out[a, feature + c] = views[a, c]
+        part = take(jobs)
 
 
-@parallel_kernel
-def rectify_back(first: int, anchors: int, column: int, hidden: _Floats, gradient: _Floats) -> None:
+@kernel
+def rectify_back(
+    jobs: Jobs, first: int, anchors: int, column: int, hidden: _Floats, gradient: _Floats
+) -> None:
     """Clears the gradient in place where the rectified numbers are 0.
 
     Args:
+        jobs: From `share`.
         first: The first anchor.
         anchors: n.
         column: Column of `hidden` that belongs to the first one of the gradient.
@@ -42,9 +47,11 @@ def rectify_back(first: int, anchors: int, column: int, hidden: _Floats, gradien
         gradient: [n or more, H or 3 H].
     """
     width = gradient.shape[1]
-    for share in prange((anchors + SHARE - 1) // SHARE):
-        for n in range(share * SHARE, min(anchors, (share + 1) * SHARE)):
+    part = take(jobs)
+    while part * SHARE < anchors:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             mine = gradient[n]
             theirs = hidden[first + n, column : column + width]
             for c in range(width):
                 mine[c] = mine[c] if theirs[c] > _ZERO else _ZERO
+        part = take(jobs)

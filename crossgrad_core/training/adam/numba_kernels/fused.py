@@ -3,10 +3,10 @@
 from typing import TypeAlias
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import kernel, parallel_kernel
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jobs import Jobs, share, take
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
@@ -41,13 +41,20 @@ def update(
         param[i] -= step_size * (m / (np.sqrt(v) * root_scale + eps))
 
 
-@parallel_kernel
+@kernel
 def _update_chunks(
-    param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: Numbers
+    jobs: Jobs,
+    param: _Floats,
+    grad: _Floats,
+    exp_avg: _Floats,
+    exp_avg_sq: _Floats,
+    numbers: Numbers,
 ) -> None:
-    for chunk in prange((len(param) + _CHUNK - 1) // _CHUNK):
+    chunk = take(jobs)
+    while chunk * _CHUNK < len(param):
         a, b = chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK)
         update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
+        chunk = take(jobs)
 
 
 def numbers_of(step: Coefficients) -> Numbers:
@@ -75,5 +82,7 @@ def update_arrays(
     """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
     numbers = numbers_of(step)
     # A single chunk is not worth waking other threads for.
-    run = update if len(param) <= _CHUNK else _update_chunks
-    run(param, grad, exp_avg, exp_avg_sq, numbers)
+    if len(param) <= _CHUNK:
+        update(param, grad, exp_avg, exp_avg_sq, numbers)
+    else:
+        share(_update_chunks, param, grad, exp_avg, exp_avg_sq, numbers)

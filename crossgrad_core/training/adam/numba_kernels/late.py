@@ -9,10 +9,10 @@ registers: memory is read and written once.
 """
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import device, parallel_kernel
+from crossgrad_core.numerics.jit import device, kernel
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -141,8 +141,9 @@ def _bring_near(rows: Ints, k: int, width: int, p: Floats, m: Floats, v: Floats)
         prefetch_write(v, here)
 
 
-@parallel_kernel
+@kernel
 def catch_up(
+    jobs: Jobs,
     whole: bool,
     rows: Ints,
     width: int,
@@ -156,6 +157,7 @@ def catch_up(
     """Takes the steps without gradient that rows of a tensor are behind.
 
     Args:
+        jobs: From `share`.
         whole: Whether all rows are meant.
         rows: [R] the rows, each once, where not all are meant.
         width: Elements of a row.
@@ -168,8 +170,9 @@ def catch_up(
     """
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
-    for task in prange((count + _ROWS - 1) // _ROWS):
-        rest = np.empty(3 * LANES, np.float32)
+    rest = np.empty(3 * LANES, np.float32)
+    task = take(jobs)
+    while task * _ROWS < count:
         for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
             ahead = place + _AHEAD
             if not whole and ahead < count and done[rows[ahead]] - before < end:
@@ -179,6 +182,7 @@ def catch_up(
             if first < end:
                 _row(param, exp_avg, exp_avg_sq, i * width, width, first, end, steps, rest)
                 done[i] = before + end
+        task = take(jobs)
 
 
 @device
@@ -193,8 +197,9 @@ def _copied(source: Floats, at: int, target: Floats, to: int, width: int) -> Non
     store(target, to + width - LANES, load(source, at + width - LANES))
 
 
-@parallel_kernel
+@kernel
 def update_rows(
+    jobs: Jobs,
     rows: Ints,
     width: int,
     param: Floats,
@@ -206,6 +211,7 @@ def update_rows(
     """Takes one step with rows of a tensor and their gradients.
 
     Args:
+        jobs: From `share`.
         rows: [R], each once.
         width: Elements of a row.
         param: [N * width].
@@ -214,8 +220,9 @@ def update_rows(
         exp_avg_sq: [N * width].
         numbers: Of the step, as in `fused`.
     """
-    for task in prange((rows.size + _ROWS - 1) // _ROWS):
-        places = np.empty((3, _GATHERED * width), np.float32)
+    places = np.empty((3, _GATHERED * width), np.float32)
+    task = take(jobs)
+    while task * _ROWS < rows.size:
         last = min(rows.size, (task + 1) * _ROWS)
         for first in range(task * _ROWS, last, _GATHERED):
             end = min(first + _GATHERED, last)
@@ -233,3 +240,4 @@ def update_rows(
                 _copied(p, to, param, at, width)
                 _copied(m, to, exp_avg, at, width)
                 _copied(v, to, exp_avg_sq, at, width)
+        task = take(jobs)

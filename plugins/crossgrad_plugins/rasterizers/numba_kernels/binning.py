@@ -7,6 +7,7 @@ consecutive slots; the tile lists are then filled in the order of depth.
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -25,7 +26,6 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     LOG_OPACITY,

@@ -8,6 +8,7 @@ the same operations as `backward`, hence with the same gradients, and sums per e
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -29,7 +30,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import fill_axis_rows
 from crossgrad_plugins.rasterizers.numba_kernels.constants import OFFSETS
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import ROWS, fill_rows
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     RECORD,
     SEGMENT,

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
     as_negative,
@@ -40,7 +41,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     fill_rows,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     COLUMNS,

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import share
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
@@ -36,7 +37,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.directions import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import pinhole
 from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import share
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,

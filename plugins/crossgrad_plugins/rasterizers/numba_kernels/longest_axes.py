@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.directions import BINS, FIELDS, SUMS
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
@@ -18,7 +19,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     unit_quaternion,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
 
 #: An axis that the camera sees shorter than this (pixels) is seen end on and has no direction.

@@ -8,6 +8,7 @@ segments that hold a marked pixel. The operations are those of `forward`, and so
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
     bits,
@@ -42,7 +43,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     fill_rows,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COSINE,
     DECAY,

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import BLOCK, get, put
@@ -23,7 +24,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     unit_quaternion,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
-from crossgrad_plugins.rasterizers.numba_kernels.jobs import Jobs, take
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     BLUE,
     CHUNK,

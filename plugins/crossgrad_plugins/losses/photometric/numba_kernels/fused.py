@@ -19,10 +19,10 @@ tiles are independent and the result has the same bits for any number of threads
 from typing import TypeAlias
 
 import numpy as np
-from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import parallel_kernel, part
+from crossgrad_core.numerics.jit import kernel, part
+from crossgrad_core.numerics.jobs import Jobs, share, take
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     CHANNELS,
     DIFFERENCE,
@@ -85,28 +85,31 @@ def _tile(
     return absolute, dissimilarity
 
 
-@parallel_kernel
+@kernel
 def _all_tiles(
-    scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
+    jobs: Jobs, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
     height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
     sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Runs every tile; tile t uses row t % step of `scratch` [step, SCRATCH]."""
-    step = scratch.shape[0]
+    """Runs every tile; their sums [rows of tiles, columns of tiles, 2] are written."""
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
-    for first in prange(step):
-        for t in range(np.int64(first), down * across, step):
-            top, left = t // across * rows, t % across * columns
-            box = (top, min(height, top + rows), left, min(width, left + columns))
-            if box[0] < box[1] and box[2] < box[3]:
-                absolute, dissimilarity = _tile(
-                    scratch[first], image, target, target_8bit, is_8bit, mask, is_masked, gradient,
-                    with_gradient, box, height, width, l1_weight, ssim_weight,
-                )  # fmt: skip
-                sums[t // across, t % across, 0] = absolute
-                sums[t // across, t % across, 1] = dissimilarity
+    tile = take(jobs)
+    if tile >= down * across:
+        return
+    scratch = np.zeros(SCRATCH, np.float32)
+    while tile < down * across:
+        top, left = tile // across * rows, tile % across * columns
+        box = (top, min(height, top + rows), left, min(width, left + columns))
+        if box[0] < box[1] and box[2] < box[3]:
+            absolute, dissimilarity = _tile(
+                scratch, image, target, target_8bit, is_8bit, mask, is_masked, gradient,
+                with_gradient, box, height, width, l1_weight, ssim_weight,
+            )  # fmt: skip
+            sums[tile // across, tile % across, 0] = absolute
+            sums[tile // across, tile % across, 1] = dissimilarity
+        tile = take(jobs)
 
 
 def loss_terms(
@@ -138,10 +141,9 @@ def loss_terms(
     count = kept * CHANNELS
     down, across = -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
     sums = np.zeros((down, across, 2))
-    threads = min(get_num_threads(), down * across)
     is_8bit = target.dtype == np.uint8
-    _all_tiles(
-        np.zeros((threads, SCRATCH), np.float32),
+    share(
+        _all_tiles,
         image.reshape(-1),
         np.empty(0, np.float32) if is_8bit else target.reshape(-1).view(np.float32),
         target.reshape(-1).view(np.uint8) if is_8bit else np.empty(0, np.uint8),

@@ -1,0 +1,162 @@
+r"""The end of runs of so many seconds, by the code of several commits, in turns on one core.
+
+    python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 \
+        --code old=VENV_OLD/bin/crossgrad --code "new=VENV/bin/crossgrad --split every" \
+        --seconds 5 10 20 30:10 70:23.3 140:46.7 --seeds 1 2 3 4 5 6
+    python benchmarks/time_to_quality.py table OUT
+
+`30:10` gives the first code 30 and the second one 10 seconds. Runs have 400 px, one thread and one
+core (Linux), and those of a pair follow one another there; finished ones are not repeated. Figures
+are of the exported PLY on black: drawn by `crossgrad eval --ply` and by `viewer.py`.
+"""
+
+import argparse
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import viewer
+
+import crossgrad_core as cg
+from crossgrad_plugins.compare.statistics.estimate import estimate
+from crossgrad_plugins.compare.statistics.verdict import verdicts
+
+MAX_SIZE = 400
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Code:
+    """A commit: a name, its `crossgrad`, and options of `crossgrad run`."""
+
+    name: str
+    program: str
+    options: tuple[str, ...]
+
+    @classmethod
+    def of(cls, text: str) -> "Code":
+        """From `NAME=CROSSGRAD [OPTIONS]`."""
+        name, _, words = text.partition("=")
+        program, *options = shlex.split(words)
+        return cls(name, program, tuple(options))
+
+    def train(self, scene: Path, folder: Path, *length: str) -> None:
+        """Trains into a folder, which must not exist."""
+        command = [self.program, "run", str(scene), "--out", str(folder), "--threads", "1"]
+        command += ["--max-size", str(MAX_SIZE), *length, *self.options]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def run(given: argparse.Namespace) -> None:
+    """Runs what is missing."""
+    os.sched_setaffinity(0, {given.core})
+    codes = [Code.of(text) for text in given.code]
+    for code in codes:
+        # Compiles the kernels of all that a run needs, so that no timed run does.
+        warm = given.out / f"warm-up-{code.name}-{given.core}"
+        if not warm.exists():
+            code.train(given.scene[0], warm, "--steps", "700")
+    for seed, scene, lengths in _cases(given):
+        each = lengths.split(":")
+        pairs = [(code, each[n % len(each)]) for n, code in enumerate(codes)]
+        for code, seconds in pairs if seed % 2 else reversed(pairs):
+            folder = given.out / f"{scene.name}-{lengths.replace(':', '_')}-{code.name}-{seed}"
+            if (folder / "row.json").exists():
+                continue
+            shutil.rmtree(folder, ignore_errors=True)
+            code.train(scene, folder, "--seconds", seconds, "--seed", str(seed))
+            row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
+            (folder / "row.json").write_text(json.dumps(row | _figures(folder)))
+
+
+def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
+    for seed in given.seeds:
+        for scene in given.scene:
+            for lengths in given.seconds:
+                yield seed, scene, lengths
+
+
+def _figures(folder: Path) -> Row:
+    summary = json.loads((folder / "summary.json").read_text())
+    ply = folder / "point_cloud.ply"
+    command = [sys.executable, "-m", "crossgrad_core", "eval", str(folder), "--ply", str(ply)]
+    shown = subprocess.run([*command, "--threads", "1"], check=True, capture_output=True, text=True)
+    (drawn,) = (line.split()[2] for line in shown.stdout.splitlines() if line.startswith("overall"))
+    return {
+        "psnr": summary["overall"]["psnr"],
+        "ply": float(drawn),
+        "viewer": viewer.psnr(cg.open(folder), ply),
+        "steps": summary["step"],
+        "primitives": summary["primitives"],
+        "seconds": summary["train_seconds"],
+        "commit": str((summary.get("environment") or {}).get("commit")),
+    }
+
+
+def table(given: argparse.Namespace) -> None:
+    """Prints means and standard deviations, and what the code `new` gains over `old`."""
+    by_case: dict[tuple[str, str], dict[str, dict[int, Row]]] = defaultdict(dict)
+    for path in sorted(given.out.glob("*/row.json")):
+        row = json.loads(path.read_text())
+        by_case[row["scene"], row["lengths"]].setdefault(row["code"], {})[row["seed"]] = row
+    cases = sorted(by_case.items(), key=lambda case: (case[0][0], float(case[0][1].split(":")[0])))
+    titles = "scene | code | commit | training s | seeds | PLY, dB | viewer.py, dB | steps"
+    print(f"| {titles} | Gaussians |\n{'|---' * 9}|")
+    for (scene, _), codes in cases:
+        for code, own in sorted(codes.items(), reverse=True):
+            print(f"| {scene} | {code} | {' | '.join(_cells(list(own.values())))} |")
+    found = []
+    for (scene, lengths), codes in cases:
+        if seeds := sorted(codes.get("old", {}).keys() & codes.get("new", {}).keys()):
+            gains = [codes["new"][seed]["ply"] - codes["old"][seed]["ply"] for seed in seeds]
+            found.append((scene, lengths, estimate(gains, [scene] * len(gains), 0.1)))
+    print(f"\n| scene | seconds, old:new | new - old, dB | 95 % | seeds | verdict |\n{'|---' * 6}|")
+    for (scene, lengths, each), verdict in zip(
+        found, verdicts([e for *_, e in found]), strict=True
+    ):
+        low, high = each.wide
+        row = f"{each.center:+.2f} | [{low:+.2f}, {high:+.2f}] | {each.pairs} | {verdict.value}"
+        print(f"| {scene} | {lengths} | {row} |")
+
+
+def _cells(own: list[Row]) -> Iterator[str]:
+    yield ", ".join(sorted({row["commit"] for row in own}))
+    yield f"{fmean(row['seconds'] for row in own):.1f}"
+    yield str(len(own))
+    for name in ("ply", "viewer"):
+        values = [row[name] for row in own]
+        yield f"{fmean(values):.2f}" + (f" ± {stdev(values):.2f}" if len(values) > 1 else "")
+    for name in ("steps", "primitives"):
+        yield f"{fmean(row[name] for row in own):,.0f}"
+
+
+def main() -> None:
+    """Runs or prints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    commands = parser.add_subparsers(required=True)
+    runs = commands.add_parser("run", help="run what is missing")
+    runs.set_defaults(do=run)
+    runs.add_argument("out", type=Path)
+    runs.add_argument("--code", action="append", required=True, metavar="NAME=CROSSGRAD [OPTIONS]")
+    runs.add_argument("--scene", action="append", type=Path, required=True)
+    runs.add_argument("--seconds", nargs="+", required=True, metavar="S[:S]")
+    runs.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5, 6])
+    runs.add_argument("--core", type=int, default=0)
+    tables = commands.add_parser("table", help="print what there is")
+    tables.set_defaults(do=table)
+    tables.add_argument("out", type=Path)
+    given = parser.parse_args()
+    given.do(given)
+
+
+if __name__ == "__main__":
+    main()

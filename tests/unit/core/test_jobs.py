@@ -1,0 +1,105 @@
+"""Jobs that threads share, and where the threads run."""
+
+import os
+import sys
+import threading
+
+import numba
+import numpy as np
+import pytest
+
+from crossgrad_core.numerics import jobs
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.system import cores
+
+
+@kernel
+def mark(numbers, marks):
+    job = jobs.take(numbers)
+    while job < marks.shape[0]:
+        marks[job] += 1
+        job = jobs.take(numbers)
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request):
+    if request.param > numba.config.NUMBA_NUM_THREADS:
+        pytest.skip("fewer threads here")
+    before = numba.get_num_threads()
+    numba.set_num_threads(request.param)
+    yield request.param
+    numba.set_num_threads(before)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+@pytest.mark.parametrize("run", [jobs.share, jobs.alone])
+def test_every_job_is_done_once(threads, run, count):
+    marks = np.zeros(count, np.int64)
+    run(mark, marks)
+    assert (marks == 1).all()
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_an_error_of_a_helper_is_raised(threads):
+    both = threading.Barrier(threads)
+
+    def fails(_numbers):
+        both.wait(timeout=30)
+        if threading.current_thread() is not threading.main_thread():
+            raise ValueError("of a helper")
+
+    with pytest.raises(ValueError, match="of a helper"):
+        jobs.share(fails)
+
+
+linux = pytest.mark.skipif(
+    sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="needs two cores of Linux"
+)
+
+
+@linux
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_helpers_run_on_other_cores_than_who_asks_them(threads, monkeypatch):
+    allowed = os.sched_getaffinity(0)
+    jobs._helpers.cache_clear()
+    for core in sorted(allowed) * 2:
+        monkeypatch.setattr(jobs, "current_core", lambda core=core: core)
+        both, found = threading.Barrier(threads), {}
+
+        def look(_numbers, both=both, found=found):
+            both.wait(timeout=30)
+            found[threading.current_thread() is threading.main_thread()] = os.sched_getaffinity(0)
+
+        jobs.share(look)
+        assert found == {True: allowed, False: allowed - {core}}
+
+
+@linux
+def test_a_thread_that_has_nowhere_else_to_go_stays(monkeypatch):
+    allowed = os.sched_getaffinity(0)
+    core = cores.current_core()
+    assert core in allowed
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {core})
+    cores.keep_off(core, [threading.get_native_id()])
+    monkeypatch.undo()
+    assert os.sched_getaffinity(0) == allowed
+    cores.keep_off(None, [threading.get_native_id()])
+    assert os.sched_getaffinity(0) == allowed
+
+
+@linux
+def test_a_thread_that_has_ended_is_left_out():
+    ended = threading.Thread(target=lambda: None)
+    ended.start()
+    number = ended.native_id
+    ended.join()
+    cores.keep_off(min(os.sched_getaffinity(0)), [number])
+
+
+@pytest.mark.parametrize(("wish", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_idle_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, wish, found):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if wish is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", wish)
+    cores.let_idle_threads_sleep()
+    assert os.environ["OMP_WAIT_POLICY"] == found
