@@ -6,6 +6,7 @@ tensor, by the same float32 operations in the same order: the bits are those of 
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import inf
 from typing import Final
 
@@ -30,17 +31,26 @@ class _Behind:
 
     Attributes:
         done: [N] steps that each row has had.
-        before: Steps before the first of `steps`; no row has had fewer.
-        steps: Numbers of the steps since, for rows without a gradient.
+        before: Steps before the first of `room`; no row has had fewer.
+        room: [LONGEST, 5] both betas, step size, scale of the root and eps of each step since.
+        count: Steps since.
     """
 
     done: NDArray[np.int32]
     before: int
-    steps: list[tuple[float, ...]] = field(default_factory=list)
+    room: NDArray[np.float32] = field(default_factory=lambda: np.empty((LONGEST, 5), np.float32))
+    count: int = 0
 
+    def add(self, *numbers: float) -> None:
+        """Adds a step."""
+        self.room[self.count] = numbers
+        self.count += 1
+        vars(self).pop("table", None)
+
+    @cached_property
     def table(self) -> NDArray[np.float32]:
         """The steps as the kernel wants them, flat."""
-        steps = np.array(self.steps, np.float32).reshape(-1, 5)
+        steps = self.room[: self.count]
         # What is above this step or below it from here on.
         later = steps[::-1]
         most = np.maximum.accumulate(later[:, 2])[::-1]
@@ -95,9 +105,9 @@ class Late:
             share(update_rows, rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
         behind.done[rows.numpy()] = count
         beta1, _, beta2, _, step_size, root_scale, eps, _, _ = map(float, numbers)
-        behind.steps.append((beta1, beta2, step_size, root_scale, eps))
+        behind.add(beta1, beta2, step_size, root_scale, eps)
         _changed(name, param, adam)
-        if len(behind.steps) == LONGEST:
+        if behind.count == LONGEST:
             self.catch_up(name, param, adam)
 
     def catch_up(
@@ -114,14 +124,14 @@ class Late:
         behind = self._behind.get(name)
         if behind is None:
             return
-        if behind.steps and (rows is None or len(rows)):
+        if behind.count and (rows is None or len(rows)):
             from crossgrad_core.numerics.jobs import share
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
             # Of one type in any case: for another one the kernel would be compiled once more.
             which = np.empty(0, np.int32) if rows is None else rows.numpy()
             flat, width = _flat(name, param, adam), _width(param)
-            steps, before = behind.table(), behind.before
+            steps, before = behind.table, behind.before
             whole = rows is None
             done = behind.done
             share(catch_up, whole, which, width, flat[0], flat[1], flat[2], done, before, steps)

@@ -29,7 +29,7 @@ from crossgrad_core.numerics.simd import (
     store,
     where,
 )
-from crossgrad_core.training.adam.coefficients import SMALLEST_NORMAL, TINY
+from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY
 from crossgrad_core.training.adam.numba_kernels.fused import Numbers, update
 
 Floats = NDArray[np.float32]
@@ -40,7 +40,7 @@ Ints = NDArray[np.int32]
 BETA1, BETA2, STEP_SIZE, ROOT_SCALE, EPS, MOST, LEAST = range(7)
 NUMBERS = 7
 
-#: Rows that one task works on; a few of them fit into the second cache with their moments.
+#: Rows that one task works on, and short rows that lie side by side for a step.
 _ROWS = 1024
 _GATHERED = 128
 #: Elements of a cache line, and rows that memory is asked for ahead of time.
@@ -54,7 +54,7 @@ _STILL = np.float32(2.0**-26)
 _STEADY = np.float32(2.0**-90)
 _ALL = np.uint64(2**LANES - 1)
 _ZERO = np.float32(0.0)
-_TINY, _SMALLEST_NORMAL = np.float32(TINY), np.float32(SMALLEST_NORMAL)
+_TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
 
 
 @device
@@ -72,14 +72,11 @@ def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
 
 @device
 def _eight(
-    p_at: Floats, m_at: Floats, v_at: Floats, at: int, first: int, end: int, steps: Floats
-) -> None:
+    p: Lanes, m: Lanes, v: Lanes, first: int, end: int, steps: Floats
+) -> tuple[Lanes, Lanes, Lanes]:
     """Takes the steps from `first` to before `end` of the table with eight elements."""
     zero, tiny, normal = splat(_ZERO), splat(_TINY), splat(_SMALLEST_NORMAL)
-    p, m, v = load(p_at, at), load(m_at, at), load(v_at, at)
-    if bits(larger(magnitude(m), v) <= zero) == _ALL:
-        return
-    k = first
+    k = end if bits(larger(magnitude(m), v) <= zero) == _ALL else first
     while k < end:
         stop = min(k + _LOOK, end)
         rests = _rests(p, m, v, steps, k * NUMBERS)
@@ -94,38 +91,7 @@ def _eight(
                 root = fma(square_root(v), broadcast(steps, row + ROOT_SCALE), eps)
                 p = fnma(broadcast(steps, row + STEP_SIZE), m / root, p)
         k = stop
-    store(p_at, at, p)
-    store(m_at, at, m)
-    store(v_at, at, v)
-
-
-@device
-def _row(
-    p: Floats,
-    m: Floats,
-    v: Floats,
-    at: int,
-    width: int,
-    first: int,
-    end: int,
-    steps: Floats,
-    rest: Floats,
-) -> None:
-    """Takes the steps from `first` to before `end` with the `width` elements from `at` on."""
-    whole = width - width % LANES
-    for start in range(at, at + whole, LANES):
-        _eight(p, m, v, start, first, end, steps)
-    left = width - whole
-    if left == 0:
-        return
-    p_rest, m_rest, v_rest = rest[:LANES], rest[LANES : 2 * LANES], rest[2 * LANES :]
-    for i in range(left):
-        p_rest[i], m_rest[i], v_rest[i] = p[at + whole + i], m[at + whole + i], v[at + whole + i]
-    for i in range(left, LANES):
-        p_rest[i] = m_rest[i] = v_rest[i] = _ZERO
-    _eight(p_rest, m_rest, v_rest, 0, first, end, steps)
-    for i in range(left):
-        p[at + whole + i], m[at + whole + i], v[at + whole + i] = p_rest[i], m_rest[i], v_rest[i]
+    return p, m, v
 
 
 @device
@@ -170,7 +136,9 @@ def catch_up(
     """
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
-    rest = np.empty(3 * LANES, np.float32)
+    left = width % LANES
+    # What is left over of a row is worked on here, the rest of the eight being zero.
+    rest = np.zeros(3 * LANES, np.float32)
     task = take(jobs)
     while task * _ROWS < count:
         for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
@@ -179,22 +147,52 @@ def catch_up(
                 _bring_near(rows, ahead, width, param, exp_avg, exp_avg_sq)
             i = np.intp(place) if whole else np.intp(rows[place])
             first = np.intp(done[i]) - before
-            if first < end:
-                _row(param, exp_avg, exp_avg_sq, i * width, width, first, end, steps, rest)
-                done[i] = before + end
+            if first >= end:
+                continue
+            at = i * width
+            for _ in range(width // LANES):
+                p, m, v = load(param, at), load(exp_avg, at), load(exp_avg_sq, at)
+                p, m, v = _eight(p, m, v, first, end, steps)
+                store(param, at, p)
+                store(exp_avg, at, m)
+                store(exp_avg_sq, at, v)
+                at += LANES
+            if left:
+                for c in range(left):
+                    rest[c] = param[at + c]
+                    rest[LANES + c] = exp_avg[at + c]
+                    rest[2 * LANES + c] = exp_avg_sq[at + c]
+                p, m, v = load(rest, 0), load(rest, LANES), load(rest, 2 * LANES)
+                p, m, v = _eight(p, m, v, first, end, steps)
+                store(rest, 0, p)
+                store(rest, LANES, m)
+                store(rest, 2 * LANES, v)
+                for c in range(left):
+                    param[at + c] = rest[c]
+                    exp_avg[at + c] = rest[LANES + c]
+                    exp_avg_sq[at + c] = rest[2 * LANES + c]
+            done[i] = before + end
         task = take(jobs)
 
 
 @device
-def _copied(source: Floats, at: int, target: Floats, to: int, width: int) -> None:
-    """Copies `width` elements; eight at a time, the last of which may be copied twice."""
-    if width < LANES:
-        for i in range(width):
-            target[to + i] = source[at + i]
-        return
-    for i in range(0, width - LANES, LANES):
-        store(target, to + i, load(source, at + i))
-    store(target, to + width - LANES, load(source, at + width - LANES))
+def _stepped(
+    p: Lanes, m: Lanes, v: Lanes, g: Lanes, numbers: Numbers
+) -> tuple[Lanes, Lanes, Lanes]:
+    """One step with eight elements and their gradient, operation by operation that of `update`."""
+    beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
+    zero, tiny, most = splat(_ZERO), splat(_TINY), splat(_LARGEST)
+    g = splat(scale) * g
+    # Comparisons with NaN are false, so that it passes.
+    g = where(most < g, most, where(g < splat(-_LARGEST), splat(-_LARGEST), g))
+    g = where(magnitude(g) < tiny, zero, g)
+    m = fma(splat(beta1), m, splat(new1) * g)
+    m = where(magnitude(m) < tiny, zero, m)
+    g = where(magnitude(g) < splat(square_floor), zero, g)
+    v = fma(splat(beta2), v, splat(new2) * g * g)
+    v = where(v < splat(_SMALLEST_NORMAL), zero, v)
+    root = fma(square_root(v), splat(root_scale), splat(eps))
+    return fnma(splat(step_size), m / root, p), m, v
 
 
 @kernel
@@ -220,24 +218,41 @@ def update_rows(
         exp_avg_sq: [N * width].
         numbers: Of the step, as in `fused`.
     """
-    places = np.empty((3, _GATHERED * width), np.float32)
+    # Loops stand here, not in a function: Numba counts references of arrays at each call.
+    room = 0 if width >= LANES else _GATHERED * width
+    ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    end = width - width % LANES
     task = take(jobs)
     while task * _ROWS < rows.size:
         last = min(rows.size, (task + 1) * _ROWS)
-        for first in range(task * _ROWS, last, _GATHERED):
-            end = min(first + _GATHERED, last)
-            size = (end - first) * width
-            p, m, v = places[0, :size], places[1, :size], places[2, :size]
-            for k in range(first, end):
-                _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
+        for k in range(task * _ROWS, last if width >= LANES else 0):
+            _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
+            at, source = np.intp(rows[k]) * width, k * width
+            # The last eight overlap with others: worked out before these are written.
+            tail, of_tail = at + width - LANES, source + width - LANES
+            p, m, v = load(param, tail), load(exp_avg, tail), load(exp_avg_sq, tail)
+            p_tail, m_tail, v_tail = _stepped(p, m, v, load(grad, of_tail), numbers)
+            for i in range(0, end, LANES):
+                p, m, v = load(param, at + i), load(exp_avg, at + i), load(exp_avg_sq, at + i)
+                p, m, v = _stepped(p, m, v, load(grad, source + i), numbers)
+                store(param, at + i, p)
+                store(exp_avg, at + i, m)
+                store(exp_avg_sq, at + i, v)
+            store(param, tail, p_tail)
+            store(exp_avg, tail, m_tail)
+            store(exp_avg_sq, tail, v_tail)
+        for first in range(task * _ROWS, last if width < LANES else 0, _GATHERED):
+            stop = min(first + _GATHERED, last)
+            for k in range(first, stop):
                 at, to = np.intp(rows[k]) * width, (k - first) * width
-                _copied(param, at, p, to, width)
-                _copied(exp_avg, at, m, to, width)
-                _copied(exp_avg_sq, at, v, to, width)
-            update(p, grad[first * width : end * width], m, v, numbers)
-            for k in range(first, end):
+                for i in range(width):
+                    ps[to + i], ms[to + i] = param[at + i], exp_avg[at + i]
+                    vs[to + i] = exp_avg_sq[at + i]
+            size = (stop - first) * width
+            update(ps[:size], grad[first * width : stop * width], ms[:size], vs[:size], numbers)
+            for k in range(first, stop):
                 at, to = np.intp(rows[k]) * width, (k - first) * width
-                _copied(p, to, param, at, width)
-                _copied(m, to, exp_avg, at, width)
-                _copied(v, to, exp_avg_sq, at, width)
+                for i in range(width):
+                    param[at + i], exp_avg[at + i] = ps[to + i], ms[to + i]
+                    exp_avg_sq[at + i] = vs[to + i]
         task = take(jobs)
