@@ -57,7 +57,9 @@ def named(source):
                 *(k.value for k in node.keywords if k.arg == "name"),
             ]
             yield from (
-                (node.lineno, each.value) for each in given if isinstance(each, ast.Constant)
+                (node.lineno, each.value)
+                for each in given
+                if isinstance(each, ast.Constant) and isinstance(each.value, str)
             )
         elif isinstance(node, ast.Compare) and _is_name(node.left):
             literals = [each.value for each in node.comparators if isinstance(each, ast.Constant)]
