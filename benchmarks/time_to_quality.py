@@ -98,7 +98,7 @@ def _figures(folder: Path) -> Row:
         "steps": summary["step"],
         "primitives": summary["primitives"],
         "seconds": summary["train_seconds"],
-        "commit": str((summary.get("environment") or {}).get("commit")),
+        "commit": (summary.get("environment") or {}).get("commit") or "not recorded",
     }
 
 
