@@ -31,7 +31,8 @@ __all__ = ["Camera", "Run", "RunFailedError", "UserError", "__version__", "open"
 
 
 def __getattr__(name: str) -> object:
-    let_idle_threads_sleep()
+    if name == "run" or name in _HOMES:
+        let_idle_threads_sleep()
     if name == "run":  # The room of that name, which can be called.
         return import_module("crossgrad_core.run")
     if name in _HOMES:

@@ -18,8 +18,7 @@ def keep_freed_memory() -> None:
     """Keeps up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
     By itself glibc gives them back after every step, and the kernel clears each page again when the
-    next step first writes to it: a sixth of a step of 20,000 Gaussians. Other C libraries are left
-    as they are.
+    next step first writes to it. Other C libraries are left as they are.
     """
     if sys.platform != "linux":
         return

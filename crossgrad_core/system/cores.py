@@ -1,11 +1,11 @@
 """How many cores this process may use, and which of them a thread does."""
 
-import ctypes
 import math
 import os
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
@@ -37,7 +37,8 @@ def let_idle_threads_sleep() -> None:
 
 def current_core() -> int | None:
     """Number of the core that the calling thread runs on; None where the system does not tell."""
-    return None if _SCHED_GETCPU is None else int(_SCHED_GETCPU())
+    tell = _sched_getcpu()
+    return None if tell is None else int(tell())
 
 
 def keep_off(core: int | None, threads: Iterable[int]) -> None:
@@ -53,11 +54,11 @@ def keep_off(core: int | None, threads: Iterable[int]) -> None:
             os.sched_setaffinity(thread, others)
 
 
+@cache
 def _sched_getcpu() -> Callable[[], int] | None:
     if sys.platform != "linux":
         return None
+    import ctypes
+
     # The lock is kept: the call takes less than letting it go does.
     return getattr(ctypes.PyDLL(None), "sched_getcpu", None)
-
-
-_SCHED_GETCPU = _sched_getcpu()

@@ -1,5 +1,8 @@
 """One number of threads for Numba and torch."""
 
+import platform
+import subprocess
+import sys
 import threading
 
 import numba
@@ -96,3 +99,28 @@ def test_backward_on_the_cpu_runs_in_the_calling_thread():
 
     Probe.apply(torch.ones(2, requires_grad=True)).sum().backward()
     assert seen == [threading.get_ident()]
+
+
+PROGRAM = """
+import resource
+
+import numpy as np
+
+from crossgrad_core.system.allocator import keep_freed_memory
+
+keep_freed_memory()
+for _ in range(4):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    arrays = [np.ones(6 << 20, np.uint8) for _ in range(8)]
+    del arrays
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+print(faults)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_memory_that_was_freed_is_used_again_without_faults():
+    command = [sys.executable, "-c", PROGRAM]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    # 48 MiB are 12,288 pages.
+    assert int(shown) < 500
