@@ -10,10 +10,14 @@ import os
 import runpy
 import signal
 import sys
+from contextlib import suppress
+from pathlib import Path
 from threading import Thread
 
 #: Standard input, which nothing is ever written to.
 _PIPE = 0
+#: Linux shares processors among sessions first; the `nice` of a process only counts within one.
+_SESSION_NICENESS = Path("/proc/self/autogroup")
 
 
 def main() -> None:
@@ -21,9 +25,17 @@ def main() -> None:
     cores, *arguments = sys.argv[1:]
     if cores != "-" and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
+    _be_as_nice_as_asked()
     Thread(target=_stop_when_alone, name="crossgrad-sweep", daemon=True).start()
     sys.argv = ["crossgrad", *arguments]
     runpy.run_module("crossgrad_core", run_name="__main__", alter_sys=False)
+
+
+def _be_as_nice_as_asked() -> None:
+    """Gives the session of this run, which is its own, the niceness of the process (`nice`)."""
+    if (niceness := getattr(os, "nice", lambda _: 0)(0)) > 0:
+        with suppress(OSError):  # Not Linux, or a Linux that shares in other ways.
+            _SESSION_NICENESS.write_text(str(niceness), encoding="ascii")
 
 
 def _stop_when_alone() -> None:
