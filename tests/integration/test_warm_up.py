@@ -39,7 +39,7 @@ print(json.dumps(sorted(kernels() - before)))
 """
 
 
-@pytest.mark.parametrize("length", [{"steps": 640}, {"seconds": 3.0}], ids=["steps", "seconds"])
+@pytest.mark.parametrize("length", [{"steps": 160}, {"seconds": 3.0}], ids=["steps", "seconds"])
 def test_training_compiles_nothing_behind_the_warm_up(tmp_path, length):
     settings = {
         "scene": str(bundled_scene()),
