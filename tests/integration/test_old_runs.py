@@ -7,6 +7,7 @@ pictures and log; its scene was called SCENE.
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from support.scenes import write_tiny_scene
@@ -35,6 +36,12 @@ def old(scene, tmp_path):
     return folder
 
 
+def _parts(ply):
+    """Header and numbers of a PLY of float32."""
+    header, _, body = ply.read_bytes().partition(b"end_header\n")
+    return header, np.frombuffer(body, "<f4")
+
+
 def test_a_run_of_0_1_is_evaluated_rendered_and_exported(old, tmp_path):
     run = cg.open(old)
     means = run.evaluate().overall
@@ -43,7 +50,11 @@ def test_a_run_of_0_1_is_evaluated_rendered_and_exported(old, tmp_path):
     image = run.render(run.scene.test_views[0].name)
     assert image.shape == (24, 32, 3) and image.std() > 0.05
     exported = run.export(tmp_path / "old.ply")
-    assert exported.read_bytes() == (OLD / "point_cloud.ply").read_bytes()
+    header, values = _parts(exported)
+    old_header, old_values = _parts(OLD / "point_cloud.ply")
+    assert header == old_header
+    # Logarithms differ in the last place from one processor to another.
+    np.testing.assert_allclose(values, old_values, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "export"])
