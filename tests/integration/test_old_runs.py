@@ -14,6 +14,7 @@ from support.scenes import write_tiny_scene
 
 import crossgrad_core as cg
 from crossgrad_core.cli.main import main
+from crossgrad_core.config import RunConfig
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.settings import merged
@@ -165,6 +166,10 @@ def test_short_forms_in_a_file_of_0_1(tmp_path):
     config.write_text("operator: [{name: mean, granularity: tensor}, soft]\nsteps: 5\n")
     settings = merged(config, {}, ())
     assert settings == {"operator": [{"name": "mean"}, {"name": "soft"}], "steps": 5}
+
+
+def test_the_default_preset_has_a_name_now():
+    assert RunConfig(preset="default") == RunConfig(preset="fast") == RunConfig()
 
 
 def test_a_configuration_of_a_newer_version_is_refused(old):
