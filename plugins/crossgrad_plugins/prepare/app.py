@@ -100,7 +100,7 @@ def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
     models = _timed("poses", lambda: mapping.found_models(layout, plan, threads))
     result = _timed("place", lambda: placed(layout, plan, models))
     ways = matching.way_of(plan), mapping.way_of(plan)
-    report = Report(plan, features, links, result, ways)
+    report = Report(plan, features, links, result, ways, mapping.misplaced(layout))
     _timed("photos", lambda: write_scene(layout, plan, threads))
     if not layout.report.is_file():
         _write_report(layout, report)
