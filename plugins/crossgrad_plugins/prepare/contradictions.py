@@ -83,12 +83,9 @@ class _Counts:
         self, votes: Votes, which: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """[size] matches and [size] pairs of each photo, of some pairs."""
-        photos, matches = votes.photos[which], votes.matches[which]
-        weights = np.repeat(matches, 2).astype(np.float64)
-        return (
-            np.bincount(photos.ravel(), weights, minlength=self.size),
-            np.bincount(photos.ravel(), minlength=self.size),
-        )
+        photos, matches = votes.photos[which].ravel(), np.repeat(votes.matches[which], 2)
+        summed = np.bincount(photos, matches.astype(np.float64), minlength=self.size)
+        return summed.astype(np.float64), np.bincount(photos, minlength=self.size).astype(np.int64)
 
 
 def _votes(model: "pycolmap.Reconstruction", path: Path) -> Votes:
@@ -156,7 +153,6 @@ def _off(
     error = np.abs((there * lines).sum(axis=1))
     # Two photos of one place have no epipolar lines, and nothing to contradict.
     tiny = np.finfo(np.float64).tiny
-    return np.maximum(
-        error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * second.focal,
-        error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * first.focal,
-    )
+    in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * second.focal
+    in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * first.focal
+    return np.asarray(np.maximum(in_one, in_other))

@@ -139,10 +139,11 @@ def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
 
 
 def _nothing(layout: Layout, plan: Plan) -> UserError:
+    pairs = len(json.loads(layout.links.read_bytes()))
     return UserError(
         "no camera could be found: no photos fit together",
         where=plan.photos,
         expected="photos that overlap by more than half, taken from different places",
-        found=f"{len(plan.used)} photos; the pairs that match are in {layout.links}",
+        found=f"{len(plan.used)} photos; {pairs} pairs of them match ({layout.links})",
         todo="add photos between those that there are, or choose another --lens or --matching",
     )
