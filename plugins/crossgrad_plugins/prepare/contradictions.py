@@ -27,7 +27,7 @@ _SHARE, _AGAINST = 1.0 / 3.0, 2
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """What the pairs of a model say of its poses.
+    """The pairs of a model, and whether they agree with its poses.
 
     Attributes:
         photos: [P, 2] numbers of the two photos of each pair.
