@@ -101,10 +101,12 @@ def main() -> None:
     parser.add_argument("photos", type=Path)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--truth", type=Path, action="append", default=[])
-    parser.add_argument("options", nargs="*")
-    given = parser.parse_args()
+    # By hand: argparse leaves nothing behind an option to a list of positional arguments.
+    words = [*sys.argv[1:], "--"]
+    ours = words.index("--")
+    given = parser.parse_args(words[:ours])
     if not (given.scene / "report.json").is_file():
-        wall, cpu, memory = prepare(given.photos, given.scene, given.options)
+        wall, cpu, memory = prepare(given.photos, given.scene, words[ours + 1 : -1])
         print(f"{wall:.0f} s, {cpu:.0f} s of CPU time, at most {memory:.1f} GiB")
     report = json.loads((given.scene / "report.json").read_text())
     print(f"{report['matching']} matching, {report['mapper']} mapping, mean reprojection error "

@@ -28,6 +28,8 @@ from crossgrad_plugins.prepare.undistortion import write_scene
 
 T = TypeVar("T")
 _PAUSE = 5.0
+#: Camera model of photos that look in all directions.
+_ALL_AROUND = "EQUIRECTANGULAR"
 
 
 def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | None) -> None:
@@ -72,7 +74,16 @@ def _check_lens(name: str) -> None:
     guard_pycolmap()
     import pycolmap
 
-    known = [each for each in pycolmap.CameraModelId.__members__ if each != "INVALID"]
+    unknown = {"INVALID", _ALL_AROUND}
+    known = [each for each in pycolmap.CameraModelId.__members__ if each not in unknown]
+    if name == _ALL_AROUND:
+        raise UserError(
+            "360-degree photos have no pinhole camera to be undistorted to",
+            where="--lens",
+            expected=", ".join(known),
+            found=name,
+            todo="cut them into perspective photos, and prepare those",
+        )
     if name not in known:
         raise UserError(
             "there is no such camera model",
@@ -100,7 +111,7 @@ def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
     models = _timed("poses", lambda: mapping.found_models(layout, plan, threads))
     result = _timed("place", lambda: placed(layout, plan, models))
     ways = matching.way_of(plan), mapping.way_of(plan)
-    report = Report(plan, features, links, result, ways)
+    report = Report(plan, features, links, result, ways, mapping.misplaced(layout))
     _timed("photos", lambda: write_scene(layout, plan, threads))
     if not layout.report.is_file():
         _write_report(layout, report)

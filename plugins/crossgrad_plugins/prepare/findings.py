@@ -81,8 +81,8 @@ def lost_photos(
     plan: Plan,
     features: Mapping[str, int],
     links: Sequence[Link],
-    models: Sequence[frozenset[str]],
-    joined: Sequence[bool],
+    models: Sequence[tuple[frozenset[str], bool]],
+    misplaced: Mapping[str, tuple[int, int]],
 ) -> tuple[Lost, ...]:
     """The photos that are not in the scene, and why they may not be.
 
@@ -90,14 +90,14 @@ def lost_photos(
         plan: The plan.
         features: Name -> number of features.
         links: Pairs with verified matches.
-        models: Names of the photos of each model.
-        joined: Whether each of these is in the scene.
+        models: Names of the photos of each model, and whether it is in the scene.
+        misplaced: Name -> matches for and against the pose of those that were taken out of a model.
     """
     partners: Counter[str] = Counter()
     for link in links:
         partners.update((link.first, link.second))
     inside, elsewhere = set[str](), dict[str, int]()
-    for names, is_joined in zip(models, joined, strict=True):
+    for names, is_joined in models:
         if is_joined:
             inside |= names
         else:
@@ -111,10 +111,20 @@ def lost_photos(
             partners[photo.name],
             f"in another model, of {elsewhere[photo.name]} photos"
             if photo.name in elsewhere
+            else _contradicted(*misplaced[photo.name])
+            if photo.name in misplaced
             else _why(photo, features[photo.name], partners[photo.name], (usual, sharp)),
         )
         for photo in plan.used
         if photo.name not in inside
+    )
+
+
+def _contradicted(agreeing: int, against: int) -> str:
+    """Why a photo was taken out of a model."""
+    return (
+        f"its matches contradict each other: {against} speak against the one place that {agreeing} "
+        "speak for (walls, windows or pavements that repeat?)"
     )
 
 

@@ -53,6 +53,11 @@ class Layout:
         return self.work / "models"
 
     @property
+    def misplaced(self) -> Path:
+        """The photos that were taken out of models; there when mapping is done."""
+        return self.work / "misplaced.json"
+
+    @property
     def placed(self) -> Path:
         """The model of the scene, in its place on Earth where that is known."""
         return self.work / "placed"

@@ -1,11 +1,13 @@
 """From matches to poses and points: one model, or several where photos cannot be joined."""
 
 import itertools
+import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crossgrad_core.commands import UserError
+from crossgrad_core.commands import UserError, write_atomically
+from crossgrad_plugins.prepare.contradictions import contradicted
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.soundness import sound_models
@@ -44,6 +46,7 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
         models = list(waited_for(layout, plan, threads, below).values())
         if way_of(plan) == "global":
             models = sound_models(models, _SMALLEST)
+        models = _without_misplaced(layout, models)
         if not models:
             raise _nothing(layout, plan)
         ordered = sorted(models, key=lambda model: -model.num_reg_images())
@@ -56,6 +59,37 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
         below.rmdir()
         scratch.replace(layout.models)
     return [model for _, model in read_models(layout.models)]
+
+
+def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
+    """Name -> matches for and against the pose of each photo that was taken out of a model."""
+    if not layout.misplaced.is_file():
+        return {}
+    return {
+        name: (yes, no) for name, (yes, no) in json.loads(layout.misplaced.read_bytes()).items()
+    }
+
+
+def _without_misplaced(
+    layout: Layout, models: "list[pycolmap.Reconstruction]"
+) -> "list[pycolmap.Reconstruction]":
+    """The models without photos whose matches contradict their poses; those are written down."""
+    found: dict[str, tuple[int, int]] = {}
+    for model in models:
+        doubted = waited(
+            "checking poses",
+            lambda _, model=model: contradicted(model, layout.database),  # type: ignore[misc]
+            lambda: "",
+        )
+        for number, votes in doubted.items():
+            image = model.image(number)
+            found[image.name] = votes
+            model.deregister_frame(image.frame_id)
+    kept = [model for model in models if model.num_reg_images() >= _SMALLEST]
+    elsewhere = {model.image(n).name for model in kept for n in model.reg_image_ids()}
+    told = {name: votes for name, votes in sorted(found.items()) if name not in elsewhere}
+    write_atomically(layout.misplaced, json.dumps(told, indent=1).encode())
+    return kept
 
 
 def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]":
@@ -105,10 +139,11 @@ def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
 
 
 def _nothing(layout: Layout, plan: Plan) -> UserError:
+    pairs = len(json.loads(layout.links.read_bytes()))
     return UserError(
         "no camera could be found: no photos fit together",
         where=plan.photos,
         expected="photos that overlap by more than half, taken from different places",
-        found=f"{len(plan.used)} photos; the pairs that match are in {layout.links}",
+        found=f"{len(plan.used)} photos; {pairs} pairs of them match ({layout.links})",
         todo="add photos between those that there are, or choose another --lens or --matching",
     )

@@ -26,6 +26,9 @@ _NEXT_ALONE: Final = 20
 _FARTHEST: Final = 500.0
 #: Features of a photo by which others like it are looked up, at most.
 _LOOKED_UP: Final = 2000
+#: Geometries that are tried to explain the matches of a pair, at most. COLMAP tries five times as
+#: many of pairs that show nothing in common, and finds the same ones (docs/prepare.md).
+_TRIALS: Final = 2000
 #: How photos to compare are chosen -> pycolmap's ways that this takes.
 _WAYS: Final = {
     "exhaustive": ("exhaustive",),
@@ -116,6 +119,7 @@ def _match(
     matching.num_threads = threads
     # Each pair by itself: the same in whatever order, and after whatever interruption.
     verification.ransac.random_seed = 0
+    verification.ransac.max_num_trials = _TRIALS
     compare = getattr(pycolmap, f"match_{way}")
     compare(
         layout.database, matching_options=matching, pairing_options=pairing,

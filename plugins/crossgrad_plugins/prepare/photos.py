@@ -224,10 +224,15 @@ def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> 
     """The error where no scene can be made."""
     first = "; ".join(f"{each.name}: {each.why}" for each in left_out[:3])
     nothing = not used and not left_out
+    todo = "name the folder that the photos are in"
+    if left_out:
+        todo = "repair, convert or leave out what is named, or name another folder"
+    elif used:
+        todo = "add photos that overlap with it, taken from other places"
     return UserError(
         "there are no photos in the folder" if nothing else "too few photos can be used",
         where=root,
         expected=f"at least 2 photos ({', '.join(sorted(end[1:] for end in _READ))})",
         found=f"{len(used)} that can be used" + (f"; {first}" if first else ""),
-        todo="name the folder that the photos are in",
+        todo=todo,
     )

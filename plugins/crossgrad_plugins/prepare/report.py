@@ -35,6 +35,7 @@ class Report:
         links: Pairs with verified matches.
         result: What is in the scene.
         ways: How photos were compared, and how poses were found.
+        misplaced: Name -> matches for and against the pose of photos taken out of a model.
     """
 
     plan: Plan
@@ -42,6 +43,7 @@ class Report:
     links: Sequence[Link]
     result: Result
     ways: tuple[str, str]
+    misplaced: Mapping[str, tuple[int, int]]
 
     @property
     def posed(self) -> frozenset[str]:
@@ -51,10 +53,8 @@ class Report:
     @property
     def lost(self) -> tuple[Lost, ...]:
         """The photos that are not in the scene."""
-        parts = self.result.parts
-        models = [frozenset(part.photos) for part in parts]
-        joined = [part.joined for part in parts]
-        return lost_photos(self.plan, self.features, self.links, models, joined)
+        models = [(frozenset(part.photos), part.joined) for part in self.result.parts]
+        return lost_photos(self.plan, self.features, self.links, models, self.misplaced)
 
     @property
     def joins(self) -> tuple[Join, ...]:

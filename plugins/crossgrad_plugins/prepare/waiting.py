@@ -24,17 +24,18 @@ _COUNT: Final = (
     "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
 )
 _PATIENCE: Final = 5.0
-#: Glog's level of errors: pycolmap's notes and warnings do not concern the user.
-_ERRORS: Final = 2
+#: Glog's level of what ends the process. What pycolmap says below that does not concern the user: a
+#: failure that counts is told by its exception, or by what is missing afterwards.
+_FATAL: Final = 3
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Pycolmap says nothing but errors inside the block."""
+    """Pycolmap prints nothing inside the block."""
     guard_pycolmap()
     import pycolmap
 
-    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _ERRORS
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _FATAL
     try:
         yield
     finally:

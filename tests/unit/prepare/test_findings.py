@@ -116,14 +116,22 @@ def test_reasons_why_a_photo_is_lost(changed, features, links, why):
     plan = plan_of(*map(photo, AERIAL), bad)
     found = [Link("bad", name, 20) for name in AERIAL[:links]]
     counts = dict.fromkeys(AERIAL, 1000) | {"bad": features}
-    (lost,) = lost_photos(plan, counts, found, [frozenset(AERIAL)], [True])
+    (lost,) = lost_photos(plan, counts, found, [(frozenset(AERIAL), True)], {})
     assert lost.name == "bad"
     assert why in lost.why
 
 
 def test_a_photo_of_another_model_is_told_so():
     counts = dict.fromkeys(AERIAL + STREET, 1000)
-    lost = lost_photos(PLAN, counts, [], MODELS, [True, False])
+    lost = lost_photos(PLAN, counts, [], list(zip(MODELS, [True, False], strict=True)), {})
     assert [each.name for each in lost] == STREET
     assert {each.why for each in lost} == {"in another model, of 3 photos"}
-    assert not lost_photos(PLAN, counts, [], MODELS, [True, True])
+    assert not lost_photos(PLAN, counts, [], list(zip(MODELS, [True, True], strict=True)), {})
+
+
+def test_a_photo_that_was_taken_out_is_told_by_what():
+    counts = dict.fromkeys(AERIAL + STREET, 1000)
+    models = [(frozenset(AERIAL + STREET[1:]), True)]
+    (lost,) = lost_photos(PLAN, counts, [], models, {STREET[0]: (40, 310)})
+    assert lost.name == STREET[0]
+    assert "310 speak against the one place that 40 speak for" in lost.why

@@ -234,6 +234,37 @@ def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize(
+    ("names", "todo"),
+    [
+        ([], "name the folder that the photos are in"),
+        (["a.jpg"], "add photos that overlap"),
+        (["a.jpg", "b.HEIC"], "repair, convert or leave out what is named"),
+    ],
+)
+def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in names:
+        Image.new("RGB", (100, 100)).save(photos / name, format="JPEG")
+    assert ended("prepare", photos, tmp_path / "scene") == 2
+    assert todo in capsys.readouterr().err
+
+
+def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):
+    """And not a line of pycolmap's beside it."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "my photos").mkdir()
+    for number in range(3):
+        noise = rng.integers(0, 256, (160, 200, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "my photos" / f"{number}.png")
+    assert ended("prepare", tmp_path / "my photos", tmp_path / "scene") == 2
+    told = capfd.readouterr().err
+    assert "no photos fit together" in told
+    assert "3 photos; 0 pairs of them match" in told
+    assert "sfm.cc" not in told
+
+
 @pytest.mark.parametrize("option", ["features", "matching", "mapper", "cameras"])
 def test_unknown_choices_are_refused(option, tmp_path, capsys):
     assert ended("prepare", tmp_path, tmp_path / "scene", f"--{option}", "magic") == 2
@@ -244,6 +275,7 @@ def test_unknown_choices_are_refused(option, tmp_path, capsys):
     ("options", "what"),
     [
         (("--lens", "monocle"), "no such camera model"),
+        (("--lens", "equirectangular"), "cut them into perspective photos"),
         (("--matching", "spatial"), "no GPS"),
         (("--masks", "gone"), "mask folder is not there"),
         ((), "no features"),

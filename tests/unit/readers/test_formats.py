@@ -133,25 +133,53 @@ def test_lists_of_the_user_come_first(reader, forms, tmp_path):
     assert [view.name for view in scene.test_views] == ["aerial/0002.png", "street/0001.png"]
 
 
-def trained(path, reader):
-    """The parameters after five steps."""
+#: Steps that are trained in each format, and how far parameters may be apart after them where
+#: cameras are rounded: Adam's first steps are as large for a gradient of 1e-9 as for one of 1, so
+#: what is rounded is carried on (measured: 2.4e-6 in means, 1.1e-2 in logits of opacity).
+STEPS = 50
+TRAINED_APART = {"means": 1e-5, "others": 0.05}
+
+
+@pytest.fixture(scope="module")
+def trained(forms):
+    """Format -> parameters after some steps, each format trained when it is first asked for."""
+    found = {}
+
+    def parameters(reader):
+        if reader not in found:
+            found[reader] = parameters_after(forms[reader], reader)
+        return found[reader]
+
+    return parameters
+
+
+def parameters_after(path, reader):
     from crossgrad_core.config import RunConfig
     from crossgrad_core.run.assemble import assemble, read_scene
     from crossgrad_core.training.loop import timed_step
     from crossgrad_core.training.start import first_state
 
     config = RunConfig(
-        scene=path, steps=5, threads=1, start={"name": "sfm"}, reader={"name": reader}
+        scene=path, steps=STEPS, threads=1, start={"name": "sfm"}, reader={"name": reader}
     )
     setup = assemble(config, *read_scene(config, path))
     state = first_state(setup)
-    for _ in range(5):
+    for _ in range(STEPS):
         timed_step(setup, state)
-    return state.parameters
+    return {name: tensor.detach() for name, tensor in state.parameters.items()}
 
 
 @pytest.mark.parametrize("reader", EXACT)
-def test_training_begins_with_the_same_bits(reader, forms):
-    ours, theirs = trained(forms[reader], reader), trained(forms["colmap"], "colmap")
+def test_matrices_train_to_the_same_bits(reader, trained):
+    ours, theirs = trained(reader), trained("colmap")
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+@pytest.mark.parametrize("reader", ROUNDED)
+def test_rounded_cameras_train_alike(reader, trained):
+    ours, theirs = trained(reader), trained("colmap")
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        apart = float((ours[name] - theirs[name]).abs().max()) if ours[name].numel() else 0.0
+        assert apart <= TRAINED_APART.get(name, TRAINED_APART["others"]), name

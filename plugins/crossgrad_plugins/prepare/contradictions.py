@@ -1,0 +1,158 @@
+"""Photos that a model holds in one place while most of their matches speak for another."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.prepare.waiting import quiet
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Pairs count from so many verified matches on, as many as COLMAP asks of a pose. Between photos of
+#: repeated walls and pavements most pairs with fewer are wrong, and few of those between heights
+#: (docs/prepare.md).
+_MATCHES: Final = 30
+#: Pixels from the epipolar line within which a match agrees with two poses, as in verification, and
+#: the share of a pair's matches that have to.
+_PIXELS, _AGREEING = 4.0, 0.5
+#: A photo is misplaced where less than this share of its matches agrees, and pairs with at least so
+#: many other photos do not: one pair may be wrong by itself.
+_SHARE, _AGAINST = 1.0 / 3.0, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """The pairs of a model, and whether they agree with its poses.
+
+    Attributes:
+        photos: [P, 2] numbers of the two photos of each pair.
+        matches: [P] verified matches.
+        agrees: [P] whether most of these agree with the two poses.
+    """
+
+    photos: NDArray[np.int64]
+    matches: NDArray[np.int64]
+    agrees: NDArray[np.bool_]
+
+
+def contradicted(model: "pycolmap.Reconstruction", database: Path) -> dict[int, tuple[int, int]]:
+    """Photos most of whose matches with other photos of the model contradict its pose.
+
+    Repeated structures look alike in places that are not the same: such pairs pass the verification
+    of two views, and a photo that comes early may be placed by them. Its pairs with the photos that
+    come later tell. The photo with the smallest share of agreeing matches goes first and has no
+    vote on the others.
+
+    Args:
+        model: The model.
+        database: COLMAP's database with the verified matches.
+
+    Returns:
+        Number of each such photo -> its matches for and against the pose.
+    """
+    votes, found = _votes(model, database), dict[int, tuple[int, int]]()
+    counts = _Counts(max(model.reg_image_ids(), default=0) + 1)
+    present = np.ones(len(votes.matches), dtype=np.bool_)
+    while present.any():
+        yes, no = (counts.of(votes, present & side) for side in (votes.agrees, ~votes.agrees))
+        weighed = np.where(no[1] >= _AGAINST, yes[0] / np.maximum(1, yes[0] + no[0]), 1.0)
+        worst = int(np.argmin(weighed))
+        if weighed[worst] >= _SHARE:
+            break
+        found[worst] = int(yes[0][worst]), int(no[0][worst])
+        present &= (votes.photos != worst).all(axis=1)
+    return found
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """Sums over pairs for each photo.
+
+    Attributes:
+        size: One more than the largest number of a photo.
+    """
+
+    size: int
+
+    def of(
+        self, votes: Votes, which: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """[size] matches and [size] pairs of each photo, of some pairs."""
+        photos, matches = votes.photos[which].ravel(), np.repeat(votes.matches[which], 2)
+        summed = np.bincount(photos, matches.astype(np.float64), minlength=self.size)
+        return summed.astype(np.float64), np.bincount(photos, minlength=self.size).astype(np.int64)
+
+
+def _votes(model: "pycolmap.Reconstruction", path: Path) -> Votes:
+    import pycolmap
+
+    with quiet():
+        database = pycolmap.Database.open(path)
+        try:
+            rows = list(_judged(model, database))
+        finally:
+            database.close()
+    table = np.array(rows, dtype=np.int64).reshape(-1, 4)
+    return Votes(table[:, :2], table[:, 2], table[:, 3] >= _AGREEING * table[:, 2])
+
+
+def _judged(
+    model: "pycolmap.Reconstruction", database: "pycolmap.Database"
+) -> Iterator[tuple[int, int, int, int]]:
+    """Of each pair of the model's photos: their numbers, its matches, and how many agree."""
+    import pycolmap
+
+    views = {number: _View(model, number) for number in model.reg_image_ids()}
+    pairs, counts = database.read_two_view_geometry_num_inliers()
+    for pair, count in zip(pairs, counts, strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        if count < _MATCHES or first not in views or second not in views:
+            continue
+        matches = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
+        one, other = (
+            views[number].seen(database)[matches[:, side]]
+            for side, number in enumerate((first, second))
+        )
+        off = _off(views[first], views[second], one, other)
+        yield first, second, len(matches), int((off <= _PIXELS).sum())
+
+
+class _View:
+    """A photo with its pose; its features are read when they are asked for, and kept."""
+
+    def __init__(self, model: "pycolmap.Reconstruction", number: int) -> None:
+        image = model.image(number)
+        self._number, self._camera = number, model.camera(image.camera_id)
+        self._seen: NDArray[np.float32] | None = None
+        self.focal = self._camera.mean_focal_length()
+        self.pose = image.cam_from_world()
+
+    def seen(self, database: "pycolmap.Database") -> NDArray[np.float32]:
+        """[N, 2] features without lens distortion, in units of the focal length."""
+        if self._seen is None:
+            pixels = np.asarray(database.read_keypoints(self._number)[:, :2], dtype=np.float64)
+            self._seen = np.asarray(self._camera.cam_from_img(pixels), dtype=np.float32)
+        return self._seen
+
+
+def _off(
+    first: _View, second: _View, one: NDArray[np.float32], other: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """[N] pixels that matches lie from each other's epipolar lines, the larger of both."""
+    relative = second.pose * first.pose.inverse()
+    x, y, z = relative.translation
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    essential = cross @ relative.rotation.matrix()
+    here, there = (np.column_stack([points, np.ones(len(points))]) for points in (one, other))
+    lines, back = here @ essential.T, there @ essential
+    error = np.abs((there * lines).sum(axis=1))
+    # Two photos of one place have no epipolar lines, and nothing to contradict.
+    tiny = np.finfo(np.float64).tiny
+    in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * second.focal
+    in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * first.focal
+    return np.asarray(np.maximum(in_one, in_other))
