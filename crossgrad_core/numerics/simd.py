@@ -1,10 +1,12 @@
-"""Eight float32 lanes as a value of their own inside compiled kernels.
+"""Eight or sixteen float32 lanes as a value of their own inside compiled kernels.
 
 Numba leaves vectorisation to LLVM's loop vectoriser, which gives up on the compositing loops as
 soon as they carry state. Here a vector is a type: `Lanes` holds eight float32 numbers and `Mask`
 eight truth values, so a kernel written with them is SIMD code by construction (one AVX register
-each; LLVM splits them where a machine has narrower ones). Operations are never reordered, and
-`fma` fuses on every machine that can, so the same expression in two kernels gives the same bits.
+each; LLVM splits them where a machine has narrower ones). Functions whose names end in `_wide` make
+vectors of sixteen, which take half the instructions where registers are that wide (AVX-512) and two
+each elsewhere; all other functions take either. Operations are never reordered, and `fma` fuses on
+every machine that can, so the same expression in two kernels gives the same bits.
 
 Everything below exists only inside compiled kernels; `Lanes` and `Mask` are annotations.
 """
@@ -21,23 +23,21 @@ from numba.extending import intrinsic, models, overload, register_model
 from numpy.typing import NDArray
 
 LANES = 8
+WIDE = 2 * LANES
 
 _FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
-_FLOATS, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
-_FLAGS = ir.VectorType(ir.IntType(1), LANES)
 _ALIGNMENT = 4  # bytes; arrays of float32 promise no more
-_SIGN_BIT = ir.Constant(_INTS, [-(2**31)] * LANES)
-_MANTISSA_BITS = ir.Constant(_INTS, [23] * LANES)
+_SIGN_BIT, _MANTISSA_BITS = -(2**31), 23
 
 
 class Mask(Protocol):
-    """Eight truth values."""
+    """Eight or sixteen truth values."""
 
     def __and__(self, other: "Mask") -> "Mask": ...
 
 
 class Lanes(Protocol):
-    """Eight float32 numbers."""
+    """Eight or sixteen float32 numbers."""
 
     def __add__(self, other: "Lanes") -> "Lanes": ...
     def __sub__(self, other: "Lanes") -> "Lanes": ...
@@ -49,28 +49,50 @@ class Lanes(Protocol):
 
 
 class _LanesType(types.Type):
-    def __init__(self) -> None:
-        cast("Any", super()).__init__(name="Lanes")
+    def __init__(self, width: int) -> None:
+        self.width = width
+        cast("Any", super()).__init__(name=f"Lanes{width}")
 
 
 class _MaskType(types.Type):
-    def __init__(self) -> None:
-        cast("Any", super()).__init__(name="Mask")
+    def __init__(self, width: int) -> None:
+        self.width = width
+        cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-_lanes, _mask = _LanesType(), _MaskType()
+def _lanes(width: int) -> _LanesType:
+    return _LanesType(width)
+
+
+def _mask(width: int) -> _MaskType:
+    return _MaskType(width)
+
+
+def _floats(width: int) -> ir.Type:
+    return ir.VectorType(_FLOAT, width)
+
+
+def _same(a: Any) -> ir.Type:
+    """Whole numbers, as many as a vector of LLVM has."""
+    return ir.VectorType(_INT, a.type.count)
+
+
+_eight, _wide = _lanes(LANES), _lanes(WIDE)
+_triple = cast("Any", types).UniTuple(_eight, 3)
 
 
 @register_model(_LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        cast("Any", super()).__init__(manager, numba_type, _FLOATS)
+        cast("Any", super()).__init__(manager, numba_type, _floats(numba_type.width))
 
 
 @register_model(_MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        cast("Any", super()).__init__(manager, numba_type, _FLAGS)
+        cast("Any", super()).__init__(
+            manager, numba_type, ir.VectorType(ir.IntType(1), numba_type.width)
+        )
 
 
 class _Site(NamedTuple):
@@ -86,19 +108,26 @@ def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
     Args:
         emit: Emits its instructions, given the site and the operands' LLVM values.
-        result: Numba type of the result.
-        operands: Numba types of the operands; None stands for any array.
+        result: Numba type of the result; `_lanes` and `_mask` stand for a vector as wide as those
+            among the operands.
+        operands: Numba types of the operands, likewise; None stands for any array.
     """
 
     def define(*given: Any) -> Any:
-        kinds = [
-            other if kind is None else kind for kind, other in zip(operands, given, strict=True)
-        ]
+        widths = (kind.width for kind in given if isinstance(kind, _LanesType | _MaskType))
+        width = next(widths, LANES)
+
+        def typed(kind: Any, other: Any) -> Any:
+            if kind is None:
+                return other
+            return kind(width) if kind in (_lanes, _mask) else kind
+
+        kinds = [typed(kind, other) for kind, other in zip(operands, given, strict=True)]
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             return emit(_Site(context, builder, signature.args), *args)
 
-        return result(*kinds), generate
+        return typed(result, None)(*kinds), generate
 
     # Numba reads the number of operands off the function.
     by_count: dict[int, Callable[..., Any]] = {
@@ -106,6 +135,7 @@ def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
         1: lambda typing, a: define(a),
         2: lambda typing, a, b: define(a, b),
         3: lambda typing, a, b, c: define(a, b, c),
+        5: lambda typing, a, b, c, d, e: define(a, b, c, d, e),
         8: lambda typing, a, b, c, d, e, f, g, h: define(a, b, c, d, e, f, g, h),
     }
     return intrinsic(by_count[len(operands)])
@@ -115,9 +145,11 @@ def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any
     """Gives a Python operator its meaning between two values of one kind."""
     implementation = _function(emit, to, kind, kind)
 
+    vector = _LanesType if kind is _lanes else _MaskType
+
     @overload(sign, strict=False)  # the annotations are no part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
-        if a == kind and b == kind:
+        if isinstance(a, vector) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
         return None
 
@@ -132,14 +164,15 @@ _define(operator.lt, lambda at, a, b: at.builder.fcmp_ordered("<", a, b), _lanes
 _define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 
 
-def _llvm(name: str, result: ir.Type) -> Callable[..., Any]:
-    """Emits a call of an LLVM intrinsic."""
+def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
+    """Emits a call of an LLVM intrinsic; on vectors, where it does not say what results."""
 
     def emit(at: _Site, *args: Any) -> Any:
-        function = at.builder.module.globals.get(name)
+        full = name if result else f"{name}.v{args[0].type.count}f32"
+        function = at.builder.module.globals.get(full)
         if function is None:
-            signature = ir.FunctionType(result, [arg.type for arg in args])
-            function = ir.Function(at.builder.module, signature, name)
+            signature = ir.FunctionType(result or args[0].type, [arg.type for arg in args])
+            function = ir.Function(at.builder.module, signature, full)
         return at.builder.call(function, args)
 
     return emit
@@ -152,18 +185,69 @@ def _element(at: _Site, array: Any, index: Any, kind: ir.Type) -> Any:
 
 
 def _shuffle(at: _Site, a: Any, b: Any, order: Sequence[int]) -> Any:
-    """Picks lanes of `a` (0 to 7) and `b` (8 to 15)."""
-    return at.builder.shuffle_vector(a, b, ir.Constant(_INTS, list(order)))
+    """Picks lanes of `a` (from 0 on) and then of `b`."""
+    places = ir.Constant(ir.VectorType(_INT, len(order)), list(order))
+    return at.builder.shuffle_vector(a, b, places)
 
 
-def _splat(at: _Site, value: Any) -> Any:
-    single = at.builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), value, _INT(0))
-    return _shuffle(at, single, single, [0] * LANES)
+def _splat(width: int) -> Callable[..., Any]:
+    def emit(at: _Site, value: Any) -> Any:
+        empty = ir.Constant(_floats(width), ir.Undefined)
+        single = at.builder.insert_element(empty, value, _INT(0))
+        return _shuffle(at, single, single, [0] * width)
+
+    return emit
+
+
+def _load(width: int) -> Callable[..., Any]:
+    def emit(at: _Site, array: Any, index: Any) -> Any:
+        return at.builder.load(_element(at, array, index, _floats(width)), align=_ALIGNMENT)
+
+    return emit
+
+
+def _broadcast(width: int) -> Callable[..., Any]:
+    def emit(at: _Site, array: Any, index: Any) -> Any:
+        return _splat(width)(at, at.builder.load(_element(at, array, index, _FLOAT)))
+
+    return emit
+
+
+def _broadcast_two(at: _Site, array: Any, index: Any) -> Any:
+    # A choice by a constant, not a shuffle: two instructions with AVX-512, and none more without.
+    upper = ir.Constant(ir.VectorType(ir.IntType(1), WIDE), [0] * LANES + [1] * LANES)
+    following = at.builder.add(index, ir.Constant(index.type, 1))
+    low, high = (_broadcast(WIDE)(at, array, i) for i in (index, following))
+    return at.builder.select(upper, high, low)
 
 
 def _store(at: _Site, array: Any, index: Any, value: Any) -> Any:
-    at.builder.store(value, _element(at, array, index, _FLOATS), align=_ALIGNMENT)
+    at.builder.store(value, _element(at, array, index, value.type), align=_ALIGNMENT)
     return at.context.get_dummy_value()
+
+
+def _load_triples(at: _Site, array: Any, index: Any) -> Any:
+    a, b, c = _parts(at, array, index)
+    first, last = at.builder.load(a, align=_ALIGNMENT), at.builder.load(c, align=_ALIGNMENT)
+    two = _shuffle(at, first, at.builder.load(b, align=_ALIGNMENT), range(WIDE))
+    three = _shuffle(at, two, _shuffle(at, last, last, range(WIDE)), range(3 * LANES))
+    picked = [_shuffle(at, three, three, range(i, 3 * LANES, 3)) for i in range(3)]
+    return at.context.make_tuple(at.builder, _triple, picked)
+
+
+def _store_triples(at: _Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> Any:
+    two, third = _shuffle(at, x, y, range(WIDE)), _shuffle(at, z, z, range(WIDE))
+    mixed = [i + LANES * channel for i in range(LANES) for channel in range(3)]
+    for part, address in enumerate(_parts(at, array, index)):
+        here = _shuffle(at, two, third, mixed[part * LANES : (part + 1) * LANES])
+        at.builder.store(here, address, align=_ALIGNMENT)
+    return at.context.get_dummy_value()
+
+
+def _parts(at: _Site, array: Any, index: Any) -> list[Any]:
+    """The addresses of three vectors of eight, one after the other."""
+    places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(3)]
+    return [_element(at, array, place, _floats(LANES)) for place in places]
 
 
 def _prefetch(at: _Site, array: Any, index: Any, *, write: int) -> Any:
@@ -174,12 +258,12 @@ def _prefetch(at: _Site, array: Any, index: Any, *, write: int) -> Any:
 
 
 def _negated_fma(at: _Site, a: Any, b: Any, c: Any) -> Any:
-    return _llvm("llvm.fmuladd.v8f32", _FLOATS)(at, at.builder.fneg(a), b, c)
+    return _llvm("llvm.fmuladd")(at, at.builder.fneg(a), b, c)
 
 
 def _as_negative(at: _Site, a: Any) -> Any:
-    with_sign = at.builder.or_(at.builder.bitcast(a, _INTS), _SIGN_BIT)
-    return at.builder.bitcast(with_sign, _FLOATS)
+    sign = ir.Constant(_same(a), [_SIGN_BIT] * a.type.count)
+    return at.builder.bitcast(at.builder.or_(at.builder.bitcast(a, _same(a)), sign), a.type)
 
 
 def _pick(sign: str) -> Callable[..., Any]:
@@ -190,13 +274,15 @@ def _pick(sign: str) -> Callable[..., Any]:
 
 
 def _bits(at: _Site, mask: Any) -> Any:
-    return at.builder.zext(at.builder.bitcast(mask, ir.IntType(LANES)), _LONG)
+    return at.builder.zext(at.builder.bitcast(mask, ir.IntType(mask.type.count)), _LONG)
 
 
 def _scale_by_power(at: _Site, value: Any, shifted: Any) -> Any:
-    exponent = at.builder.shl(at.builder.bitcast(shifted, _INTS), _MANTISSA_BITS)
-    scaled = at.builder.add(at.builder.bitcast(value, _INTS), exponent)
-    return at.builder.bitcast(scaled, _FLOATS)
+    whole = _same(value)
+    places = ir.Constant(whole, [_MANTISSA_BITS] * value.type.count)
+    exponent = at.builder.shl(at.builder.bitcast(shifted, whole), places)
+    scaled = at.builder.add(at.builder.bitcast(value, whole), exponent)
+    return at.builder.bitcast(scaled, value.type)
 
 
 def _sums(at: _Site, *args: Any) -> Any:
@@ -219,24 +305,49 @@ def _total(at: _Site, a: Any) -> Any:
     return at.builder.extract_element(a, _INT(0))
 
 
-_RAMP = ir.Constant(_FLOATS, [float(lane) for lane in range(LANES)])
+def _ramp(width: int) -> Callable[..., Any]:
+    return lambda at: ir.Constant(_floats(width), [float(lane) for lane in range(width)])
+
+
 _Array = NDArray[Any]
+_Three = tuple[Lanes, Lanes, Lanes]
 
 #: Returns a float32 number in all lanes.
-splat: Callable[[np.float32], Lanes] = _function(_splat, _lanes, types.float32)
+splat: Callable[[np.float32], Lanes] = _function(_splat(LANES), _eight, types.float32)
 #: Returns (0, 1, ..., 7).
-ramp: Callable[[], Lanes] = _function(lambda at: _RAMP, _lanes)
+ramp: Callable[[], Lanes] = _function(_ramp(LANES), _eight)
 #: Returns eight consecutive numbers of a flat float32 array, from an index on.
-load: Callable[[_Array, int], Lanes] = _function(
-    lambda at, array, index: at.builder.load(_element(at, array, index, _FLOATS), align=_ALIGNMENT),
-    *(_lanes, None, types.intp),
-)
+load: Callable[[_Array, int], Lanes] = _function(_load(LANES), _eight, None, types.intp)
 #: Returns one number of a flat float32 array in all lanes.
-broadcast: Callable[[_Array, int], Lanes] = _function(
-    lambda at, array, index: _splat(at, at.builder.load(_element(at, array, index, _FLOAT))),
-    *(_lanes, None, types.intp),
+broadcast: Callable[[_Array, int], Lanes] = _function(_broadcast(LANES), _eight, None, types.intp)
+#: Returns a float32 number in sixteen lanes.
+splat_wide: Callable[[np.float32], Lanes] = _function(_splat(WIDE), _wide, types.float32)
+#: Returns (0, 1, ..., 15).
+ramp_wide: Callable[[], Lanes] = _function(_ramp(WIDE), _wide)
+#: Returns sixteen consecutive numbers of a flat float32 array, from an index on.
+load_wide: Callable[[_Array, int], Lanes] = _function(_load(WIDE), _wide, None, types.intp)
+#: Returns one number of a flat float32 array in sixteen lanes.
+broadcast_wide: Callable[[_Array, int], Lanes] = _function(
+    _broadcast(WIDE), _wide, None, types.intp
 )
-#: Writes eight consecutive numbers to a flat float32 array, from an index on.
+#: Returns two consecutive numbers of a flat float32 array, in eight lanes each.
+broadcast_two: Callable[[_Array, int], Lanes] = _function(_broadcast_two, _wide, None, types.intp)
+#: Returns the first eight of sixteen lanes.
+low_half: Callable[[Lanes], Lanes] = _function(
+    lambda at, a: _shuffle(at, a, a, range(LANES)), _eight, _wide
+)
+#: Returns the sixteen lanes of two vectors of eight.
+joined: Callable[[Lanes, Lanes], Lanes] = _function(
+    lambda at, a, b: _shuffle(at, a, b, range(WIDE)), _wide, _eight, _eight
+)
+#: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
+#: vectors, from a flat index on.
+load_triples: Callable[[_Array, int], _Three] = _function(_load_triples, _triple, None, types.intp)
+#: Writes eight consecutive triples likewise.
+store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = _function(
+    _store_triples, types.void, None, types.intp, _eight, _eight, _eight
+)
+#: Writes consecutive numbers to a flat float32 array, from an index on.
 store: Callable[[_Array, int, Lanes], None] = _function(
     _store, types.void, None, types.intp, _lanes
 )
@@ -250,20 +361,20 @@ prefetch_write: Callable[[_Array, int], None] = _function(
 )
 #: Returns a b + c, rounded once where the machine can.
 fma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
-    _llvm("llvm.fmuladd.v8f32", _FLOATS), _lanes, _lanes, _lanes, _lanes
+    _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
 #: Returns c - a b, rounded once where the machine can.
 fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
     _negated_fma, _lanes, _lanes, _lanes, _lanes
 )
 #: Returns the square roots.
-square_root: Callable[[Lanes], Lanes] = _function(_llvm("llvm.sqrt.v8f32", _FLOATS), _lanes, _lanes)
+square_root: Callable[[Lanes], Lanes] = _function(_llvm("llvm.sqrt"), _lanes, _lanes)
 #: Returns the smallest whole numbers that are not smaller.
-round_up: Callable[[Lanes], Lanes] = _function(_llvm("llvm.ceil.v8f32", _FLOATS), _lanes, _lanes)
+round_up: Callable[[Lanes], Lanes] = _function(_llvm("llvm.ceil"), _lanes, _lanes)
 #: Returns the largest whole numbers that are not larger.
-round_down: Callable[[Lanes], Lanes] = _function(_llvm("llvm.floor.v8f32", _FLOATS), _lanes, _lanes)
+round_down: Callable[[Lanes], Lanes] = _function(_llvm("llvm.floor"), _lanes, _lanes)
 #: Returns the absolute values.
-magnitude: Callable[[Lanes], Lanes] = _function(_llvm("llvm.fabs.v8f32", _FLOATS), _lanes, _lanes)
+magnitude: Callable[[Lanes], Lanes] = _function(_llvm("llvm.fabs"), _lanes, _lanes)
 #: Returns minus the absolute values.
 as_negative: Callable[[Lanes], Lanes] = _function(_as_negative, _lanes, _lanes)
 #: Returns the smaller of each two numbers, the second where they do not compare.
@@ -274,7 +385,7 @@ larger: Callable[[Lanes, Lanes], Lanes] = _function(_pick(">"), _lanes, _lanes, 
 where: Callable[[Mask, Lanes, Lanes], Lanes] = _function(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
 )
-#: Returns the mask as a number from 0 to 255, lane 0 in the lowest bit.
+#: Returns the mask as a number, lane 0 in the lowest bit.
 bits: Callable[[Mask], np.uint64] = _function(_bits, types.uint64, _mask)
 #: Returns the position of the lowest set bit, 64 for zero.
 lowest_bit: Callable[[np.uint64], int] = _function(
@@ -289,7 +400,7 @@ count_bits: Callable[[np.uint64], int] = _function(
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = _function(_scale_by_power, _lanes, _lanes, _lanes)
 #: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
 sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = _function(
-    _sums, _lanes, *([_lanes] * LANES)
+    _sums, _eight, *([_eight] * LANES)
 )
 #: Returns the sum over the lanes, added in pairs.
-total: Callable[[Lanes], np.float32] = _function(_total, types.float32, _lanes)
+total: Callable[[Lanes], np.float32] = _function(_total, types.float32, _eight)

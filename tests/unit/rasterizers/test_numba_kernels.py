@@ -443,3 +443,27 @@ def test_too_many_pairs_of_gaussian_and_tile_are_refused():
                   np.ones((count, 3)), size)  # fmt: skip
     with pytest.raises(MemoryError, match="too many"):
         drawn(huge, camera(*size))
+
+
+@pytest.mark.parametrize("width", range(33, 41))
+def test_where_the_image_ends_within_a_segment_pixels_are_the_same(width):
+    gaussians, shown = cloud(60, (32, 24), seed=5), DrawOptions(depth=True)
+    whole, cut = camera(64, 32), replace(camera(64, 32), width=width, height=21)
+    # The Jacobian's bounds follow the size of the image; these means lie far within.
+    gaussians = replace(gaussians, means=gaussians.means * np.float32([0.2, 0.2, 1.0]))
+    full, part = (forward(gaussians, view, BLACK, shown) for view in (whole, cut))
+    np.testing.assert_array_equal(part.image, full.image[:21, :width])
+    np.testing.assert_array_equal(part.alpha, full.alpha[:21, :width])
+    np.testing.assert_array_equal(part.depth, full.depth[:21, :width])
+    rng = np.random.default_rng(1)
+    v_image, v_alpha, v_depth = (np.zeros(shape, np.float32) for shape in _shapes(full))
+    for v in (v_image, v_alpha, v_depth):
+        v[:21, :width] = rng.normal(size=v[:21, :width].shape)
+    inside = [np.ascontiguousarray(v[:21, :width]) for v in (v_image, v_alpha, v_depth)]
+    of_full, of_part = backward(full, v_image, v_alpha, v_depth), backward(part, *inside)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(of_part, name), getattr(of_full, name))
+
+
+def _shapes(frame):
+    return frame.image.shape, frame.alpha.shape, frame.alpha.shape

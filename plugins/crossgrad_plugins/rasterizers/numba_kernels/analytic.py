@@ -35,7 +35,7 @@ from crossgrad_core.numerics.simd import (
     store,
     where,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.constants import exp2
+from crossgrad_plugins.rasterizers.numba_kernels.constants import exp2, terms_of
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
@@ -206,8 +206,9 @@ def _window_terms(
     zero, one = _number(0.0), _number(1.0)
     t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
     least, most = _number(-100.0), _number(100.0)
-    upper = exp2(larger(smaller(_power(t - h), most), least), constants)
-    lower = exp2(larger(zero - _power(t + h), least), constants)
+    terms = terms_of(constants)
+    upper = exp2(larger(smaller(_power(t - h), most), least), terms)
+    lower = exp2(larger(zero - _power(t + h), least), terms)
     spread = fma(_number(3.0), t * t, h * h)
     difference = inverse_sigma * fma(_number(CUBIC), spread, _number(LINEAR))
     share = _share(difference, upper * lower)

@@ -43,6 +43,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     OFFSETS,
     TOUCHED,
     exp2,
+    terms_of,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROW_CENTRE,
@@ -60,12 +61,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
+    PAIR,
     PARTIAL,
     PEAK,
     RECORD,
     RED,
     ROW_DECAY,
-    SEGMENT,
     SEGMENTS,
     SINE,
     SLOPE,
@@ -85,6 +86,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     blend,
     start_tile,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned
 
 #: Entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
@@ -126,13 +128,13 @@ def _gather(
         reached &= reached - np.uint64(1)
         row = base + (segment & (TILE_HEIGHT - 1))
         at = segment * STATE
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
             dx = offsets - broadcast(rows, row + ROW_CENTRE)
             power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
             touched = power >= load(constants, TOUCHED)
             free = power <= load(constants, CAPPED)
-            alpha = exp2(power, constants)
+            alpha = exp2(power, terms_of(constants))
         else:
             u, v = axis_offsets(cosine, sine, offsets, rows, row)
             alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
@@ -211,8 +213,8 @@ def _backward(
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
-    state = np.empty(DEPTHS + SEGMENTS * LANES, np.float32)
-    rows = np.empty(BATCH * ROWS, np.float32)
+    state = aligned(DEPTHS + SEGMENTS * LANES)
+    rows = aligned(BATCH * ROWS)
     batch = np.empty(BATCH, np.int64)
     start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
     entry, stop = starts[tile], starts[tile + 1]

@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
 from crossgrad_core.numerics.simd import (
-    LANES,
+    WIDE,
     Lanes,
     fma,
     load,
+    load_wide,
     scale_by_power,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COLUMNS,
+    PAIR,
     SEGMENT,
     TOUCH,
 )
@@ -31,19 +33,22 @@ _EXP2_HIGH = (0.009671512991189957, 0.001326472032815218)
 # Adding it rounds a small float32 to a whole number, left in the lowest bits of the sum.
 _ROUND = 1.5 * 2.0**23
 
-EXP2 = LANES  # six coefficients, after the rounding constant
-LARGEST_ALPHA = 7 * LANES
-TOUCHED = 8 * LANES
-STOPPED = 9 * LANES
-ONE = 10 * LANES
-FINISHED = 11 * LANES
-CAPPED = 12 * LANES
-LEAST = 13 * LANES
-OFFSETS = 14 * LANES  # pixel offsets of each column of segments
+EXP2 = WIDE  # six coefficients, after the rounding constant
+LARGEST_ALPHA = 7 * WIDE
+TOUCHED = 8 * WIDE
+STOPPED = 9 * WIDE
+ONE = 10 * WIDE
+FINISHED = 11 * WIDE
+CAPPED = 12 * WIDE
+LEAST = 13 * WIDE
+OFFSETS = 14 * WIDE  # pixel offsets of each column of segments, for both segments of a pair
+
+#: What `exp2` needs.
+Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
-    """Returns the constants for one cap of alpha, eight equal numbers each (offsets: 0, 1, ...)."""
+    """Returns the constants for one cap of alpha, WIDE equal numbers each (offsets: 0, 1, ...)."""
     shared = (
         max_alpha,
         TOUCH,
@@ -54,19 +59,55 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
         ALPHA_THRESHOLD,
     )
     values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
-    offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32)
-    return np.concatenate([np.repeat(np.array(values, dtype=np.float32), LANES), offsets])
+    offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32).reshape(COLUMNS, 1, SEGMENT)
+    pairs = np.repeat(offsets, PAIR // SEGMENT, axis=1).ravel()
+    flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), pairs])
+    room = np.empty(len(flat) + WIDE, np.float32)
+    shift = -(room.ctypes.data // room.itemsize) % WIDE
+    # From the beginning of a cache line on: no vector lies across two.
+    found = room[shift : shift + len(flat)]
+    found[:] = flat
+    return found
 
 
 @device
-def exp2(power: Lanes, constants: NDArray[np.float32]) -> Lanes:
+def terms_of(constants: NDArray[np.float32]) -> Terms:
+    """Returns what `exp2` needs for eight lanes.
+
+    Loaded before a loop it stays in registers where there are 32 of them.
+    """
+    return (
+        load(constants, 0),
+        load(constants, EXP2),
+        load(constants, EXP2 + WIDE),
+        load(constants, EXP2 + 2 * WIDE),
+        load(constants, EXP2 + 3 * WIDE),
+        load(constants, EXP2 + 4 * WIDE),
+        load(constants, EXP2 + 5 * WIDE),
+    )
+
+
+@device
+def wide_terms_of(constants: NDArray[np.float32]) -> Terms:
+    """As `terms_of` for sixteen lanes."""
+    return (
+        load_wide(constants, 0),
+        load_wide(constants, EXP2),
+        load_wide(constants, EXP2 + WIDE),
+        load_wide(constants, EXP2 + 2 * WIDE),
+        load_wide(constants, EXP2 + 3 * WIDE),
+        load_wide(constants, EXP2 + 4 * WIDE),
+        load_wide(constants, EXP2 + 5 * WIDE),
+    )
+
+
+@device
+def exp2(power: Lanes, terms: Terms) -> Lanes:
     """Returns 2**power, relative error below 2e-7 for powers in [-126, 127], else anything."""
-    rounder = load(constants, 0)
+    rounder, c0, c1, c2, c3, c4, c5 = terms
     shifted = power + rounder
     fraction = power - (shifted - rounder)
     square = fraction * fraction
-    high = fma(load(constants, EXP2 + 5 * LANES), fraction, load(constants, EXP2 + 4 * LANES))
-    middle = fma(load(constants, EXP2 + 3 * LANES), fraction, load(constants, EXP2 + 2 * LANES))
-    low = fma(load(constants, EXP2 + LANES), fraction, load(constants, EXP2))
+    high, middle, low = fma(c5, fraction, c4), fma(c3, fraction, c2), fma(c1, fraction, c0)
     value = fma(fma(high, square, middle), square, low)
     return scale_by_power(value, shifted)

@@ -31,8 +31,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import OFFSETS
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import ROWS, fill_rows
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    PAIR,
     RECORD,
-    SEGMENT,
     SEGMENTS,
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -149,7 +149,7 @@ def _entry(
         gx, gy = mean_gradients(
             segment, records, record, rows, 0, state, constants, v_depth, analytic
         )
-        dx = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT) - u
+        dx = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR) - u
         dy = splat(np.float32(segment & (TILE_HEIGHT - 1))) - v
         _spread(gx, gy, fma(axis_x, dx, axis_y * dy), width, height, places, binned)
     for group in range(SUMS // LANES):

@@ -4,15 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import (
-    LANES,
     bits,
-    broadcast,
+    broadcast_wide,
     fma,
     fnma,
-    ramp,
+    ramp_wide,
     round_down,
     round_up,
-    splat,
+    splat_wide,
     square_root,
     store,
 )
@@ -54,34 +53,33 @@ def fill_rows(
     `left`, `top` are the tile's corner in pixels; row centres are relative to it and count from
     the middle of the first pixel.
     """
-    half = splat(np.float32(0.5))
-    u = (broadcast(records, record + U_WHOLE) - splat(left)) + (
-        broadcast(records, record + U_PART) - half
+    half = splat_wide(np.float32(0.5))
+    u = (broadcast_wide(records, record + U_WHOLE) - splat_wide(left)) + (
+        broadcast_wide(records, record + U_PART) - half
     )
-    v = (broadcast(records, record + V_WHOLE) - splat(top)) + (
-        broadcast(records, record + V_PART) - half
+    v = (broadcast_wide(records, record + V_WHOLE) - splat_wide(top)) + (
+        broadcast_wide(records, record + V_PART) - half
     )
-    slope = broadcast(records, record + SLOPE)
-    row_decay = broadcast(records, record + ROW_DECAY)
-    width = broadcast(records, record + WIDTH)
-    log_opacity = broadcast(records, record + LOG_OPACITY)
-    spare = splat(np.float32(SPARE - TOUCH))
+    row_decay = broadcast_wide(records, record + ROW_DECAY)
+    # One lane for each row of the tile.
+    dy = ramp_wide() - v
+    exponent = fnma(row_decay * dy, dy, broadcast_wide(records, record + LOG_OPACITY))
+    centre = fma(broadcast_wide(records, record + SLOPE), dy, u)
+    store(rows, base + ROW_CENTRE, centre)
+    store(rows, base + ROW_EXPONENT, exponent)
+    store(rows, base + ROW_DY, dy)
+    # NaN in rows that the Gaussian does not reach; NaN passes no comparison.
+    budget = (exponent + splat_wide(np.float32(SPARE - TOUCH))) * broadcast_wide(
+        records, record + WIDTH
+    )
+    extent = square_root(budget)
+    first = round_up(centre - extent)
+    last = round_down(centre + extent)
+    row_reached = first <= last
     reached = np.uint64(0)
-    for block in range(0, TILE_HEIGHT, LANES):
-        dy = (ramp() + splat(np.float32(block))) - v
-        exponent = fnma(row_decay * dy, dy, log_opacity)
-        centre = fma(slope, dy, u)
-        store(rows, base + ROW_CENTRE + block, centre)
-        store(rows, base + ROW_EXPONENT + block, exponent)
-        store(rows, base + ROW_DY + block, dy)
-        # NaN in rows that the Gaussian does not reach; NaN passes no comparison.
-        extent = square_root((exponent + spare) * width)
-        first = round_up(centre - extent)
-        last = round_down(centre + extent)
-        row_reached = first <= last
-        for column in range(COLUMNS):
-            begin = splat(np.float32(column * SEGMENT))
-            end = splat(np.float32(column * SEGMENT + SEGMENT - 1))
-            inside = row_reached & (first <= end) & (last >= begin)
-            reached |= bits(inside) << np.uint64(column * TILE_HEIGHT + block)
+    for column in range(COLUMNS):
+        begin = splat_wide(np.float32(column * SEGMENT))
+        end = splat_wide(np.float32(column * SEGMENT + SEGMENT - 1))
+        inside = row_reached & (first <= end) & (last >= begin)
+        reached |= bits(inside) << np.uint64(column * TILE_HEIGHT)
     return reached

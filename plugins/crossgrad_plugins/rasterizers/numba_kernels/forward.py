@@ -6,18 +6,29 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
+    WIDE,
+    Lanes,
     as_negative,
     bits,
     broadcast,
+    broadcast_two,
+    broadcast_wide,
     count_bits,
     fma,
     fnma,
+    joined,
     load,
+    load_wide,
+    low_half,
     lowest_bit,
+    magnitude,
     prefetch,
+    ramp,
     smaller,
     splat,
+    splat_wide,
     store,
+    store_triples,
     where,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
@@ -33,6 +44,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     STOPPED,
     TOUCHED,
     exp2,
+    wide_terms_of,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROW_CENTRE,
@@ -50,6 +62,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
+    PAIR,
     PEAK,
     RADIUS,
     RECORD,
@@ -60,6 +73,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, upper_of
 
 #: Entries whose reach is computed before any of them is blended: hides the latency of their
 #: memory reads and row extents, and is how often finished segments are looked for.
@@ -69,11 +83,17 @@ BATCH = 16
 _SQUARE = 16
 _COLUMN = np.uint64((1 << TILE_HEIGHT) - 1)
 
-# State of a segment: one vector each. The transmittance is negative once a pixel is finished.
-# The depths of all segments follow the states of all segments.
-_T, _RED, _GREEN, _BLUE = 0, LANES, 2 * LANES, 3 * LANES
-_STATE = 4 * LANES
-_DEPTHS = SEGMENTS * _STATE
+# State of a pair of segments, WIDE numbers each: transmittance (negative once a pixel is finished)
+# and three channels. The depths of all pairs follow the states of all pairs.
+_T, _RED, _GREEN, _BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE
+_STATE = 4 * WIDE
+_DEPTHS = SEGMENTS // 2 * _STATE
+
+
+@device
+def _spot(segment: int) -> int:
+    """Returns where the state of a segment begins."""
+    return (segment >> 1) * _STATE + (segment & 1) * LANES
 
 
 @device
@@ -83,12 +103,14 @@ def _start(state: NDArray[np.float32], width: int, height: int) -> np.uint64:
     live = np.uint64(0)
     for segment in range(SEGMENTS):
         row = segment % TILE_HEIGHT
-        first = (segment // TILE_HEIGHT) * SEGMENT
-        for x in range(SEGMENT):
-            inside = row < height and first + x < width
-            state[segment * _STATE + _T + x] = np.float32(1.0 if inside else -1.0)
-        if row < height and first < width:
-            live |= np.uint64(1) << np.uint64(segment)
+        left = min(width - (segment // TILE_HEIGHT) * SEGMENT, SEGMENT) if row < height else 0
+        inside = ramp() < splat(np.float32(left))
+        store(
+            state,
+            _spot(segment) + _T,
+            where(inside, splat(np.float32(1.0)), splat(np.float32(-1.0))),
+        )
+        live |= np.uint64(left > 0) << np.uint64(segment)
     return live
 
 
@@ -106,13 +128,51 @@ def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
 @device
 def _unfinished(state: NDArray[np.float32], live: np.uint64) -> np.uint64:
     """Returns the live segments that still have an unfinished pixel."""
-    rest = live
+    rest = upper_of(live)
+    going = np.uint64(0)
     while rest != np.uint64(0):
         segment = lowest_bit(rest)
         rest &= rest - np.uint64(1)
-        going = bits(load(state, segment * _STATE + _T) >= splat(np.float32(0.0)))
-        live &= ~(np.uint64(going == np.uint64(0)) << np.uint64(segment))
-    return live
+        pixels = bits(load_wide(state, _spot(segment) + _T) >= splat_wide(np.float32(0.0)))
+        upper, lower = (pixels & np.uint64(0xFF)) != 0, pixels > np.uint64(0xFF)
+        going |= (np.uint64(upper) | (np.uint64(lower) << np.uint64(1))) << np.uint64(segment)
+    return live & going
+
+
+@device
+def _coverage(
+    left: np.uint64,
+    segment: int,
+    offsets: Lanes,
+    rows: NDArray[np.float32],
+    row: int,
+    records: NDArray[np.float32],
+    record: int,
+    constants: NDArray[np.float32],
+) -> tuple[Lanes, np.uint64]:
+    """The analytic response in a pair of segments.
+
+    Returns:
+        Alpha, and `left` without those of the two segments that are out of reach.
+    """
+    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
+    inverse_1 = broadcast(records, record + INVERSE_1)
+    inverse_2 = broadcast(records, record + INVERSE_2)
+    peak = broadcast(records, record + PEAK)
+    squared = broadcast(records, record + RADIUS)
+    eight = low_half(offsets)
+    u, v = axis_offsets(cosine, sine, eight, rows, row)
+    lower_u, lower_v = axis_offsets(cosine, sine, eight, rows, row + 1)
+    if near_enough(u, v, inverse_1, inverse_2, squared) == np.uint64(0):
+        left &= ~(np.uint64(1) << np.uint64(segment))
+    if near_enough(lower_u, lower_v, inverse_1, inverse_2, squared) == np.uint64(0):
+        left &= ~(np.uint64(2) << np.uint64(segment))
+    if (left >> np.uint64(segment)) & np.uint64(3) == np.uint64(0):
+        zero = splat(np.float32(0.0))
+        return joined(zero, zero), left
+    alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
+    lower = coverages(peak, lower_u, lower_v, inverse_1, inverse_2, constants)
+    return joined(alpha, lower), left
 
 
 @device
@@ -128,59 +188,81 @@ def _blend(
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[int, np.uint64]:
-    """Blends one Gaussian into the reached segments.
+    """Blends one Gaussian into the reached segments, in pairs.
+
+    The other segment of a pair is left as it is: none of its pixels is touched, or all are done.
 
     Returns:
         The number of pixels blended, and the segments without those found to be out of reach.
     """
     left = reached
-    decay = broadcast(records, record + DECAY)
-    red = broadcast(records, record + RED)
-    green = broadcast(records, record + GREEN)
-    blue = broadcast(records, record + BLUE)
-    z = broadcast(records, record + DEPTH)
-    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    inverse_1 = broadcast(records, record + INVERSE_1)
-    inverse_2 = broadcast(records, record + INVERSE_2)
-    peak = broadcast(records, record + PEAK)
-    squared = broadcast(records, record + RADIUS)
-    zero = splat(np.float32(0.0))
+    pairs = upper_of(reached)
+    decay = broadcast_wide(records, record + DECAY)
+    red = broadcast_wide(records, record + RED)
+    green = broadcast_wide(records, record + GREEN)
+    blue = broadcast_wide(records, record + BLUE)
+    z = broadcast_wide(records, record + DEPTH)
+    terms = wide_terms_of(constants)
+    most, stopped = load_wide(constants, LARGEST_ALPHA), load_wide(constants, STOPPED)
+    least = load_wide(constants, TOUCHED if analytic is None else LEAST)
+    zero = splat_wide(np.float32(0.0))
     pixels = 0
-    while reached != np.uint64(0):
-        segment = lowest_bit(reached)
-        reached &= reached - np.uint64(1)
+    while pairs != np.uint64(0):
+        segment = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
         row = base + (segment & (TILE_HEIGHT - 1))
-        at = segment * _STATE
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+        at = segment * (_STATE // 2)
+        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
-            dx = offsets - broadcast(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-            touched = power >= load(constants, TOUCHED)
-            alpha = exp2(power, constants)
+            dx = offsets - broadcast_two(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast_two(rows, row + ROW_EXPONENT))
+            touched = power >= least
+            alpha = exp2(power, terms)
         else:
-            u, v = axis_offsets(cosine, sine, offsets, rows, row)
-            if near_enough(u, v, inverse_1, inverse_2, squared) == np.uint64(0):
-                left &= ~(np.uint64(1) << np.uint64(segment))
-                continue
-            alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
-            touched = alpha >= load(constants, LEAST)
+            alpha, left = _coverage(left, segment, offsets, rows, row, records, record, constants)
+            touched = alpha >= least
         # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
-        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-        before = load(state, at + _T)
+        alpha = where(touched, smaller(alpha, most), zero)
+        before = load_wide(state, at + _T)
         weight = alpha * before
         after = before - weight
-        blended = after >= load(constants, STOPPED)
+        blended = after >= stopped
         weight = where(blended, weight, zero)
         store(state, at + _T, where(blended, after, as_negative(before)))
-        store(state, at + _RED, fma(weight, red, load(state, at + _RED)))
-        store(state, at + _GREEN, fma(weight, green, load(state, at + _GREEN)))
-        store(state, at + _BLUE, fma(weight, blue, load(state, at + _BLUE)))
+        store(state, at + _RED, fma(weight, red, load_wide(state, at + _RED)))
+        store(state, at + _GREEN, fma(weight, green, load_wide(state, at + _GREEN)))
+        store(state, at + _BLUE, fma(weight, blue, load_wide(state, at + _BLUE)))
         if depth is not None:
             spot = _DEPTHS + segment * LANES
-            store(state, spot, fma(weight, z, load(state, spot)))
+            store(state, spot, fma(weight, z, load_wide(state, spot)))
         if counts is not None:
             pixels += count_bits(bits(touched & blended))
     return pixels, left
+
+
+@device
+def _finish_segment(
+    state: NDArray[np.float32],
+    segment: int,
+    pixel: int,
+    background: NDArray[np.float32],
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+) -> None:
+    """Adds the background to a segment and writes it to the pixels from a flat index on."""
+    at = _spot(segment)
+    through = magnitude(load(state, at + _T))
+    store_triples(
+        image,
+        3 * pixel,
+        load(state, at + _RED) + through * broadcast(background, 0),
+        load(state, at + _GREEN) + through * broadcast(background, 1),
+        load(state, at + _BLUE) + through * broadcast(background, 2),
+    )
+    store(alpha, pixel, splat(np.float32(1.0)) - through)
+    if depth is not None:
+        store(depth, pixel, load(state, _DEPTHS + segment * LANES))
 
 
 @device
@@ -194,10 +276,17 @@ def _finish(
     depth: NDArray[np.float32] | None,
 ) -> None:
     """Adds the background and writes the tile's pixels."""
+    width = image.shape[1]
     for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
-        for x in range(min(TILE_WIDTH, image.shape[1] - left)):
+        inside = min(TILE_WIDTH, width - left)
+        for column in range(inside // SEGMENT):
+            pixel = (top + y) * width + left + column * SEGMENT
+            segment = column * TILE_HEIGHT + y
+            _finish_segment(state, segment, pixel, background, image, alpha, depth)
+        # A segment that the image cuts.
+        for x in range(inside - inside % SEGMENT, inside):
             segment = (x // SEGMENT) * TILE_HEIGHT + y
-            at = segment * _STATE + x % SEGMENT
+            at = _spot(segment) + x % SEGMENT
             through = abs(state[at + _T])
             image[top + y, left + x, 0] = state[at + _RED] + through * background[0]
             image[top + y, left + x, 1] = state[at + _GREEN] + through * background[1]
@@ -227,8 +316,8 @@ def _composite(
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
-    state = np.empty(_DEPTHS + SEGMENTS * LANES, np.float32)
-    rows = np.empty(BATCH * ROWS, np.float32)
+    state = aligned(_DEPTHS + SEGMENTS * LANES)
+    rows = aligned(BATCH * ROWS)
     batch = np.empty(BATCH, np.int64)
     live = _start(state, image.shape[1] - left, image.shape[0] - top)
     entry, stop = starts[tile], starts[tile + 1]

@@ -19,6 +19,10 @@ TILE_HEIGHT = 16
 SEGMENT = 8
 COLUMNS = TILE_WIDTH // SEGMENT
 SEGMENTS = COLUMNS * TILE_HEIGHT
+#: Two segments, one above the other, are a pair and are worked on together; as bits, the upper
+#: segments of all pairs.
+PAIR = 2 * SEGMENT
+UPPER = sum(1 << segment for segment in range(0, SEGMENTS, 2))
 
 #: Gaussians that one job of the projection handles.
 CHUNK = 2048

@@ -35,6 +35,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     STOPPED,
     TOUCHED,
     exp2,
+    terms_of,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROW_CENTRE,
@@ -48,6 +49,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     DECAY,
     INVERSE_1,
     INVERSE_2,
+    PAIR,
     PEAK,
     RECORD,
     SEGMENT,
@@ -96,17 +98,18 @@ def _count(
     inverse_2 = broadcast(records, record + INVERSE_2)
     peak = broadcast(records, record + PEAK)
     zero = splat(np.float32(0.0))
+    terms = terms_of(constants)
     pixels = 0
     while reached != np.uint64(0):
         segment = lowest_bit(reached)
         reached &= reached - np.uint64(1)
         row = segment & (TILE_HEIGHT - 1)
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
             dx = offsets - broadcast(rows, row + ROW_CENTRE)
             power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
             touched = power >= load(constants, TOUCHED)
-            alpha = exp2(power, constants)
+            alpha = exp2(power, terms)
         else:
             u, v = axis_offsets(cosine, sine, offsets, rows, row)
             alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)

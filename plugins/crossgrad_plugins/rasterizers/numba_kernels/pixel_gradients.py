@@ -29,6 +29,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     OFFSETS,
     TOUCHED,
     exp2,
+    terms_of,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROW_CENTRE,
@@ -44,10 +45,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
+    PAIR,
     PEAK,
     RED,
     ROW_DECAY,
-    SEGMENT,
     SINE,
     SLOPE,
     TILE_HEIGHT,
@@ -98,7 +99,7 @@ def mean_gradients(
     Those of plain records are in units of 2 log 2 px^-1, the others in px^-1.
     """
     row = base + (segment & (TILE_HEIGHT - 1))
-    offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * SEGMENT)
+    offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
     zero = splat(np.float32(0.0))
     if analytic is None:
         decay = broadcast(records, record + DECAY)
@@ -106,7 +107,7 @@ def mean_gradients(
         power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
         touched = power >= load(constants, TOUCHED)
         free = power <= load(constants, CAPPED)
-        alpha = exp2(power, constants)
+        alpha = exp2(power, terms_of(constants))
     else:
         cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
         inverse_1 = broadcast(records, record + INVERSE_1)

@@ -3,7 +3,17 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.simd import LANES, Lanes, Mask, fnma, load, splat, store, where
+from crossgrad_core.numerics.simd import (
+    LANES,
+    Lanes,
+    Mask,
+    fnma,
+    load,
+    load_triples,
+    splat,
+    store,
+    where,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.constants import FINISHED, ONE, STOPPED
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
@@ -22,6 +32,37 @@ DEPTHS = SEGMENTS * STATE
 
 
 @device
+def _start_segment(
+    state: NDArray[np.float32],
+    segment: int,
+    pixel: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the state of a segment from the pixels from a flat index on."""
+    at = segment * STATE
+    one = splat(np.float32(1.0))
+    r, g, b = load_triples(image, 3 * pixel)
+    red, green, blue = load_triples(v_image, 3 * pixel)
+    rest = red * r + green * g + blue * b
+    if v_alpha is not None:
+        rest = rest - load(v_alpha, pixel) * (one - load(alpha, pixel))
+    if depth is not None and v_depth is not None:
+        v_z = load(v_depth, pixel)
+        rest = rest + v_z * load(depth, pixel)
+        store(state, DEPTHS + segment * LANES, v_z)
+    store(state, at + PASSED, one)
+    store(state, at + REST, rest)
+    store(state, at + V_RED, red)
+    store(state, at + V_GREEN, green)
+    store(state, at + V_BLUE, blue)
+
+
+@device
 def start_tile(
     state: NDArray[np.float32],
     top: int,
@@ -34,12 +75,19 @@ def start_tile(
     v_depth: NDArray[np.float32] | None,
 ) -> None:
     """Fills the state of a tile."""
-    state[:] = np.float32(0.0)
-    for segment in range(SEGMENTS):
-        for x in range(SEGMENT):
-            state[segment * STATE + PASSED + x] = np.float32(-1.0)
-    for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
-        for x in range(min(TILE_WIDTH, image.shape[1] - left)):
+    width = image.shape[1]
+    height, inside = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
+    if height < TILE_HEIGHT or inside < TILE_WIDTH:
+        state[:] = np.float32(0.0)
+        for segment in range(SEGMENTS):
+            store(state, segment * STATE + PASSED, splat(np.float32(-1.0)))
+    for y in range(height):
+        for column in range(inside // SEGMENT):
+            pixel = (top + y) * width + left + column * SEGMENT
+            segment = column * TILE_HEIGHT + y
+            _start_segment(state, segment, pixel, image, alpha, depth, v_image, v_alpha, v_depth)
+        # A segment that the image cuts.
+        for x in range(inside - inside % SEGMENT, inside):
             segment = (x // SEGMENT) * TILE_HEIGHT + y
             at = segment * STATE + x % SEGMENT
             i, j = top + y, left + x

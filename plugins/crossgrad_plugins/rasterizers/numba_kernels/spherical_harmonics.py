@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.simd import prefetch
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
@@ -16,6 +17,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 
 #: Number of basis functions of all degrees.
 BASIS = 16
+#: Floats of a cache line, and records ahead for whose coefficients memory is asked.
+_LINE, _AHEAD = 16, 6
 
 _C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
 _C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
@@ -39,6 +42,14 @@ def _direction(
     z = np.float64(means[i, 2]) - eye[2]
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
+
+
+@device
+def _bring_near(rest: NDArray[np.float32], i: int) -> None:
+    """Asks for the memory of the coefficients of Gaussian i before they are needed."""
+    width = 3 * rest.shape[1]
+    for at in range(0, width, _LINE):
+        prefetch(rest, i * width + at)
 
 
 @device
@@ -130,14 +141,21 @@ def shade(
     basis = np.empty(BASIS, np.float64)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
-        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+        end = chunk * CHUNK + drawn[chunk]
+        for j in range(chunk * CHUNK, end):
             i = np.intp(owners[j])
+            _bring_near(rest, np.intp(owners[min(j + _AHEAD, end - 1)]))
             x, y, z, _ = _direction(means, i, eye)
             _basis(degree, x, y, z, basis)
-            for channel in range(3):
-                colour = 0.5 + basis[0] * np.float64(dc[i, 0, channel])
-                for k in range(1, count):
-                    colour += basis[k] * np.float64(rest[i, k - 1, channel])
+            red = 0.5 + basis[0] * np.float64(dc[i, 0, 0])
+            green = 0.5 + basis[0] * np.float64(dc[i, 0, 1])
+            blue = 0.5 + basis[0] * np.float64(dc[i, 0, 2])
+            # Coefficients in the order of memory; three sums that do not wait for each other.
+            for k in range(1, count):
+                red += basis[k] * np.float64(rest[i, k - 1, 0])
+                green += basis[k] * np.float64(rest[i, k - 1, 1])
+                blue += basis[k] * np.float64(rest[i, k - 1, 2])
+            for channel, colour in enumerate((red, green, blue)):
                 if not math.isfinite(colour):
                     # Reaches no pixel.
                     records[j * RECORD + LOG_OPACITY] = -math.inf
@@ -186,24 +204,42 @@ def unshade(
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
         before = drawn[:chunk].sum() - chunk * CHUNK
-        for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
+        end = chunk * CHUNK + drawn[chunk]
+        for j in range(chunk * CHUNK, end):
             if records[j * RECORD + LOG_OPACITY] == -math.inf:
                 continue
             i = np.intp(owners[j])
+            _bring_near(rest, np.intp(owners[min(j + _AHEAD, end - 1)]))
             to_dc = before + j if dc_by_rows else i
             to_rest = before + j if rest_by_rows else i
             x, y, z, inverse = _direction(means, i, eye)
             _basis(degree, x, y, z, basis)
-            v_basis[:] = 0.0
-            for channel in range(3):
-                # A channel clamped at 0 has no gradient.
-                if records[j * RECORD + RED + channel] <= np.float32(0.0):
-                    continue
-                v = np.float64(v_colors[i, channel])
-                v_dc[to_dc, 0, channel] = v * basis[0]
+            at = j * RECORD + RED
+            if min(records[at], records[at + 1], records[at + 2]) > np.float32(0.0):
+                red, green = np.float64(v_colors[i, 0]), np.float64(v_colors[i, 1])
+                blue = np.float64(v_colors[i, 2])
+                v_dc[to_dc, 0, 0] = red * basis[0]
+                v_dc[to_dc, 0, 1] = green * basis[0]
+                v_dc[to_dc, 0, 2] = blue * basis[0]
+                # Coefficients in the order of memory.
                 for k in range(1, count):
-                    v_rest[to_rest, k - 1, channel] = v * basis[k]
-                    v_basis[k] += v * np.float64(rest[i, k - 1, channel])
+                    v_rest[to_rest, k - 1, 0] = red * basis[k]
+                    v_rest[to_rest, k - 1, 1] = green * basis[k]
+                    v_rest[to_rest, k - 1, 2] = blue * basis[k]
+                    along = red * np.float64(rest[i, k - 1, 0])
+                    along += green * np.float64(rest[i, k - 1, 1])
+                    v_basis[k] = along + blue * np.float64(rest[i, k - 1, 2])
+            else:
+                v_basis[:] = 0.0
+                for channel in range(3):
+                    # A channel clamped at 0 has no gradient.
+                    if records[at + channel] <= np.float32(0.0):
+                        continue
+                    v = np.float64(v_colors[i, channel])
+                    v_dc[to_dc, 0, channel] = v * basis[0]
+                    for k in range(1, count):
+                        v_rest[to_rest, k - 1, channel] = v * basis[k]
+                        v_basis[k] += v * np.float64(rest[i, k - 1, channel])
             v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_basis)
             along = x * v_x + y * v_y + z * v_z
             v_means[i, 0] += (v_x - x * along) * inverse

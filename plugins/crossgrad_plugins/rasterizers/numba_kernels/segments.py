@@ -1,0 +1,22 @@
+"""Sets of a tile's segments, as bits, and room for their states."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.simd import WIDE
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+from crossgrad_plugins.rasterizers.numba_kernels.layout import UPPER
+
+
+@device
+def upper_of(segments: np.uint64) -> np.uint64:
+    """Returns the upper segments of the pairs in which there is one of these segments."""
+    return (segments | (segments >> np.uint64(1))) & np.uint64(UPPER)
+
+
+@device
+def aligned(count: int) -> NDArray[np.float32]:
+    """Returns room for so many numbers that begins a cache line: no vector lies across two."""
+    room = np.empty(count + WIDE, np.float32)
+    shift = (-(room.ctypes.data // room.itemsize)) % WIDE
+    return room[shift : shift + count]

@@ -1,0 +1,85 @@
+"""Vectors in kernels: what wide ones and triples hold, and that both widths compute the same."""
+
+import numpy as np
+import pytest
+
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.simd import (
+    LANES,
+    WIDE,
+    bits,
+    broadcast_two,
+    fma,
+    joined,
+    load,
+    load_triples,
+    load_wide,
+    low_half,
+    splat,
+    splat_wide,
+    square_root,
+    store,
+    store_triples,
+    where,
+)
+
+
+@kernel
+def _turned(source, target):
+    x, y, z = load_triples(source, 1)
+    store_triples(target, 2, z, x, y)
+
+
+@kernel
+def _two(source, target):
+    store(target, 0, broadcast_two(source, 3))
+    store(target, WIDE, low_half(broadcast_two(source, 4)))
+    store(target, WIDE + LANES, joined(load(source, LANES), load(source, 0)))
+
+
+@kernel
+def _eights(a, b, target):
+    found = np.uint64(0)
+    for i in range(0, WIDE, LANES):
+        x, y = load(a, i), load(b, i)
+        smaller = x < y
+        root = square_root(fma(x, y, splat(np.float32(1.0))))
+        store(target, i, where(smaller, root / y, x - y))
+        found |= bits(smaller) << np.uint64(i)
+    return found
+
+
+@kernel
+def _sixteen(a, b, target):
+    x, y = load_wide(a, 0), load_wide(b, 0)
+    smaller = x < y
+    root = square_root(fma(x, y, splat_wide(np.float32(1.0))))
+    store(target, 0, where(smaller, root / y, x - y))
+    return bits(smaller)
+
+
+def test_triples_come_apart_and_together_again():
+    source = np.arange(3 * LANES + 1, dtype=np.float32)
+    target = np.full(3 * LANES + 3, -1, np.float32)
+    _turned(source, target)
+    triples = source[1:].reshape(LANES, 3)
+    np.testing.assert_array_equal(target[2:-1].reshape(LANES, 3), triples[:, [2, 0, 1]])
+    assert target[[0, 1, -1]].tolist() == [-1, -1, -1]
+
+
+def test_halves_of_a_wide_vector():
+    source = np.arange(WIDE, dtype=np.float32)
+    target = np.empty(2 * WIDE + LANES, np.float32)
+    _two(source, target)
+    expected = [3] * LANES + [4] * LANES + [4] * LANES + [*range(LANES, WIDE), *range(LANES)]
+    assert target.tolist() == expected
+
+
+@pytest.mark.parametrize("extreme", [0.0, 1e-40, 3e38, np.inf, np.nan])
+def test_both_widths_give_the_same_bits(extreme):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, WIDE)).astype(np.float32)
+    a[3] = b[12] = extreme
+    eight, sixteen = np.empty(WIDE, np.float32), np.empty(WIDE, np.float32)
+    assert _eights(a, b, eight) == _sixteen(a, b, sixteen)
+    np.testing.assert_array_equal(eight.view(np.uint32), sixteen.view(np.uint32))
