@@ -13,9 +13,8 @@ from crossgrad_plugins.prepare.waiting import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Pairs count from so many verified matches on, as many as COLMAP asks of a pose. Between photos of
-#: repeated walls and pavements most pairs with fewer are wrong, and few of those between heights
-#: (docs/prepare.md).
+#: Pairs count from so many verified matches on, as many as COLMAP asks of a pose: between photos of
+#: repeated walls and pavements most pairs with fewer are wrong.
 _MATCHES: Final = 30
 #: Pixels from the epipolar line within which a match agrees with two poses, as in verification, and
 #: the share of a pair's matches that have to.

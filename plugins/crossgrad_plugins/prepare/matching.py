@@ -27,7 +27,7 @@ _FARTHEST: Final = 500.0
 #: Features of a photo by which others like it are looked up, at most.
 _LOOKED_UP: Final = 2000
 #: Geometries that are tried to explain the matches of a pair, at most. COLMAP tries five times as
-#: many of pairs that show nothing in common, and finds the same ones (docs/prepare.md).
+#: many of pairs that show nothing in common.
 _TRIALS: Final = 2000
 #: How photos to compare are chosen -> pycolmap's ways that this takes.
 _WAYS: Final = {
