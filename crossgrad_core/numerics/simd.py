@@ -60,12 +60,8 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-def _lanes(width: int) -> _LanesType:
-    return _LanesType(width)
-
-
-def _mask(width: int) -> _MaskType:
-    return _MaskType(width)
+#: Called with a width they are the type of such a vector.
+_lanes, _mask = _LanesType, _MaskType
 
 
 def _floats(width: int) -> ir.Type:
@@ -145,11 +141,9 @@ def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any
     """Gives a Python operator its meaning between two values of one kind."""
     implementation = _function(emit, to, kind, kind)
 
-    vector = _LanesType if kind is _lanes else _MaskType
-
     @overload(sign, strict=False)  # the annotations are no part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
-        if isinstance(a, vector) and a == b:
+        if isinstance(a, kind) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
         return None
 
