@@ -30,6 +30,8 @@ class Backbone(Component):
         passed_on: Field of the Gaussians -> tensor that `decode` hands over as this field (or not
             at all) and does not read: only the rows that are drawn need to be up to date. It
             holds for the very class that says so, not for those that inherit from it.
+        positions: Tensor [N, 3] of the primitives' positions in the local frame, by which they are
+            ordered in memory; where there is none of this name, they stay in any order.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -38,6 +40,7 @@ class Backbone(Component):
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = False
     passed_on: ClassVar[Mapping[str, str]] = {}
+    positions: ClassVar[str] = "means"
 
     @classmethod
     @override

@@ -9,6 +9,7 @@ from crossgrad_core.contract.topology import (
     apply_to_parameters,
     gather_indices,
 )
+from crossgrad_core.training.order import ordered_edit
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -23,6 +24,7 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
         return False
     before = state.primitives(setup)
     state.settle(edit.values if edit.source is None else None)
+    edit = ordered_edit(edit, state.tensors, setup.blocks, setup.backbone.positions)
     for block in setup.blocks:
         if block.per_primitive:
             for name in block.tensors:

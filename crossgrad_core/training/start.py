@@ -17,6 +17,7 @@ from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training import photo_parameters
 from crossgrad_core.training.compile_ahead import compiling_beside
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.setup import Setup
@@ -31,6 +32,7 @@ def first_state(setup: Setup) -> TrainState:
     """The state before the first step."""
     rngs = make_streams(setup.config.seed)
     parameters = setup.densifier.started(initial_parameters(setup, rngs["create"]))
+    parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
         name: tensor.detach().to(setup.device).requires_grad_(name in trained)

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -55,6 +56,8 @@ class AnchorBackbone(AnchorOptions):
     rotation and the opacity of an anchor, which the published code holds but never trains, are left
     out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
     """
+
+    positions: ClassVar[str] = "anchors"
 
     def created(
         self,
