@@ -124,6 +124,8 @@ class Screen:
             are `abs_gradient`), and their number.
         count: [H, W] bool -> [N] int32, in how many of these pixels the Gaussian was blended; None
             unless asked for. It keeps alive what it needs of the render.
+        rows: [R] int64, sorted, among which is every Gaussian with a radius; None where the
+            rasterizer has no such list.
     """
 
     radii: Tensor
@@ -132,6 +134,7 @@ class Screen:
     abs_gradient: Tensor | None = None
     directions: Tensor | None = None
     count: Callable[[Tensor], Tensor] | None = None
+    rows: Tensor | None = None
 
 
 @dataclass(frozen=True)

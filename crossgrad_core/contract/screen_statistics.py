@@ -77,7 +77,10 @@ def seen(record: RenderedView) -> Tensor | None:
 
     None, which means all, on a GPU, where their number would be waited for.
     """
-    return record.screen.radii.nonzero()[:, 0] if record.screen.radii.is_cpu else None
+    radii, rows = record.screen.radii, record.screen.rows
+    if not radii.is_cpu:
+        return None
+    return radii.nonzero()[:, 0] if rows is None else rows[radii[rows] > 0]
 
 
 def _present(statistic: Tensor | None) -> Tensor:

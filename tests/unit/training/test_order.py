@@ -8,6 +8,7 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.topology import Edit, Rows, apply_to_parameters
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import order
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.order import along_curve, ordered, ordered_edit
 from crossgrad_core.training.start import first_state
@@ -17,6 +18,11 @@ BLOCKS = (
     Block("codes", ("codes",), True, "neutral", LearningRate(0.1)),
     Block("shared", ("shared",), False, "neutral", LearningRate(0.1)),
 )
+
+
+@pytest.fixture(autouse=True)
+def few_are_many(monkeypatch):
+    monkeypatch.setattr(order, "FEWEST", 2)
 
 
 def code(position):
@@ -94,3 +100,13 @@ def test_a_run_keeps_the_order(backbone):
             assert apply_edit(setup, state, Edit(source=source))
         positions = state.parameters[name]
         assert torch.equal(along_curve(positions), torch.arange(len(positions)))
+
+
+def test_few_stay_in_their_order(monkeypatch):
+    monkeypatch.setattr(order, "FEWEST", 51)
+    parameters = random_parameters(50)
+    assert ordered(parameters, BLOCKS, "means") is parameters
+    edit = Edit(source=torch.arange(50))
+    assert ordered_edit(edit, parameters, BLOCKS, "means") is edit
+    edit = Edit(source=torch.arange(51) % 50)
+    assert ordered_edit(edit, parameters, BLOCKS, "means") is not edit

@@ -37,12 +37,9 @@ def test_it_begins_with_all_bands_of_the_file(trained):
     again = assemble(config, sample_scene(), "none")
     ours, wanted = decoded(again, first_state(again)), decoded(setup, state)
     assert ours.sh_degree == wanted.sh_degree == again.backbone.sh_degree > 0
-    # The order in memory is each run's own.
-    same = torch.cdist(ours.means, wanted.means).argmin(1)
-    assert same.sort().values.tolist() == list(range(len(wanted.means)))
-    assert torch.equal(ours.sh_rest, wanted.sh_rest[same]) and ours.sh_rest.abs().max() > 0
-    assert torch.allclose(ours.means, wanted.means[same], atol=1e-6)
-    assert torch.allclose(ours.opacities, wanted.opacities[same], atol=1e-6)
+    assert torch.equal(ours.sh_rest, wanted.sh_rest) and ours.sh_rest.abs().max() > 0
+    assert torch.allclose(ours.means, wanted.means, atol=1e-6)
+    assert torch.allclose(ours.opacities, wanted.opacities, atol=1e-6)
     assert lengthened(again, 10, 2000).schedule.sh_from == 3
 
 

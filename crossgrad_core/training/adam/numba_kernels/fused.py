@@ -10,6 +10,7 @@ from crossgrad_core.numerics.jobs import Jobs, share, take
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
+_RUN = 1 << 13  # elements that are left out together where nothing has moved them yet
 
 _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
@@ -42,6 +43,19 @@ def update(
 
 
 @kernel
+def _moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
+    """Whether the step changes a bit: gradient and moments of what was never drawn are 0."""
+    few = min(64, len(grad))
+    for end in (few, len(grad)):
+        count = 0
+        for i in range(end):
+            count += (grad[i] != _ZERO) | (exp_avg[i] != _ZERO) | (exp_avg_sq[i] != _ZERO)
+        if count:
+            return True
+    return False
+
+
+@kernel
 def _update_chunks(
     jobs: Jobs,
     param: _Floats,
@@ -52,8 +66,10 @@ def _update_chunks(
 ) -> None:
     chunk = take(jobs)
     while chunk * _CHUNK < len(param):
-        a, b = chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK)
-        update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
+        for a in range(chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK), _RUN):
+            b = min(len(param), a + _RUN)
+            if _moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
+                update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
         chunk = take(jobs)
 
 

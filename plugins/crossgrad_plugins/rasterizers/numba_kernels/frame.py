@@ -136,7 +136,8 @@ def backward(
         quats=np.zeros((count, 4), np.float32),
         scales=np.zeros((count, 3), np.float32),
         opacities=np.zeros(count, np.float32),
-        colors=np.zeros((count, 3), np.float32),
+        # On the way to harmonics nobody reads those of Gaussians that were not drawn.
+        colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest),
         centres=np.zeros((count, 2), np.float32),

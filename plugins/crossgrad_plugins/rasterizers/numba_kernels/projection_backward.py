@@ -212,11 +212,12 @@ def _fill_block(
         first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
         i = np.intp(owners[j])
         j += 1
-        if not add_up(first, count, written, partials, sums):
-            continue
+        found = add_up(first, count, written, partials, sums)
         v_colors[i, 0] = sums[SUM_RED]
         v_colors[i, 1] = sums[SUM_GREEN]
         v_colors[i, 2] = sums[SUM_BLUE]
+        if not found:
+            continue
         v_opacities[i] = np.float64(sums[SUM_1]) / np.float64(opacities[i])
         if v_absolute.shape[0] > 0:
             v_absolute[i, 0] = sums[SUM_ABS_X]
@@ -302,7 +303,7 @@ def unproject(
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].
-        v_colors: [N, 3], of the RGB drawn.
+        v_colors: [N, 3], of the RGB drawn; written for all drawn, and need not be zero before.
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
