@@ -34,6 +34,15 @@ class Gradients(ABC):
     def finite(self) -> NDArray[np.bool_]:
         """[B, K], views whose gradient of the block is finite."""
 
+    def is_judged(self, name: str, gradient: Tensor) -> bool:
+        """Whether `finite` is known to hold for this very tensor as it is: no need to look again.
+
+        Args:
+            name: Of the tensor that it is the gradient of.
+            gradient: As `total` gave it, or anything else.
+        """
+        return False
+
     @abstractmethod
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
         """Tensor name -> plain sum in the order of the views (the bits of accumulation).

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Gradients
+from crossgrad_core.gradients.by_rows import values_of
 from crossgrad_core.gradients.finite import finite_and_present
 from crossgrad_core.gradients.plain import plain_sums
 
@@ -35,12 +36,15 @@ class SummedGradients(Gradients):
         self._last: dict[str, Tensor] = {}
         self._divisor = 0
         self._views = self._expected = views
+        #: Gradients that were judged as they are, and their versions then.
+        self._looked: dict[str, tuple[Tensor, int]] = {}
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []
         if views:
             finite, present = self._judged(self._sum)
             self._finite, self._present = [finite] * views, [present] * views
             self._forget(finite)
+            self._remember(self._sum)
 
     @classmethod
     def empty(cls, blocks: Sequence[Block], views: int) -> Self:
@@ -66,6 +70,8 @@ class SummedGradients(Gradients):
                 gradient = _contiguous(view.get(name))
                 if gradient is not None:
                     self._last[name] = gradient
+        if self._expected == 1:
+            self._remember(self._last)
         if self._views < self._expected:
             self._fold(1)
 
@@ -98,6 +104,23 @@ class SummedGradients(Gradients):
     @override
     def present(self) -> NDArray[np.bool_]:
         return np.stack(self._present, axis=1)
+
+    @override
+    def is_judged(self, name: str, gradient: Tensor) -> bool:
+        own, version = self._looked.get(name, (None, 0))
+        if own is None or own.is_sparse != gradient.is_sparse:
+            return False
+        if own.is_sparse:
+            return values_of(gradient).data_ptr() == values_of(own).data_ptr()
+        return gradient is own and gradient._version == version  # noqa: SLF001
+
+    def _remember(self, gradients: Mapping[str, Tensor | None]) -> None:
+        """Notes gradients that were judged and are no part of a longer sum, which may overflow."""
+        self._looked = {
+            name: (gradient, gradient._version)  # noqa: SLF001
+            for name, gradient in gradients.items()
+            if gradient is not None
+        }
 
     def _judged(
         self, view: Mapping[str, Tensor | None]

@@ -69,7 +69,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     if setup.device.type == "cpu":
         # On a GPU each look would be waited for: what is not finite is found with the parameters.
-        _check_finite(state, rendered, gradients)
+        _check_finite(state, rendered, gradients, of_views)
     state.laps.lap("aggregation")
     counted = aggregated.counts
     # An edit needs the memory that gradients hold.
@@ -219,8 +219,12 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
             restart(state)
 
 
-def _check_finite(state: TrainState, rendered: Rendered, gradients: TensorGradients) -> None:
+def _check_finite(
+    state: TrainState, rendered: Rendered, gradients: TensorGradients, of_views: Gradients
+) -> None:
     for name, gradient in gradients.items():
-        if gradient is not None and not is_finite(gradient):
+        if gradient is None or of_views.is_judged(name, gradient):
+            continue
+        if not is_finite(gradient):
             views = tuple(record.view.name for record in rendered.records)
             raise NonFiniteError(state.step, views, f"the gradient of block {name}")

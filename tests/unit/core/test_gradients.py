@@ -10,6 +10,7 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.by_rows import by_rows
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
@@ -434,3 +435,42 @@ def test_sums_that_are_read_late_take_no_more_views_than_were_to_come():
     late.add(make_views(1)[0])
     with pytest.raises(RuntimeError, match="one view more than the 1"):
         late.add(make_views(1)[0])
+
+
+def summed(views):
+    gradients = SummedGradients.empty(BLOCKS, len(views))
+    for view in views:
+        gradients.add({name: tensor.clone() for name, tensor in view.items()})
+    return gradients
+
+
+def test_the_gradient_of_one_view_is_not_looked_at_twice_unless_it_was_written_to():
+    (view,) = make_views(1)
+    view["scales"][3, 1] = torch.inf
+    gradients = summed([view])
+    total = gradients.total(1)
+    assert total["scales"] is None
+    assert all(gradients.is_judged(n, total[n]) for n in SHAPES if n != "scales")
+    assert not gradients.is_judged("means", total["opacities"])
+    assert not gradients.is_judged("means", total["means"].clone())
+    assert not gradients.is_judged("scales", view["scales"])
+    total["means"].mul_(torch.inf)
+    assert not gradients.is_judged("means", total["means"])
+
+
+def test_sums_are_looked_at_again_for_they_may_overflow():
+    gradients = summed(make_views(2))
+    assert not any(gradients.is_judged(name, g) for name, g in gradients.total(2).items())
+    (view,) = make_views(1)
+    joint = SummedGradients(view, BLOCKS, 2)
+    assert joint.is_judged("means", joint.total(1)["means"])
+
+
+def test_rows_of_one_view_are_not_looked_at_twice():
+    (view,) = make_views(1)
+    rows, values = torch.tensor([3, 8]), torch.ones(2, 3)
+    gradients = summed([{**view, "means": by_rows(rows, values, (50, 3))}])
+    total = gradients.total(1)
+    assert gradients.is_judged("means", total["means"])
+    assert not gradients.is_judged("means", by_rows(rows, values.clone(), (50, 3)))
+    assert not gradients.is_judged("means", total["means"].to_dense())

@@ -43,6 +43,8 @@ NUMBERS = 7
 #: Rows that one task works on, and short rows that lie side by side for a step.
 _ROWS = 1024
 _GATHERED = 128
+#: Long rows that are taken together where they follow one another.
+_SIDE_BY_SIDE = 16
 #: Elements of a cache line, and rows that memory is asked for ahead of time.
 _LINE, _AHEAD = 16, 6
 #: Steps between two looks at whether a parameter still moves.
@@ -210,7 +212,7 @@ def update_rows(
 
     Args:
         jobs: From `share`.
-        rows: [R], each once.
+        rows: [R], sorted, each once: where they follow one another, memory is read in one go.
         width: Elements of a row.
         param: [N * width].
         grad: [R * width].
@@ -219,37 +221,45 @@ def update_rows(
         numbers: Of the step, as in `fused`.
     """
     # Loops stand here, not in a function: Numba counts references of arrays at each call.
-    room = 0 if width >= LANES else _GATHERED * width
+    wide = width >= LANES
+    room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
     ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     end = width - width % LANES
     task = take(jobs)
     while task * _ROWS < rows.size:
         last = min(rows.size, (task + 1) * _ROWS)
-        for k in range(task * _ROWS, last if width >= LANES else 0):
-            _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
-            at, source = np.intp(rows[k]) * width, k * width
-            # The last eight overlap with others: worked out before these are written.
-            tail, of_tail = at + width - LANES, source + width - LANES
-            p, m, v = load(param, tail), load(exp_avg, tail), load(exp_avg_sq, tail)
-            p_tail, m_tail, v_tail = _stepped(p, m, v, load(grad, of_tail), numbers)
-            for i in range(0, end, LANES):
-                p, m, v = load(param, at + i), load(exp_avg, at + i), load(exp_avg_sq, at + i)
-                p, m, v = _stepped(p, m, v, load(grad, source + i), numbers)
-                store(param, at + i, p)
-                store(exp_avg, at + i, m)
-                store(exp_avg_sq, at + i, v)
-            store(param, tail, p_tail)
-            store(exp_avg, tail, m_tail)
-            store(exp_avg_sq, tail, v_tail)
-        for first in range(task * _ROWS, last if width < LANES else 0, _GATHERED):
-            stop = min(first + _GATHERED, last)
+        for first in range(task * _ROWS, last, together):
+            stop = min(first + together, last)
+            source, size = first * width, (stop - first) * width
+            if rows[stop - 1] - rows[first] == stop - 1 - first:
+                a, b = np.intp(rows[first]) * width, (np.intp(rows[stop - 1]) + 1) * width
+                pulls = grad[source : source + size]
+                update(param[a:b], pulls, exp_avg[a:b], exp_avg_sq[a:b], numbers)
+                continue
+            for k in range(first, stop if wide else first):
+                _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
+                at, begin = np.intp(rows[k]) * width, k * width
+                # The last eight overlap with others: worked out before these are written.
+                tail, of_tail = at + width - LANES, begin + width - LANES
+                p, m, v = load(param, tail), load(exp_avg, tail), load(exp_avg_sq, tail)
+                p_tail, m_tail, v_tail = _stepped(p, m, v, load(grad, of_tail), numbers)
+                for i in range(0, end, LANES):
+                    p, m, v = load(param, at + i), load(exp_avg, at + i), load(exp_avg_sq, at + i)
+                    p, m, v = _stepped(p, m, v, load(grad, begin + i), numbers)
+                    store(param, at + i, p)
+                    store(exp_avg, at + i, m)
+                    store(exp_avg_sq, at + i, v)
+                store(param, tail, p_tail)
+                store(exp_avg, tail, m_tail)
+                store(exp_avg_sq, tail, v_tail)
+            if wide:
+                continue
             for k in range(first, stop):
                 at, to = np.intp(rows[k]) * width, (k - first) * width
                 for i in range(width):
                     ps[to + i], ms[to + i] = param[at + i], exp_avg[at + i]
                     vs[to + i] = exp_avg_sq[at + i]
-            size = (stop - first) * width
-            update(ps[:size], grad[first * width : stop * width], ms[:size], vs[:size], numbers)
+            update(ps[:size], grad[source : source + size], ms[:size], vs[:size], numbers)
             for k in range(first, stop):
                 at, to = np.intp(rows[k]) * width, (k - first) * width
                 for i in range(width):
