@@ -91,6 +91,36 @@ def _filter_row(
             part[x] = np.float32(part[x])
 
 
+@strict_device
+def _columns(
+    columns: int, channels: int, width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """[w C] what lies left and right of each number of a row, and the weight of what is left."""
+    left, right = np.empty(columns * channels, np.int64), np.empty(columns * channels, np.int64)
+    near = np.empty(columns * channels)
+    for column in range(columns):
+        across = (column + 0.5) * (width / columns) - 0.5
+        start = int(np.floor(across))
+        for channel in range(channels):
+            x = column * channels + channel
+            near[x] = 1.0 - (across - start)
+            left[x] = start * channels + channel
+            right[x] = min(start + 1, width - 1) * channels + channel
+    return left, right, near
+
+
+@strict_device
+def _times(row: NDArray[np.float64], weight: float, result: NDArray[np.float64]) -> None:
+    for x in range(row.size):
+        result[x] = row[x] * weight
+
+
+@strict_device
+def _rounded(values: NDArray[np.float64], row: NDArray[np.uint8]) -> None:
+    for x in range(values.size):
+        row[x] = np.uint8(min(max(np.rint(np.float32(values[x])), 0.0), 255.0))
+
+
 @strict_kernel
 def shrink(
     image: NDArray[np.uint8],
@@ -108,33 +138,31 @@ def shrink(
     """
     rows, columns, channels = small.shape
     height, width = image.shape[0], image.shape[1] // channels
-    tall, wide = height / rows, width / columns
+    tall = height / rows
     border = (along_rows.size - 1) * channels
     padded = np.empty(width * channels + 2 * border)
     line = padded[border : border + width * channels]
     filtered = np.empty((2, width * channels))
     held = np.full(2, -1)
+    left, right, near = _columns(columns, channels, width)
+    # Both rows times their weights, and what is between their pixels.
+    above, below = np.empty(width * channels), np.empty(width * channels)
+    values = np.empty(columns * channels)
     for row in range(rows):
         at = (row + 0.5) * tall - 0.5
         top = int(np.floor(at))
         upper = 1.0 - (at - top)
-        lower = 1.0 - upper
         for y in (top, min(top + 1, height - 1)):
             if held[y % 2] != y:
                 _filter_columns(image, y, along_columns, line)
                 _filter_row(padded, channels, along_rows, filtered[y % 2])
                 held[y % 2] = y
-        first, second = filtered[top % 2], filtered[min(top + 1, height - 1) % 2]
-        for column in range(columns):
-            across = (column + 0.5) * wide - 0.5
-            start = int(np.floor(across))
-            near = 1.0 - (across - start)
-            far = 1.0 - near
-            left, right = start * channels, min(start + 1, width - 1) * channels
-            for channel in range(channels):
-                value = first[left + channel] * upper * near
-                value += first[right + channel] * upper * far
-                value += second[left + channel] * lower * near
-                value += second[right + channel] * lower * far
-                rounded = np.rint(np.float32(value))
-                small[row, column, channel] = np.uint8(min(max(rounded, 0.0), 255.0))
+        _times(filtered[top % 2], upper, above)
+        _times(filtered[min(top + 1, height - 1) % 2], 1.0 - upper, below)
+        for x in range(values.size):
+            far = 1.0 - near[x]
+            value = above[left[x]] * near[x]
+            value += above[right[x]] * far
+            value += below[left[x]] * near[x]
+            values[x] = value + below[right[x]] * far
+        _rounded(values, small[row].reshape(-1))
