@@ -47,7 +47,7 @@ def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Par
         blocks: Of the backbone.
         name: The tensor that has the positions; without it the order stays as it is.
     """
-    if not _placed(blocks, name) or len(parameters[name]) < FEWEST:
+    if not _placed(blocks, parameters, name) or len(parameters[name]) < FEWEST:
         return parameters
     rows = along_curve(parameters[name])
     return apply_to_parameters(Edit(source=rows), blocks, parameters)
@@ -62,7 +62,7 @@ def ordered_edit(edit: Edit, parameters: Parameters, blocks: tuple[Block, ...], 
         blocks: Of the backbone.
         name: The tensor that has the positions; without it the edit stays as it is.
     """
-    placed = _placed(blocks, name)
+    placed = _placed(blocks, parameters, name)
     if edit.source is None or not placed or len(edit.source) < FEWEST:
         return edit
     rows = along_curve(apply_to_parameters(edit, placed, parameters)[name])
@@ -76,9 +76,11 @@ def ordered_edit(edit: Edit, parameters: Parameters, blocks: tuple[Block, ...], 
     )
 
 
-def _placed(blocks: tuple[Block, ...], name: str) -> tuple[Block, ...]:
+def _placed(blocks: tuple[Block, ...], parameters: Parameters, name: str) -> tuple[Block, ...]:
     """The block whose tensor says where each primitive is, if there is one."""
-    return tuple(block for block in blocks if block.per_primitive and name in block.tensors)
+    found = tuple(block for block in blocks if block.per_primitive and name in block.tensors)
+    # A tensor of this name may be something else in a backbone of another kind.
+    return found if found and parameters[name].shape[1:] == (3,) else ()
 
 
 def _moved(values: Rows, rows: Tensor, places: Tensor) -> Rows:

@@ -84,7 +84,7 @@ def test_an_edit_of_values_and_a_backbone_without_positions_stay_as_they_are():
     edit = Edit(values={"means": Rows(torch.zeros(5, 3))})
     assert ordered_edit(edit, parameters, BLOCKS, "means") is edit
     edit = Edit(source=torch.tensor([4, 0]))
-    for name in ("places", "shared"):
+    for name in ("places", "shared", "codes"):
         assert ordered_edit(edit, parameters, BLOCKS, name) is edit
         assert ordered(parameters, BLOCKS, name) is parameters
 
