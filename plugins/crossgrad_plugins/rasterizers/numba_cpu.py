@@ -179,16 +179,18 @@ class _Draw(torch.autograd.Function):
         rest = found.rest if found.rest is not None and found.rest.shape[1] else None
         arrays = (found.means, found.quats, found.scales, found.opacities, colors, found.dc, rest)
         named = zip(_INPUTS, arrays, strict=True)
-        return None, *(_gradient(frame, name, array) for name, array in named)
+        rows = call.screen.rows
+        return None, *(_gradient(frame.gaussians, rows, name, array) for name, array in named)
 
 
-def _gradient(frame: Frame, name: str, array: NDArray[np.float32] | None) -> Tensor | None:
+def _gradient(
+    gaussians: GaussianArrays, rows: Tensor | None, name: str, array: NDArray[np.float32] | None
+) -> Tensor | None:
     """The gradient of one input; by rows, sparse, where it was asked for."""
     if array is None:
         return None
-    values, rows = torch.from_numpy(array), frame.projected.rows
-    if rows is None or name not in frame.gaussians.by_rows:
+    values = torch.from_numpy(array)
+    if rows is None or name not in gaussians.by_rows:
         return values
-    shape = (len(frame.gaussians.means), *values.shape[1:])
-    indices = torch.from_numpy(rows).long()[None]
-    return torch.sparse_coo_tensor(indices, values, shape, check_invariants=False)
+    shape = (len(gaussians.means), *values.shape[1:])
+    return torch.sparse_coo_tensor(rows[None], values, shape, check_invariants=False)
