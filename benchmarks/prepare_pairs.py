@@ -136,6 +136,9 @@ def mapped(photos: Path, source: Path, wrong: list[Pair], truth: Poses) -> Itera
             out = Path(folder) / str(points)
             out.mkdir()
             models = pycolmap.incremental_mapping(path, photos, out, options=options)
+            if not models:
+                yield f"with the right pairs alone and {points} points for a pose: nothing"
+                continue
             largest = max(models.values(), key=lambda model: model.num_reg_images())
             largest.write(out)
             errors, _ = errors_of(poses_of([out]), truth)

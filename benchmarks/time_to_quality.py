@@ -5,12 +5,14 @@ r"""The end of runs of so many seconds, by the code of several commits, in turns
         --seconds 5 10 20 30:10 70:23.3 140:46.7 --seeds 1 2 3 4 5 6
     python benchmarks/time_to_quality.py table OUT
 
-`30:10` gives the first code 30 and the second one 10 seconds. Runs have 400 px, one thread and one
-core (Linux), and those of a pair follow one another there; finished ones are not repeated. Figures
-are of the exported PLY on black: drawn by `crossgrad eval --ply` and by `viewer.py`.
+`30:10` gives the first code 30 and the second one 10 seconds. Files of both are drawn on the views
+that the last code held out, which the first one has to hold out, too. Runs have 400 px, one thread
+and one core (Linux), and those of a pair follow one another there; finished ones are not repeated.
+Figures are of the exported PLY on black: drawn by `crossgrad eval --ply` and by `viewer.py`.
 """
 
 import argparse
+import csv
 import json
 import os
 import shlex
@@ -73,15 +75,26 @@ def run(given: argparse.Namespace) -> None:
             for code in codes
         }
         for code, seconds in pairs if seed % 2 else reversed(pairs):
-            if not (folders[code] / "summary.json").exists():
+            if not _finished(folders[code]):
                 shutil.rmtree(folders[code], ignore_errors=True)
                 code.train(scene, folders[code], "--seconds", seconds, "--seed", str(seed))
+        judge = folders[codes[-1]]
         for code, folder in folders.items():
             if not (folder / "row.json").exists():
                 row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
-                # On the views that the last code held out: rules of splits are not those of then.
-                found = _figures(folder, folders[codes[-1]])
-                (folder / "row.json").write_text(json.dumps(row | found))
+                (folder / "row.json").write_text(json.dumps(row | _figures(folder, judge)))
+
+
+def _finished(folder: Path) -> bool:
+    """Whether a run has come to its end, and not to another one."""
+    path = folder / "summary.json"
+    return path.exists() and json.loads(path.read_text())["status"] == "finished"
+
+
+def _held_out(folder: Path) -> set[str]:
+    """Names of the views that a run was evaluated on."""
+    with (folder / "per_view.csv").open(newline="") as file:
+        return {row["name"] for row in csv.DictReader(file)}
 
 
 def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
@@ -93,6 +106,10 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
 
 def _figures(folder: Path, judge: Path) -> Row:
     """What a run came to, its file drawn on the held-out views of another run."""
+    if _held_out(folder) != _held_out(judge):
+        raise SystemExit(
+            f"{folder} and {judge} do not hold out the same views: give both a --split"
+        )
     summary = json.loads((folder / "summary.json").read_text())
     ply = folder / "point_cloud.ply"
     command = [sys.executable, "-m", "crossgrad_core", "eval", str(judge), "--ply", str(ply)]

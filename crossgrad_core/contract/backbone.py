@@ -31,7 +31,9 @@ class Backbone(Component):
             at all) and does not read: only the rows that are drawn need to be up to date. It
             holds for the very class that says so, not for those that inherit from it.
         positions: Tensor [N, 3] of the primitives' positions in the local frame, by which they are
-            ordered in memory; where there is none of this name, they stay in any order.
+            put in order in memory, before the first step and after steps that edit: all rows of all
+            per-primitive tensors together, and without a call of `prepare`. Where it is empty,
+            only edits move rows.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -40,7 +42,7 @@ class Backbone(Component):
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = False
     passed_on: ClassVar[Mapping[str, str]] = {}
-    positions: ClassVar[str] = "means"
+    positions: ClassVar[str] = ""
 
     @classmethod
     @override

@@ -10,7 +10,6 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.gradients.by_rows import values_of
 from crossgrad_core.gradients.finite import finite_and_present
 from crossgrad_core.gradients.plain import plain_sums
 
@@ -44,7 +43,7 @@ class SummedGradients(Gradients):
             finite, present = self._judged(self._sum)
             self._finite, self._present = [finite] * views, [present] * views
             self._forget(finite)
-            self._remember(self._sum)
+            self._remember()
 
     @classmethod
     def empty(cls, blocks: Sequence[Block], views: int) -> Self:
@@ -70,8 +69,6 @@ class SummedGradients(Gradients):
                 gradient = _contiguous(view.get(name))
                 if gradient is not None:
                     self._last[name] = gradient
-        if self._expected == 1:
-            self._remember(self._last)
         if self._views < self._expected:
             self._fold(1)
 
@@ -89,7 +86,10 @@ class SummedGradients(Gradients):
         """
         if self._divisor in {0, divisor}:
             if not self._divisor:
+                alone = self._views == 1
                 self._fold(divisor)
+                if alone:
+                    self._remember()
             self._divisor = divisor
             return self._sum
         if self._divisor != 1:
@@ -108,17 +108,13 @@ class SummedGradients(Gradients):
     @override
     def is_judged(self, name: str, gradient: Tensor) -> bool:
         own, version = self._looked.get(name, (None, 0))
-        if own is None or own.is_sparse != gradient.is_sparse:
-            return False
-        if own.is_sparse:
-            return values_of(gradient).data_ptr() == values_of(own).data_ptr()
         return gradient is own and gradient._version == version  # noqa: SLF001
 
-    def _remember(self, gradients: Mapping[str, Tensor | None]) -> None:
-        """Notes gradients that were judged and are no part of a longer sum, which may overflow."""
+    def _remember(self) -> None:
+        """Notes the sum where it was judged as it is; one of several views may overflow."""
         self._looked = {
             name: (gradient, gradient._version)  # noqa: SLF001
-            for name, gradient in gradients.items()
+            for name, gradient in self._sum.items()
             if gradient is not None
         }
 

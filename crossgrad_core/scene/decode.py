@@ -142,8 +142,8 @@ def _colours(image: "Image") -> Pixels:
     rows = max(1, _BAND // pixels[0].size)
     for top in range(0, image.height, rows):
         band = pixels[top : top + rows]
-        part = image.crop((0, top, image.width, top + len(band)))
-        band[:] = np.frombuffer(part.tobytes(), np.uint8).reshape(band.shape)
+        values = pillow.rows_of(image, top, top + len(band))
+        band[:] = np.frombuffer(values, np.uint8).reshape(band.shape)
     return pixels
 
 

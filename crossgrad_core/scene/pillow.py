@@ -79,6 +79,14 @@ class _Bounded(BufferedReader):
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
+def rows_of(image: "Image", top: int, end: int) -> bytes:
+    """The pixels of some rows of a photo that has been opened; decodes it if nobody has yet."""
+    image.load()
+    with _LOCK:  # Pillow looks at its bound here, too.
+        part = image.crop((0, top, image.width, end))
+    return part.tobytes()
+
+
 def _check_pixels(image: "Image", path: Path) -> None:
     if 0 in image.size:
         raise UserError("the photo has no pixels", where=path, todo="replace or remove it")

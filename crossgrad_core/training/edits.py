@@ -9,7 +9,7 @@ from crossgrad_core.contract.topology import (
     apply_to_parameters,
     gather_indices,
 )
-from crossgrad_core.training.order import ordered_edit
+from crossgrad_core.training.order import in_order
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -22,9 +22,24 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     """
     if edit.is_empty:
         return False
+    _apply(setup, state, edit)
+    if edit.source is None:
+        return False
+    phase = setup.phase(state.step, training=True)
+    state.tensors = setup.backbone.prepare(state.tensors, setup.scene, phase)
+    return True
+
+
+def put_in_order(setup: Setup, state: TrainState) -> None:
+    """Puts the primitives in the order in which they are kept, when a step has edited them."""
+    rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
+    if rows is not None:
+        _apply(setup, state, Edit(source=rows))
+
+
+def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
     before = state.primitives(setup)
     state.settle(edit.values if edit.source is None else None)
-    edit = ordered_edit(edit, state.tensors, setup.blocks, setup.backbone.positions)
     for block in setup.blocks:
         if block.per_primitive:
             for name in block.tensors:
@@ -33,14 +48,11 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
                         moments[name] = apply_to_moment(edit, name, moments[name])
     state.tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
     if edit.source is None:
-        return False
+        return
     source, fresh = gather_indices(edit, before, edit.source.device)
     state.states = {
         name: _gathered(name, old, source, fresh, before) for name, old in state.states.items()
     }
-    phase = setup.phase(state.step, training=True)
-    state.tensors = setup.backbone.prepare(state.tensors, setup.scene, phase)
-    return True
 
 
 def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: int) -> PluginState:

@@ -5,13 +5,11 @@ line of the processor's cache is used whole: a step costs less the more primitiv
 Few primitives lie in the cache anyway and stay in the order that they come in.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, Parameters
-from crossgrad_core.contract.topology import Edit, Rows, apply_to_parameters
+from crossgrad_core.contract.topology import Edit, apply_to_parameters
 
 #: Primitives from which on they are put in order: of 59 parameters each and their moments, 12 MB.
 FEWEST = 2**14
@@ -39,51 +37,22 @@ def along_curve(positions: Tensor) -> Tensor:
     return torch.argsort(codes[:, 0] | (codes[:, 1] << 1) | (codes[:, 2] << 2), stable=True)
 
 
-def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Parameters:
-    """The parameters with their primitives along the curve, if there are many of them.
+def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Tensor | None:
+    """[N] int64, the rows of the primitives along the curve; None where they stay as they are.
 
     Args:
         parameters: In any order.
         blocks: Of the backbone.
         name: The tensor that has the positions; without it the order stays as it is.
     """
-    if not _placed(blocks, parameters, name) or len(parameters[name]) < FEWEST:
-        return parameters
-    rows = along_curve(parameters[name])
-    return apply_to_parameters(Edit(source=rows), blocks, parameters)
+    if not any(block.per_primitive and name in block.tensors for block in blocks):
+        return None
+    return along_curve(parameters[name]) if len(parameters[name]) >= FEWEST else None
 
 
-def ordered_edit(edit: Edit, parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Edit:
-    """The same edit with the new primitives along the curve, if there are many of them.
-
-    Args:
-        edit: One that changes the set of primitives.
-        parameters: Those before the edit.
-        blocks: Of the backbone.
-        name: The tensor that has the positions; without it the edit stays as it is.
-    """
-    placed = _placed(blocks, parameters, name)
-    if edit.source is None or not placed or len(edit.source) < FEWEST:
-        return edit
-    rows = along_curve(apply_to_parameters(edit, placed, parameters)[name])
-    places = torch.empty_like(rows)
-    places[rows] = torch.arange(len(rows), device=rows.device)
-    return replace(
-        edit,
-        source=edit.source[rows],
-        fresh=None if edit.fresh is None else edit.fresh[rows],
-        values={name: _moved(each, rows, places) for name, each in edit.values.items()},
+def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Parameters:
+    """The parameters with their primitives in that order."""
+    rows = in_order(parameters, blocks, name)
+    return (
+        parameters if rows is None else apply_to_parameters(Edit(source=rows), blocks, parameters)
     )
-
-
-def _placed(blocks: tuple[Block, ...], parameters: Parameters, name: str) -> tuple[Block, ...]:
-    """The block whose tensor says where each primitive is, if there is one."""
-    found = tuple(block for block in blocks if block.per_primitive and name in block.tensors)
-    # A tensor of this name may be something else in a backbone of another kind.
-    return found if found and parameters[name].shape[1:] == (3,) else ()
-
-
-def _moved(values: Rows, rows: Tensor, places: Tensor) -> Rows:
-    if values.rows is None:
-        return replace(values, values=values.values[rows])
-    return replace(values, rows=places[values.rows])

@@ -25,7 +25,7 @@ from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.density_views import observed_views
-from crossgrad_core.training.edits import apply_edit
+from crossgrad_core.training.edits import apply_edit, put_in_order
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.operator_scale import Scale
@@ -160,7 +160,9 @@ def _finish(
             left = {name: g for name, g in gradients.items() if name not in gone}
             _optimize(setup, state, rendered, left, scale)
     if setup.acts_after_step:
-        _after_step(setup, state, edited=edited)
+        edited |= _after_step(setup, state, edited=edited)
+    if edited:
+        put_in_order(setup, state)
     return edit.counts
 
 
@@ -204,7 +206,9 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
     return answer.edit, edited
 
 
-def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
+def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
+    """Whether the set of primitives changed."""
+    changed = False
     context = AfterStepContext(
         **context_fields(setup, state, "after_step"),
         parameters=state.current,
@@ -217,6 +221,8 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> None:
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):
             restart(state)
+            changed = True
+    return changed
 
 
 def _check_finite(

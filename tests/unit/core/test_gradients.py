@@ -10,7 +10,7 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.by_rows import by_rows
+from crossgrad_core.gradients.by_rows import by_rows, values_of
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
@@ -474,3 +474,5 @@ def test_rows_of_one_view_are_not_looked_at_twice():
     assert gradients.is_judged("means", total["means"])
     assert not gradients.is_judged("means", by_rows(rows, values.clone(), (50, 3)))
     assert not gradients.is_judged("means", total["means"].to_dense())
+    values_of(total["means"]).mul_(torch.inf)
+    assert not gradients.is_judged("means", total["means"])

@@ -10,7 +10,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import pillow
+from crossgrad_core.scene import decode, pillow
 from crossgrad_core.scene.decode import decode_photo, resize
 from crossgrad_core.scene.headers import PhotoHeader, read_header
 from crossgrad_core.scene.reduction import choose_reduction
@@ -153,3 +153,16 @@ def test_a_bomb_is_refused_before_memory_is_set_aside(tmp_path):
     with pytest.raises(UserError, match="too large"):
         decode_photo(path)
     assert peak_mebibytes() - before < 20
+
+
+@pytest.mark.parametrize("height", [1, 6, 7, 8, 50])
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "CMYK"])
+def test_pixels_are_taken_over_band_by_band(height, mode, tmp_path, monkeypatch):
+    monkeypatch.setattr(decode, "_BAND", 7 * 3 * 23 + 5)  # Seven rows and a bit.
+    noise = np.random.default_rng(height).integers(0, 256, (height, 23, 3), np.uint8)
+    path = tmp_path / f"photo.{'tiff' if mode == 'CMYK' else 'png'}"
+    Image.fromarray(noise).convert(mode).save(path)
+    with Image.open(path) as image:
+        wanted = np.asarray(image.convert("RGB"))
+    rgb, alpha = decode_photo(path)
+    assert alpha is None and np.array_equal(rgb, wanted)

@@ -5,12 +5,14 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.topology import Edit, Rows, apply_to_parameters
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import Edit
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import order
-from crossgrad_core.training.edits import apply_edit
-from crossgrad_core.training.order import along_curve, ordered, ordered_edit
+from crossgrad_core.training.edits import apply_edit, put_in_order
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.order import along_curve, in_order, ordered
 from crossgrad_core.training.start import first_state
 
 BLOCKS = (
@@ -43,10 +45,13 @@ def test_it_is_mortons_order_bit_by_bit():
     assert rows.tolist() == sorted(range(552), key=lambda i: (code(positions[i].tolist()), i))
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e38])
-def test_positions_without_a_cell_are_put_somewhere(bad):
-    positions = torch.tensor([[0.0, 0.0, 0.0], [bad, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    assert along_curve(positions).sort().values.tolist() == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("far", "place"), [(torch.nan, 0), (-torch.inf, 0), (torch.inf, 2), (1e38, 2)]
+)
+def test_positions_without_a_cell_are_put_at_an_end(far, place):
+    """Where x is not a number or left of all cells it counts as the first cell, else the last."""
+    positions = torch.tensor([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    assert along_curve(positions).tolist().index(1) == place
 
 
 def test_neighbours_come_to_lie_side_by_side():
@@ -56,57 +61,62 @@ def test_neighbours_come_to_lie_side_by_side():
     assert (means[1:] - means[:-1]).norm(dim=1).median() < 0.2 * apart
 
 
-def test_an_edit_means_the_same_in_another_order():
-    parameters = ordered(random_parameters(50), BLOCKS, "means")
-    assert parameters["shared"].shape == (2,)
-    moved, codes = torch.randn(4, 3) * 3, torch.arange(100.0, 160.0)
-    edit = Edit(
-        source=torch.cat([torch.arange(50), torch.arange(10)]),
-        fresh=torch.arange(60) >= 50,
-        values={
-            "means": Rows(moved, torch.tensor([3, 9, 55, 59]), keep_moments=True),
-            "codes": Rows(codes),
-        },
-        counts={"cloned": 10},
-    )
-    other = ordered_edit(edit, parameters, BLOCKS, "means")
-    plain = apply_to_parameters(edit, BLOCKS, parameters)
-    found = apply_to_parameters(other, BLOCKS, parameters)
-    rows = along_curve(plain["means"])
-    assert torch.equal(found["means"], plain["means"][rows])
-    assert torch.equal(found["codes"], plain["codes"][rows])
-    assert torch.equal(other.fresh, edit.fresh[rows]) and other.counts == edit.counts
-    assert other.values["means"].keep_moments and not torch.equal(rows, torch.arange(60))
+def test_all_rows_move_together_and_what_is_shared_stays():
+    parameters = random_parameters(50)
+    found = ordered(parameters, BLOCKS, "means")
+    rows = found["codes"].long()
+    assert torch.equal(rows, along_curve(parameters["means"]))
+    assert torch.equal(found["means"], parameters["means"][rows])
+    assert found["shared"] is parameters["shared"]
 
 
-def test_an_edit_of_values_and_a_backbone_without_positions_stay_as_they_are():
+@pytest.mark.parametrize("name", ["", "places", "shared"])
+def test_without_a_tensor_of_positions_nothing_moves(name):
     parameters = random_parameters(5)
-    edit = Edit(values={"means": Rows(torch.zeros(5, 3))})
-    assert ordered_edit(edit, parameters, BLOCKS, "means") is edit
-    edit = Edit(source=torch.tensor([4, 0]))
-    for name in ("places", "shared", "codes"):
-        assert ordered_edit(edit, parameters, BLOCKS, name) is edit
-        assert ordered(parameters, BLOCKS, name) is parameters
+    assert in_order(parameters, BLOCKS, name) is None
+    assert ordered(parameters, BLOCKS, name) is parameters
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "mip", "scaffold", "octree"])
-def test_a_run_keeps_the_order(backbone):
+def test_steps_that_edit_leave_all_in_order_and_together(backbone, monkeypatch):
+    """An edit that turns all around: moments and a plugin's rows stay with their primitives."""
     config = RunConfig.model_validate({"steps": 10, "backbone": {"name": backbone}})
     setup = assemble(config, sample_scene(), "none")
     state = first_state(setup)
     name = setup.backbone.positions
-    for source in (None, torch.tensor([7, 1, 30, 3, 12, 0])):
-        if source is not None:
-            assert apply_edit(setup, state, Edit(source=source))
-        positions = state.parameters[name]
-        assert torch.equal(along_curve(positions), torch.arange(len(positions)))
+    count = len(state.parameters[name])
+    assert torch.equal(along_curve(state.parameters[name]), torch.arange(count))
+    marks = torch.arange(float(count))
+    state.states["mine"] = PluginState(per_primitive={"marks": marks})
+    for moments in (state.moments.exp_avg, state.moments.exp_avg_sq):
+        moments[name] = marks[:, None].repeat(1, 3)
+    before = state.parameters[name].detach().clone()
+    assert apply_edit(setup, state, Edit(source=torch.arange(count - 1, -1, -1)))
+    assert torch.equal(state.parameters[name], before.flip(0))
+    put_in_order(setup, state)
+    assert torch.equal(state.parameters[name], before)
+    found = state.states["mine"].per_primitive["marks"]
+    assert torch.equal(before[found.long()], before)
+    assert torch.equal(state.moments.exp_avg[name][:, 0], found)
+    assert torch.equal(state.moments.exp_avg_sq[name][:, 2], found)
+
+
+def test_a_run_is_in_order_after_each_of_its_edits():
+    given = {"steps": 60, "densify_from": 5, "densify_every": 5, "densify_until": 50}
+    setup = assemble(RunConfig.model_validate({**given, "events": "steps"}), sample_scene(), "none")
+    state = first_state(setup)
+    last, edits = len(state.parameters["means"]), 0
+    for _ in range(60):
+        timed_step(setup, state)
+        means = state.parameters["means"]
+        if len(means) != last:
+            assert torch.equal(along_curve(means), torch.arange(len(means)))
+            last, edits = len(means), edits + 1
+    assert edits > 2
 
 
 def test_few_stay_in_their_order(monkeypatch):
     monkeypatch.setattr(order, "FEWEST", 51)
     parameters = random_parameters(50)
-    assert ordered(parameters, BLOCKS, "means") is parameters
-    edit = Edit(source=torch.arange(50))
-    assert ordered_edit(edit, parameters, BLOCKS, "means") is edit
-    edit = Edit(source=torch.arange(51) % 50)
-    assert ordered_edit(edit, parameters, BLOCKS, "means") is not edit
+    assert in_order(parameters, BLOCKS, "means") is None
+    assert in_order(random_parameters(51), BLOCKS, "means") is not None
