@@ -68,21 +68,22 @@ def run(given: argparse.Namespace) -> None:
         if not warm.exists():
             code.train(given.scene[0], warm, "--steps", "700")
     for seed, scene, lengths in _cases(given):
-        each = lengths.split(":")
-        pairs = [(code, each[n % len(each)]) for n, code in enumerate(codes)]
         folders = {
             code: given.out / f"{scene.name}-{lengths.replace(':', '_')}-{code.name}-{seed}"
             for code in codes
         }
+        if all((folder / "row.json").exists() for folder in folders.values()):
+            continue
+        each = lengths.split(":")
+        pairs = [(code, each[n % len(each)]) for n, code in enumerate(codes)]
         for code, seconds in pairs if seed % 2 else reversed(pairs):
             if not _finished(folders[code]):
                 shutil.rmtree(folders[code], ignore_errors=True)
                 code.train(scene, folders[code], "--seconds", seconds, "--seed", str(seed))
-        judge = folders[codes[-1]]
         for code, folder in folders.items():
-            if not (folder / "row.json").exists():
-                row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
-                (folder / "row.json").write_text(json.dumps(row | _figures(folder, judge)))
+            row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
+            row |= _figures(folder, folders[codes[-1]])
+            (folder / "row.json").write_text(json.dumps(row))
 
 
 def _finished(folder: Path) -> bool:
