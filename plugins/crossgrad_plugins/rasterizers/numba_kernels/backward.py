@@ -38,6 +38,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
+    FIXED,
     LARGEST_ALPHA,
     LEAST,
     OFFSETS,
@@ -61,6 +62,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
+    LOG_OPACITY,
     PAIR,
     PARTIAL,
     PEAK,
@@ -84,12 +86,53 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     V_GREEN,
     V_RED,
     blend,
+    odds_of,
     start_tile,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned
 
+#: Numbers of the response in a segment: alpha, and its odds.
+RESPONSE = 2 * LANES
+
 #: Entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
+
+
+@device
+def _respond(
+    reached: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    base: int,
+    constants: NDArray[np.float32],
+    capped: NDArray[np.float32] | None,
+    responses: NDArray[np.float32],
+) -> None:
+    """Writes the plain response in the reached segments, one after the other: alpha, its odds.
+
+    A loop of its own: nothing in it waits for the transmittance, which a segment gets from the
+    Gaussian before, so that the processor works on several segments at once.
+    """
+    decay = broadcast(records, record + DECAY)
+    terms = terms_of(constants)
+    zero = splat(np.float32(0.0))
+    at = 0
+    while reached != np.uint64(0):
+        segment = lowest_bit(reached)
+        reached &= reached - np.uint64(1)
+        row = base + (segment & (TILE_HEIGHT - 1))
+        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+        dx = offsets - broadcast(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
+        touched = power >= load(constants, TOUCHED)
+        alpha = where(touched, smaller(exp2(power, terms), load(constants, LARGEST_ALPHA)), zero)
+        odds = odds_of(alpha, constants)
+        if capped is not None:
+            odds = where(power <= load(constants, CAPPED), odds, load(constants, FIXED))
+        store(responses, at, alpha)
+        store(responses, at + LANES, odds)
+        at += RESPONSE
 
 
 @device
@@ -104,10 +147,15 @@ def _gather(
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
+    capped: NDArray[np.float32] | None,
+    responses: NDArray[np.float32],
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sums the gradients of one Gaussian over the reached segments into partials[partial:]."""
+    """Sums the gradients of one Gaussian over the reached segments into partials[partial:].
+
+    `capped` is None for Gaussians whose alpha reaches the largest one nowhere.
+    """
     decay = broadcast(records, record + DECAY)
     red = broadcast(records, record + RED)
     green = broadcast(records, record + GREEN)
@@ -123,6 +171,9 @@ def _gather(
     zero = splat(np.float32(0.0))
     sum_1 = sum_a = sum_b = sum_c = sum_d = sum_e = zero
     sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
+    if analytic is None:
+        _respond(reached, records, record, rows, base, constants, capped, responses)
+    response = 0
     while reached != np.uint64(0):
         segment = lowest_bit(reached)
         reached &= reached - np.uint64(1)
@@ -131,10 +182,8 @@ def _gather(
         offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
             dx = offsets - broadcast(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-            touched = power >= load(constants, TOUCHED)
-            free = power <= load(constants, CAPPED)
-            alpha = exp2(power, terms_of(constants))
+            alpha, odds = load(responses, response), load(responses, response + LANES)
+            response += RESPONSE
         else:
             u, v = axis_offsets(cosine, sine, offsets, rows, row)
             alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
@@ -142,7 +191,8 @@ def _gather(
             )
             touched = alpha >= load(constants, LEAST)
             free = touched & (alpha <= load(constants, LARGEST_ALPHA))
-        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
+            alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
+            odds = where(free, odds_of(alpha, constants), load(constants, FIXED))
         v_red = load(state, at + V_RED)
         v_green = load(state, at + V_GREEN)
         v_blue = load(state, at + V_BLUE)
@@ -150,7 +200,7 @@ def _gather(
         if v_depth is not None:
             v_z = load(state, DEPTHS + segment * LANES)
             toned = fma(v_z, z, toned)
-        weight, s = blend(alpha, free, toned, state, at, constants)
+        weight, s = blend(alpha, odds, capped, toned, state, at, constants)
         sum_red = fma(weight, v_red, sum_red)
         sum_green = fma(weight, v_green, sum_green)
         sum_blue = fma(weight, v_blue, sum_blue)
@@ -215,6 +265,7 @@ def _backward(
     left = (tile % columns) * TILE_WIDTH
     state = aligned(DEPTHS + SEGMENTS * LANES)
     rows = aligned(BATCH * ROWS)
+    responses = aligned(SEGMENTS * RESPONSE)
     batch = np.empty(BATCH, np.int64)
     start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
     entry, stop = starts[tile], starts[tile + 1]
@@ -237,20 +288,18 @@ def _backward(
             at = batch[k]
             slot = np.intp(entries[at, 1])
             written[slot] = 1
-            _gather(
-                np.uint64(masks[at]),
-                records,
-                np.intp(entries[at, 0]) * RECORD,
-                rows,
-                k * ROWS,
-                state,
-                constants,
-                v_depth,
-                absolute,
-                analytic,
-                partials,
-                slot * PARTIAL,
-            )
+            record = np.intp(entries[at, 0]) * RECORD
+            # Two loops: that of the many Gaussians that no pixel caps has less to do.
+            if analytic is None and records[record + LOG_OPACITY] <= constants[CAPPED]:
+                _gather(
+                    np.uint64(masks[at]), records, record, rows, k * ROWS, state, constants,
+                    v_depth, absolute, analytic, None, responses, partials, slot * PARTIAL,
+                )  # fmt: skip
+            else:
+                _gather(
+                    np.uint64(masks[at]), records, record, rows, k * ROWS, state, constants,
+                    v_depth, absolute, analytic, constants, responses, partials, slot * PARTIAL,
+                )  # fmt: skip
 
 
 @kernel

@@ -39,6 +39,7 @@ TOUCHED = 8 * WIDE
 STOPPED = 9 * WIDE
 ONE = 10 * WIDE
 FINISHED = 11 * WIDE
+FIXED = FINISHED  # the odds of an alpha that no parameter changes
 CAPPED = 12 * WIDE
 LEAST = 13 * WIDE
 OFFSETS = 14 * WIDE  # pixel offsets of each column of segments, for both segments of a pair

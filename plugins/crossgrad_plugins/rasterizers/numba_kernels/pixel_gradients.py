@@ -24,6 +24,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     CAPPED,
+    FIXED,
     LARGEST_ALPHA,
     LEAST,
     OFFSETS,
@@ -60,6 +61,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     V_GREEN,
     V_RED,
     blend,
+    odds_of,
 )
 
 
@@ -119,7 +121,8 @@ def mean_gradients(
         free = touched & (alpha <= load(constants, LARGEST_ALPHA))
     alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
     toned = _toned(segment, records, record, state, v_depth)
-    _, s = blend(alpha, free, toned, state, segment * STATE, constants)
+    odds = where(free, odds_of(alpha, constants), load(constants, FIXED))
+    _, s = blend(alpha, odds, constants, toned, state, segment * STATE, constants)
     if analytic is None:
         sd = s * dx
         lean = decay * broadcast(records, record + SLOPE)

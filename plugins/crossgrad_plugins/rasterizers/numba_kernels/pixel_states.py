@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
-    Mask,
     fnma,
     load,
     load_triples,
@@ -106,9 +105,16 @@ def start_tile(
 
 
 @device
+def odds_of(alpha: Lanes, constants: NDArray[np.float32]) -> Lanes:
+    """Returns alpha / (1 - alpha)."""
+    return alpha / (load(constants, ONE) - alpha)
+
+
+@device
 def blend(
     alpha: Lanes,
-    free: Mask,
+    odds: Lanes,
+    capped: NDArray[np.float32] | None,
     toned: Lanes,
     state: NDArray[np.float32],
     at: int,
@@ -118,7 +124,9 @@ def blend(
 
     Args:
         alpha: The Gaussian's opacity in the pixels, at most the largest; 0 where it is not drawn.
-        free: Where alpha depends on the parameters: neither capped nor too small.
+        odds: alpha / (1 - alpha); negative where alpha does not depend on the parameters, since it
+            is capped.
+        capped: None says that no odds are negative.
         toned: The gradients of the pixels times the colour of the Gaussian.
         state: State of the tile.
         at: Where that of the segment begins.
@@ -138,5 +146,7 @@ def blend(
     own = weight * toned
     rest = load(state, at + REST) - own
     store(state, at + REST, rest)
-    s = fnma(rest, alpha / (load(constants, ONE) - alpha), own)
-    return weight, where(blended & free, s, zero)
+    s = fnma(rest, odds, own)
+    if capped is not None:
+        blended = blended & (odds >= zero)
+    return weight, where(blended, s, zero)
