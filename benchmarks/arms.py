@@ -15,7 +15,7 @@ from statistics import fmean, stdev
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.checks.scenes import check_scenes
-from crossgrad_plugins.compare.contrasts import Contrast, contrast
+from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.source import read_runs
@@ -81,6 +81,24 @@ def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
                 yield f"| {scene} | {arm.removesuffix(', best')} | {cells} |"
 
 
+def against(runs: Runs, baseline: str) -> Iterator[str]:
+    """The table of differences from an arm, overall and by regime, with their verdicts."""
+    yield from head("arm", *(f"{each}, less {baseline}" for each in REGIMES))
+    others = [arm for arm in runs.by_arm if arm != baseline]
+    table = [runs.difference(arm, baseline, regime) for arm in others for regime in REGIMES]
+    found = {(each.first, each.where): each for each in judged(table)}
+    for arm in others:
+        cells = [_difference(found.get((arm, regime))) for regime in REGIMES]
+        yield f"| {arm} | {' | '.join(cells)} |"
+
+
+def _difference(found: Contrast | None) -> str:
+    if found is None or found.estimate is None:
+        return ""
+    center, (low, high) = found.estimate.center, found.estimate.wide
+    return f"{center:+.2f} [{low:+.2f}, {high:+.2f}], {found.verdict} ({len(found.pairs)})"
+
+
 def head(*titles: str) -> Iterator[str]:
     """The lines above the rows of a table."""
     yield f"| {' | '.join(titles)} |"
@@ -128,8 +146,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweeps", type=Path, nargs="+")
     parser.add_argument("--figures", nargs="+", default=["psnr", "ssim"], metavar="METRIC")
+    parser.add_argument("--baseline", metavar="ARM", help="differences from this arm, by regime")
     given = parser.parse_args()
-    print("\n".join(arms(read(given.sweeps), given.figures)))
+    runs = read(given.sweeps)
+    if given.baseline is not None and given.baseline not in runs.by_arm:
+        parser.error(f"no arm {given.baseline}; there are {', '.join(runs.by_arm)}")
+    print("\n".join(arms(runs, given.figures)))
+    if given.baseline is not None:
+        print()
+        print("\n".join(against(runs, given.baseline)))
 
 
 def read(places: Sequence[Path]) -> Runs:
