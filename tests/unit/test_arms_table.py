@@ -17,7 +17,8 @@ def printed(monkeypatch, capsys):
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["arms.py", *map(str, arguments)])
         runpy.run_path(str(BENCHMARKS / "arms.py"), run_name="__main__")
-        head, rule, *rows = capsys.readouterr().out.splitlines()
+        # Of several tables the last one.
+        head, rule, *rows = capsys.readouterr().out.rpartition("\n\n")[2].splitlines()
         assert set(rule) == {"|", "-"}
         titles = [cell.strip() for cell in head.strip("|").split("|")]
         cells = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
@@ -62,3 +63,22 @@ def test_a_folder_without_runs_is_one_message(tmp_path, printed, capsys):
         printed(tmp_path)
     assert ended.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_differences_from_a_baseline_by_regime(tmp_path, printed):
+    for seed in (0, 1, 2):
+        RunFolder(seed=seed, final=20.0).write(tmp_path / f"long{seed}")
+        settings = {"steps": 300}
+        RunFolder(seed=seed, settings=settings, final=20.5).write(tmp_path / f"short{seed}")
+    (row,) = printed(tmp_path, "--baseline", "600 steps")
+    assert row["arm"] == "300 steps"
+    for regime in ("overall", "far", "near"):
+        assert row[f"{regime}, less 600 steps"].startswith("+0.50 [+0.50, +0.50], ")
+
+
+def test_a_baseline_that_is_no_arm_is_refused(tmp_path, printed, capsys):
+    RunFolder().write(tmp_path / "run")
+    with pytest.raises(SystemExit) as ended:
+        printed(tmp_path, "--baseline", "other")
+    assert ended.value.code == 2
+    assert "no arm other" in capsys.readouterr().err
