@@ -88,11 +88,12 @@ def against(runs: Runs, baseline: str) -> Iterator[str]:
     table = [runs.difference(arm, baseline, regime) for arm in others for regime in REGIMES]
     found = {(each.first, each.where): each for each in judged(table)}
     for arm in others:
-        cells = [_difference(found.get((arm, regime))) for regime in REGIMES]
+        cells = [difference(found.get((arm, regime))) for regime in REGIMES]
         yield f"| {arm} | {' | '.join(cells)} |"
 
 
-def _difference(found: Contrast | None) -> str:
+def difference(found: Contrast | None) -> str:
+    """A difference with its interval, its verdict and the number of its pairs."""
     if found is None or found.estimate is None:
         return ""
     center, (low, high) = found.estimate.center, found.estimate.wide

@@ -16,10 +16,12 @@ from pathlib import Path
 
 from crossgrad_core.commands import UserError, summary_of
 
-#: Files of a run that are kept; the last three are those of the observer `diagnostics`.
+#: Files of a run that are kept; those of the second line are of the observer `diagnostics`, the
+#: last ones of views elsewhere (distances.py).
 FILES = (
     *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
     *("diagnostics.csv", "cameras.csv", "groupings.csv"),
+    "per_view*_on_*.csv",
 )
 
 
@@ -62,7 +64,7 @@ def _kept(sweep: Path, runs: list[Path]) -> Iterator[Path]:
     yield sweep / "runs.csv"
     # File by file, so that what is alike in all runs lies close together: a third of the size.
     for name in FILES:
-        yield from (path for path in (run / name for run in runs) if path.is_file())
+        yield from (path for run in runs for path in sorted(run.glob(name)))
 
 
 def _without_owner(entry: tarfile.TarInfo) -> tarfile.TarInfo:

@@ -24,6 +24,7 @@ from crossgrad_core.run.export import (
     drawer,
     export_scene,
     georef_of,
+    plain_drawer,
     plain_renderer,
     renderer,
 )
@@ -94,16 +95,10 @@ def evaluate(
     Raises:
         UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
     """
-    if ply is not None and on is not None:
-        raise UserError(
-            "a file is evaluated on the run's own held-out views",
-            where="--on",
-            todo="leave out --on, or --ply",
-        )
     if ply is not None:
-        result, gaussians = evaluated_file(folder, ply, how)
+        result, gaussians, place = evaluated_file(folder, ply, how, on)
         told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
-        print("\n".join([*metric_lines(result), told]))  # noqa: T201
+        print("\n".join([*metric_lines(result), told, *_told_of(place)]))  # noqa: T201
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
         print("\n".join([*metric_lines(result), *_told_of(there)]))  # noqa: T201
@@ -138,13 +133,15 @@ def evaluated_on(
         return result, there
 
 
-def _told_of(there: Elsewhere) -> list[str]:
-    if not there.trained:
+def _told_of(there: Elsewhere | None) -> list[str]:
+    if there is None or not there.trained:
         return []
     return [f"left out: {there.trained} of its views that the run was trained on"]
 
 
-def evaluated_file(folder: Path, ply: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, int]:
+def evaluated_file(
+    folder: Path, ply: Path, how: Opens = AS_IT_IS, on: Path | None = None
+) -> tuple[EvaluationResult, int, Elsewhere | None]:
     """Evaluates Gaussians of a PLY on the held-out views of a run, exposures of the run included.
 
     Nothing is written.
@@ -153,18 +150,26 @@ def evaluated_file(folder: Path, ply: Path, how: Opens = AS_IT_IS) -> tuple[Eval
         folder: The run's folder.
         ply: The file, in the coordinates of the scene's input; this or another program wrote it.
         how: How the run is opened.
+        on: Another capture of the place, whose views are drawn instead, without exposures; see
+            `evaluated_on`.
 
     Returns:
-        The figures, and the number of Gaussians.
+        The figures, the number of Gaussians, and the other capture where there is one.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, or the file cannot be read.
+        UserError: It is no run, it has no checkpoint, or the file cannot be read; see also
+            `elsewhere`.
     """
     require_checkpoint(folder)
     setup, state = how.open(folder)
     gaussians = build(Exporter, EXPORTER, {}).read(ply, setup.scene.similarity)
-    draw, points = drawer(setup, state, gaussians), setup.scene.points
-    return measured(setup.scene.test_views, draw, setup.metrics, points=points), len(gaussians)
+    if on is None:
+        there, views, points = None, setup.scene.test_views, setup.scene.points
+        draw = drawer(setup, state, gaussians)
+    else:
+        there = elsewhere(setup, on)
+        views, points, draw = there.views, there.points, plain_drawer(setup, gaussians)
+    return measured(views, draw, setup.metrics, points=points), len(gaussians), there
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:

@@ -202,14 +202,15 @@ def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[V
 
     On black: what a file holds is what viewers draw, and they draw it so.
     """
+    plain = plain_drawer(setup, gaussians)
+    return lambda view: exposed(setup, state, view, plain(view))
+
+
+def plain_drawer(setup: Setup, gaussians: Gaussians) -> Callable[[View], Tensor]:
+    """Renders a view, on black, of such Gaussians before any exposure."""
     background = torch.zeros(3, device=setup.device)
     moved = gaussians.mapped(lambda tensor: tensor.to(setup.device))
-
-    def render_one(view: View) -> Tensor:
-        image = setup.rasterizer.render(moved, view.camera, background).image
-        return exposed(setup, state, view, image)
-
-    return render_one
+    return lambda view: setup.rasterizer.render(moved, view.camera, background).image
 
 
 def described(exported: Exported, path: Path) -> Sequence[str]:

@@ -67,6 +67,23 @@ def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures
     assert "street" in printed and "left out: 7 of its views" in printed
 
 
+def test_a_file_is_drawn_there_as_the_model_is(trained, scene, capsys):
+    model, _ = afterwards.evaluated_on(trained, scene)
+    before = sorted(trained.rglob("*"))
+    file, gaussians, there = afterwards.evaluated_file(
+        trained, trained / "point_cloud.ply", on=scene
+    )
+    assert gaussians > 0 and there is not None and there.trained == 7
+    for mine, other in zip(file.views, model.views, strict=True):
+        assert mine.name == other.name
+        # The model is vanilla on black: the file holds all of it, rounded to float32.
+        assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
+    afterwards.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
+    printed = capsys.readouterr().out
+    assert "drawn on black" in printed and "left out: 7 of its views" in printed
+    assert sorted(trained.rglob("*")) == before
+
+
 def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
     afterwards.render(trained, split="test", out=None, on=scene)
     (folder,) = (trained / "renders").glob("*/on_place")
@@ -122,8 +139,6 @@ def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
     with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
         afterwards.evaluate(trained, on=far_away)
-    with pytest.raises(UserError, match="own held-out views"):
-        afterwards.evaluate(trained, on=scene, ply=trained / "point_cloud.ply")
     with pytest.raises(UserError):
         afterwards.evaluate(trained, on=tmp_path / "nothing")
     assert sorted(trained.rglob("*")) == before
