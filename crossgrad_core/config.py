@@ -245,7 +245,7 @@ class RunConfig(BaseModel):
     max_gaussians: Annotated[PositiveInt | Literal["auto"] | None, Flag("N|auto", TRAINING)] = (
         Field(
             None,
-            description="Density control stops growing here; auto: as suits the length of the run. "
+            description="At most so many primitives; auto: as suits the length of the run. "
             "Default: auto where growth follows the curve, else what fits into memory.",
         )
     )

@@ -149,6 +149,25 @@ class Scene:
     point_opacities: NDArray[np.float64] | None = None
     georeference: Georeference = UNPLACED
 
+    def with_points(self, rows: NDArray[np.int64]) -> "Scene":
+        """The scene with these of its points alone, [Q] rising; views know their new rows."""
+        place = np.full(len(self.points), -1)
+        place[rows] = np.arange(len(rows))
+
+        def left(view: View) -> View:
+            seen = place[view.seen]
+            return replace(view, seen=seen[seen >= 0])
+
+        sizes, opacities = self.point_sizes, self.point_opacities
+        return replace(
+            self,
+            views=tuple(map(left, self.views)),
+            points=self.points[rows],
+            point_colors=self.point_colors[rows],
+            point_sizes=None if sizes is None else sizes[rows],
+            point_opacities=None if opacities is None else opacities[rows],
+        )
+
     @cached_property
     def train_views(self) -> tuple[View, ...]:
         """The training views, in the order that samplers index."""

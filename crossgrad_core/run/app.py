@@ -50,7 +50,7 @@ from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.start import first_state, initial_bytes, warm_up
+from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.wording import listed
@@ -159,6 +159,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
         length = Timed(config.seconds, config.clock)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
+    setup = replace(setup, notes=(*setup.notes, *told_of_start(state)))
     state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))

@@ -7,10 +7,12 @@ from time import perf_counter
 
 import numpy as np
 
+from crossgrad_core.config import AUTO
 from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
@@ -20,18 +22,23 @@ from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 _LOG = logging.getLogger(__name__)
 #: Random initial points where a scene has none (`--init random`).
 RANDOM_POINTS = 20_000
+#: The share of a bound on primitives that a run begins with where its points would make more
+#: (docs/schedules.md), and under which name such a run keeps how many they would have been.
+BEGINNING, THINNED = 2 / 3, "thinned"
 
 
 def first_state(setup: Setup) -> TrainState:
     """The state before the first step."""
     rngs = make_streams(setup.config.seed)
-    parameters = setup.densifier.started(initial_parameters(setup, rngs["create"]))
+    created, crowd = initial_parameters(setup, rngs["create"])
+    parameters = setup.densifier.started(created)
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
@@ -43,19 +50,67 @@ def first_state(setup: Setup) -> TrainState:
     photos = photo_parameters.started(setup)
     if photos is not None:
         state.commit({photo_parameters.STATE: photos})
+    if crowd is not None:
+        state.commit({THINNED: PluginState({"of": crowd, "start": state.primitives(setup)})})
     return state
 
 
-def initial_parameters(setup: Setup, rng: np.random.Generator) -> Parameters:
-    """Parameters from the SfM points, from random points, or from a PLY of Gaussians."""
-    reading = setup.config.reading
-    if reading.init_file is None:
-        scene = setup.scene
-        if reading.init == "random":
-            return setup.backbone.create(with_random_points(scene, rng), rng)
-        return setup.backbone.create(setup.selection.start.begun(scene), rng)
-    gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, setup.scene.similarity)
-    return setup.backbone.adopt(gaussians, setup.scene, rng)
+def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Parameters, int | None]:
+    """Parameters from the SfM points, from random points, or from a PLY of Gaussians.
+
+    Where points would make more primitives than the user's bound, so many of them are drawn that
+    `BEGINNING` of the bound is there at first: what is left is for density control, which places
+    primitives where the photos ask for them. Without density control it is all of the bound. A PLY
+    is taken as it is.
+
+    Returns:
+        The parameters, and the number of primitives that all points would have made where fewer
+        were taken.
+    """
+    reading, scene = setup.config.reading, setup.scene
+    if reading.init_file is not None:
+        gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, scene.similarity)
+        return setup.backbone.adopt(gaussians, scene, rng), None
+    if reading.init == "random":
+        begun = with_random_points(scene, rng)
+    else:
+        begun = setup.selection.start.begun(scene)
+    parameters = setup.backbone.create(begun, rng)
+    present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
+    if bound is None or bound == AUTO or present <= bound:
+        return parameters, None
+    share = BEGINNING if setup.schedule.grows else 1.0
+    few = thinned(begun, share * bound / present, rng)
+    return setup.backbone.create(few, rng), present
+
+
+def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
+    """The scene with this share of its points, at least one, drawn at random.
+
+    Points that a start added, which have sizes of their own, are kept where they fit: each of them
+    stands for much that has no other point.
+    """
+    count = len(scene.points)
+    wanted = max(1, round(share * count))
+    added = np.zeros(count, dtype=bool)
+    if scene.point_sizes is not None:
+        added = np.isfinite(scene.point_sizes)
+    if int(added.sum()) >= wanted:
+        added[:] = False
+    own = rng.choice(np.flatnonzero(~added), wanted - int(added.sum()), replace=False)
+    return scene.with_points(np.sort(np.concatenate([np.flatnonzero(added), own])))
+
+
+def told_of_start(state: TrainState) -> tuple[str, ...]:
+    """What to say of a start with fewer primitives than the points would have made."""
+    kept = state.states.get(THINNED)
+    if kept is None:
+        return ()
+    start, crowd = kept.values["start"], kept.values["of"]
+    return (
+        f"start: {start:,} primitives instead of {crowd:,}, from points drawn at random: "
+        f"--max-gaussians is less than all points would make",
+    )
 
 
 def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -113,5 +168,5 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
 
 def initial_bytes(setup: Setup) -> int:
     """Bytes of the initial parameters with their gradients and moments."""
-    parameters = initial_parameters(setup, make_streams(setup.config.seed)["create"])
+    parameters, _ = initial_parameters(setup, make_streams(setup.config.seed)["create"])
     return 4 * sum(tensor.numel() * tensor.element_size() for tensor in parameters.values())

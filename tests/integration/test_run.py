@@ -264,6 +264,16 @@ def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     assert summary["peak_primitives"] == 230
 
 
+def test_a_bound_below_the_points_is_kept_and_told(scene, tmp_path):
+    run(scene, tmp_path / "run", steps=60, max_gaussians=90, **GROWTH, start={"name": "sfm"})
+    counts = [int(row["primitives"]) for row in quality(tmp_path / "run")]
+    assert max(counts) <= 90
+    told = "start: 60 primitives instead of 200"
+    assert told in (tmp_path / "run/log.txt").read_text()
+    notes = json.loads((tmp_path / "run/summary.json").read_text())["notes"]
+    assert any(told in note for note in notes)
+
+
 class Poison:
     """Turns one parameter into NaN by way of an edit, in given steps."""
 

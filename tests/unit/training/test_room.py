@@ -6,7 +6,9 @@ from fractions import Fraction
 from math import floor
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -25,7 +27,7 @@ from crossgrad_core.training import room
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.room import bound_of, curve, usual_budget
 from crossgrad_core.training.schedules import growth_of
-from crossgrad_core.training.start import first_state
+from crossgrad_core.training.start import first_state, thinned, told_of_start
 
 #: Densifiers that want more than any curve gives them, and their backbones.
 GREEDY = {
@@ -147,9 +149,56 @@ def test_what_growth_a_run_has(settings, growth, bound):
     )
 
 
-def test_a_budget_below_the_start_adds_nothing():
-    setup = setup_of("adc", max_gaussians=10, growth="curve")
-    assert set(counts_of(setup)) == {40}
+@pytest.mark.parametrize("growth", ["free", "curve"])
+@pytest.mark.parametrize("name", GREEDY)
+def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
+    whole = first_state(setup_of(name)).primitives(setup_of(name))
+    bound = whole - 10
+    setup = setup_of(name, max_gaussians=bound, growth=growth)
+    found = counts_of(setup)
+    # Of anchors the number follows that of points only about.
+    about = 0 if name not in BACKBONES else 3
+    assert found[0] == pytest.approx(2 * bound / 3, abs=0.5 + about)
+    assert found[-1] == bound == max(found)
+    (told,) = told_of_start(first_state(setup))
+    assert f"{found[0]:,} primitives instead of {whole:,}" in told
+    for enough in (whole, whole + 1, "auto", None):
+        state = first_state(setup := setup_of(name, max_gaussians=enough))
+        assert state.primitives(setup) == whole and told_of_start(state) == ()
+
+
+def test_without_density_control_all_of_the_bound_is_there_at_once():
+    config = RunConfig(start={"name": "sfm"}, steps=4, max_gaussians=9)
+    setup = assemble(config, sample_scene(), "none")
+    assert not setup.schedule.grows
+    assert first_state(setup).primitives(setup) == 9
+
+
+def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
+    def means(seed):
+        config = RunConfig(seed=seed, steps=4, max_gaussians=300, reading={"init": "random"})
+        return first_state(assemble(config, sample_scene(), "none")).parameters["means"]
+
+    assert len(means(0)) == 300 and torch.equal(means(0), means(0))
+    assert not torch.equal(means(0), means(1))
+
+
+def test_points_that_a_start_added_are_kept_where_they_fit():
+    scene = sample_scene()
+    count = len(scene.points)
+    sizes = np.full(count, np.nan)
+    sizes[[3, count - 1]] = 0.5
+    scene = replace(scene, point_sizes=sizes, point_opacities=sizes)
+    for wanted, kept in ((5, 2), (2, None)):
+        few = thinned(scene, wanted / count, np.random.default_rng(0))
+        assert len(few.points) == len(few.point_colors) == len(few.point_sizes) == wanted
+        if kept is not None:
+            assert int(np.isfinite(few.point_sizes).sum()) == kept
+        for view, before in zip(few.views, scene.views, strict=True):
+            there = {tuple(each) for each in scene.points[before.seen]}
+            mine = {tuple(each) for each in few.points[view.seen]}
+            assert mine == there & {tuple(each) for each in few.points}
+    assert len(thinned(scene, 1e-9, np.random.default_rng(0)).points) == 1
 
 
 @pytest.mark.parametrize("growth", ["free", "curve"])
