@@ -1,6 +1,6 @@
 """Photos that a model holds in one place while most of their matches speak for another."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_plugins.prepare.epipolar import Rays, off_lines
 from crossgrad_plugins.prepare.waiting import quiet
 
 if TYPE_CHECKING:
@@ -39,7 +40,9 @@ class Votes:
     agrees: NDArray[np.bool_]
 
 
-def contradicted(model: "pycolmap.Reconstruction", database: Path) -> dict[int, tuple[int, int]]:
+def contradicted(
+    model: "pycolmap.Reconstruction", database: Path, settled: Collection[int] = ()
+) -> dict[int, tuple[int, int]]:
     """Photos most of whose matches with other photos of the model contradict its pose.
 
     Repeated structures look alike in places that are not the same: such pairs pass the verification
@@ -50,6 +53,8 @@ def contradicted(model: "pycolmap.Reconstruction", database: Path) -> dict[int, 
     Args:
         model: The model.
         database: COLMAP's database with the verified matches.
+        settled: Photos whose matches speak for no other place more than for theirs: whatever
+            speaks against it, nothing better is known.
 
     Returns:
         Number of each such photo -> its matches for and against the pose.
@@ -60,6 +65,7 @@ def contradicted(model: "pycolmap.Reconstruction", database: Path) -> dict[int, 
     while present.any():
         yes, no = (counts.of(votes, present & side) for side in (votes.agrees, ~votes.agrees))
         weighed = np.where(no[1] >= _AGAINST, yes[0] / np.maximum(1, yes[0] + no[0]), 1.0)
+        weighed[list(settled)] = 1.0
         worst = int(np.argmin(weighed))
         if weighed[worst] >= _SHARE:
             break
@@ -106,52 +112,17 @@ def _judged(
     """Of each pair of the model's photos: their numbers, its matches, and how many agree."""
     import pycolmap
 
-    views = {number: _View(model, number) for number in model.reg_image_ids()}
+    poses = {number: model.image(number).cam_from_world() for number in model.reg_image_ids()}
+    rays = Rays(model, database)
     pairs, counts = database.read_two_view_geometry_num_inliers()
     for pair, count in zip(pairs, counts, strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)
-        if count < _MATCHES or first not in views or second not in views:
+        if count < _MATCHES or first not in poses or second not in poses:
             continue
         matches = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
-        one, other = (
-            views[number].seen(database)[matches[:, side]]
-            for side, number in enumerate((first, second))
+        off = off_lines(
+            (poses[first], poses[second]),
+            (rays.of(first)[matches[:, 0]], rays.of(second)[matches[:, 1]]),
+            (rays.focal(first), rays.focal(second)),
         )
-        off = _off(views[first], views[second], one, other)
         yield first, second, len(matches), int((off <= _PIXELS).sum())
-
-
-class _View:
-    """A photo with its pose; its features are read when they are asked for, and kept."""
-
-    def __init__(self, model: "pycolmap.Reconstruction", number: int) -> None:
-        image = model.image(number)
-        self._number, self._camera = number, model.camera(image.camera_id)
-        self._seen: NDArray[np.float32] | None = None
-        self.focal = self._camera.mean_focal_length()
-        self.pose = image.cam_from_world()
-
-    def seen(self, database: "pycolmap.Database") -> NDArray[np.float32]:
-        """[N, 2] features without lens distortion, in units of the focal length."""
-        if self._seen is None:
-            pixels = np.asarray(database.read_keypoints(self._number)[:, :2], dtype=np.float64)
-            self._seen = np.asarray(self._camera.cam_from_img(pixels), dtype=np.float32)
-        return self._seen
-
-
-def _off(
-    first: _View, second: _View, one: NDArray[np.float32], other: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """[N] pixels that matches lie from each other's epipolar lines, the larger of both."""
-    relative = second.pose * first.pose.inverse()
-    x, y, z = relative.translation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    essential = cross @ relative.rotation.matrix()
-    here, there = (np.column_stack([points, np.ones(len(points))]) for points in (one, other))
-    lines, back = here @ essential.T, there @ essential
-    error = np.abs((there * lines).sum(axis=1))
-    # Two photos of one place have no epipolar lines, and nothing to contradict.
-    tiny = np.finfo(np.float64).tiny
-    in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * second.focal
-    in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * first.focal
-    return np.asarray(np.maximum(in_one, in_other))

@@ -23,6 +23,9 @@ LONGEST: Final = 3200
 #: Bytes that SIFT takes for a pixel of the photo, which it looks at at twice its size: measured
 #: 290 (docs/prepare.md). And the share of the free memory that all threads together may take.
 _BYTES_PER_PIXEL, _SHARE = 320, 0.6
+#: Photos of fewer pixels have few features, and are asked for fainter ones, and for those along
+#: edges: SIFT's threshold on contrast, and on the ratio of curvatures (COLMAP: 0.0067 and 10).
+_SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
 #: Photos of a camera that are tried until one can be read.
 _TRIED: Final = 5
 
@@ -37,26 +40,16 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     """
     if layout.features.is_file():
         return dict(json.loads(layout.features.read_bytes()))
-    import pycolmap
 
     if not layout.database.is_file():
         waited("reading cameras", lambda _: _make_database(layout, plan), lambda: "")
-    total = len(plan.used)
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = min(plan.settings.max_size or LONGEST, LONGEST)
-    options.num_threads = _threads(plan.used, options.max_image_size, threads)
-    options.sift.max_num_features = plan.settings.max_features
-    reading = pycolmap.ImageReaderOptions()
-    reading.camera_model = plan.settings.lens
+    longest = min(plan.settings.max_size or LONGEST, LONGEST)
+    small = {photo.name for photo in plan.used if _pixels(photo, longest) < _SMALL}
     names = [photo.name for photo in plan.used]
-    waited(
-        "finding features",
-        lambda token: pycolmap.extract_features(
-            layout.database, Path(plan.photos), names, reader_options=reading,
-            extraction_options=options, device=pycolmap.Device.cpu, cancellation_token=token,
-        ),
-        lambda: f"{rows_of(layout.database, 'descriptors')} of {total} photos",
-    )  # fmt: skip
+    for faint in (False, True):
+        asked = [name for name in names if (name in small) == faint]
+        if asked:
+            _find(layout, plan, asked, _options(plan, longest, threads, faint=faint))
     counts = _counts(layout.database)
     found = {name: counts.get(name, 0) for name in names}
     if not any(found.values()):
@@ -68,6 +61,38 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
         )
     write_atomically(layout.features, json.dumps(found, indent=1).encode())
     return found
+
+
+def _options(
+    plan: Plan, longest: int, threads: int, *, faint: bool
+) -> "pycolmap.FeatureExtractionOptions":
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = longest
+    options.num_threads = _threads(plan.used, longest, threads)
+    options.sift.max_num_features = plan.settings.max_features
+    if faint:
+        options.sift.peak_threshold, options.sift.edge_threshold = _FAINT, _ALONG_EDGES
+    return options
+
+
+def _find(
+    layout: Layout, plan: Plan, names: Sequence[str], options: "pycolmap.FeatureExtractionOptions"
+) -> None:
+    """Finds the features of these photos."""
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = plan.settings.lens
+    waited(
+        "finding features",
+        lambda token: pycolmap.extract_features(
+            layout.database, Path(plan.photos), names, reader_options=reading,
+            extraction_options=options, device=pycolmap.Device.cpu, cancellation_token=token,
+        ),
+        lambda: f"{rows_of(layout.database, 'descriptors')} of {len(plan.used)} photos",
+    )  # fmt: skip
 
 
 def _threads(photos: Sequence[Photo], longest: int, threads: int) -> int:

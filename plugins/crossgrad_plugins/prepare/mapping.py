@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -10,6 +11,7 @@ from crossgrad_core.commands import UserError, write_atomically
 from crossgrad_plugins.prepare.contradictions import contradicted
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.second_look import looked_again
 from crossgrad_plugins.prepare.soundness import sound_models
 from crossgrad_plugins.prepare.waiting import quiet, waited
 
@@ -41,12 +43,15 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
     """
     if not layout.models.is_dir():
         scratch = emptied(scratch_of(layout.models))
-        below = emptied(scratch / "found")
-        waited_for = _incremental if way_of(plan) == "incremental" else _global
-        models = list(waited_for(layout, plan, threads, below).values())
+        below, again = emptied(scratch / "found"), emptied(scratch / "again")
+        settled: frozenset[int] = frozenset()
         if way_of(plan) == "global":
+            models = list(_global(layout, plan, threads, below).values())
             models = sound_models(models, _SMALLEST)
-        models = _without_misplaced(layout, models)
+        else:
+            models = list(_incremental(layout, plan, threads, below).values())
+            models, settled = _looked_again(layout, plan, threads, again, models)
+        models = _without_misplaced(layout, models, settled)
         if not models:
             raise _nothing(layout, plan)
         ordered = sorted(models, key=lambda model: -model.num_reg_images())
@@ -54,9 +59,8 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
             for number, model in enumerate(ordered):
                 place = emptied(scratch / str(number))
                 model.write(place)
-        for path in sorted(below.rglob("*"), reverse=True):
-            path.rmdir() if path.is_dir() else path.unlink()
-        below.rmdir()
+        for folder in (below, again):
+            shutil.rmtree(folder)
         scratch.replace(layout.models)
     return [model for _, model in read_models(layout.models)]
 
@@ -71,18 +75,27 @@ def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
 
 
 def _without_misplaced(
-    layout: Layout, models: "list[pycolmap.Reconstruction]"
+    layout: Layout, models: "list[pycolmap.Reconstruction]", settled: frozenset[int] = frozenset()
 ) -> "list[pycolmap.Reconstruction]":
-    """The models without photos whose matches contradict their poses; those are written down."""
+    """The models without photos whose matches contradict their poses; those are written down.
+
+    Args:
+        layout: Where.
+        models: The models, the largest one first.
+        settled: Its photos for which no better place is known.
+    """
     found: dict[str, tuple[int, int]] = {}
-    for model in models:
+    for number, model in enumerate(models):
+        known = frozenset[int]() if number else settled
         doubted = waited(
             "checking poses",
-            lambda _, model=model: contradicted(model, layout.database),  # type: ignore[misc]
+            lambda _, model=model, known=known: contradicted(  # type: ignore[misc]
+                model, layout.database, known
+            ),
             lambda: "",
         )
-        for number, votes in doubted.items():
-            image = model.image(number)
+        for photo, votes in doubted.items():
+            image = model.image(photo)
             found[image.name] = votes
             model.deregister_frame(image.frame_id)
     kept = [model for model in models if model.num_reg_images() >= _SMALLEST]
@@ -104,9 +117,6 @@ def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]
 def _incremental(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
     import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = threads, 0
-    options.min_model_size = _SMALLEST
     posed = itertools.count(2)
     latest = [2]
 
@@ -116,11 +126,53 @@ def _incremental(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
     return waited(
         "finding cameras",
         lambda token: dict(pycolmap.incremental_mapping(
-            layout.database, Path(plan.photos), out, options=options,
+            layout.database, Path(plan.photos), out, options=_options(threads),
             next_image_callback=one_more, cancellation_token=token,
         )),
         lambda: f"{latest[0]} of {len(plan.used)} photos",
     )  # fmt: skip
+
+
+def _options(threads: int) -> "pycolmap.IncrementalPipelineOptions":
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.min_model_size = _SMALLEST
+    # It places photos by pairs, too, without asking how many agree.
+    options.structure_less_registration_fallback = False
+    return options
+
+
+def _looked_again(
+    layout: Layout,
+    plan: Plan,
+    threads: int,
+    scratch: Path,
+    models: "list[pycolmap.Reconstruction]",
+) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
+    """The models after a second look at doubtful photos, and those for which nothing is better."""
+    import pycolmap
+
+    def call(
+        token: "pycolmap.CancellationToken",
+    ) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
+        def adjust(database: Path, place: Path) -> "pycolmap.Reconstruction":
+            anew, found = (emptied(place / name) for name in ("anew", "found"))
+            options, photos = _options(threads), Path(plan.photos)
+            options.multiple_models = False
+            pycolmap.triangulate_points(
+                pycolmap.Reconstruction(place), database, photos, anew,
+                options=options, cancellation_token=token,
+            ).write(anew)  # fmt: skip
+            models = pycolmap.incremental_mapping(
+                database, photos, found, options=options, input_path=anew, cancellation_token=token
+            )
+            return max(models.values(), key=lambda model: model.num_reg_images())
+
+        return looked_again(models, layout.database, scratch, adjust, lambda: token.is_cancelled)
+
+    return waited("placing doubtful photos", call, lambda: "")
 
 
 def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:

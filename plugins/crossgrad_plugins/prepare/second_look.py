@@ -1,0 +1,205 @@
+"""Photos that mapping left out, or put where most of their pairs disagree, placed by their pairs.
+
+Mapping adds a photo by the points of the model that it shows, in the place that most of them speak
+for at that time, and does not look back. A photo that shares much with two others, but little that
+a third one shows, has few such points; and of walls and pavements that repeat the wrong ones may
+come first. So doubtful photos are placed once more, by all their pairs (by_pairs.py); pairs that
+contradict the poses are laid aside, points are made anew, and mapping goes on from there.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from crossgrad_plugins.prepare.by_pairs import Pairs, Support, best_place, support
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: How often all doubtful photos are looked at, at most.
+_ROUNDS: Final = 5
+#: A photo is doubtful where less than this share of its matches agrees with its place; another
+#: place has to have so many times as many agreeing matches.
+_DOUBTFUL, _BETTER = 0.6, 1.3
+
+Models: TypeAlias = "list[pycolmap.Reconstruction]"
+#: Makes points anew for the model in a folder, by a database, and goes on mapping from there.
+Adjust: TypeAlias = "Callable[[Path, Path], pycolmap.Reconstruction]"
+Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
+
+
+@dataclass(frozen=True)
+class Look:
+    """What pairs say of doubtful photos.
+
+    Attributes:
+        better: Photo -> a pose that more speaks for than for its own, or that it has none yet.
+        settled: Photos with a pose for which there is no better one.
+    """
+
+    better: Poses
+    settled: frozenset[int]
+
+
+def looked_again(
+    models: Models,
+    database: Path,
+    scratch: Path,
+    adjust: Adjust,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> tuple[Models, frozenset[int]]:
+    """The models, photos of the largest one placed once more where their pairs ask for it.
+
+    Args:
+        models: Of mapping; photos of smaller ones go over to the largest where more speaks for it.
+        database: COLMAP's database with the verified matches.
+        scratch: An empty folder.
+        adjust: Goes on mapping.
+        cancelled: Whether nobody waits for the answer any more; asked at every photo.
+
+    Returns:
+        The models, and photos of the largest one for which no better place is known, though pairs
+        speak against theirs.
+    """
+    if not models:
+        return [], frozenset()
+    main, *others = sorted(models, key=lambda model: -model.num_reg_images())
+    again = _Again(database, scratch / "pairs.db", others, cancelled)
+    look = again.look(main)
+    for number in range(_ROUNDS):
+        if not look.better or cancelled():
+            break
+        again.move(main, look)
+        place = scratch / str(number)
+        place.mkdir()
+        main.write(place)
+        main = adjust(again.copy, place)
+        look = again.look(main)
+    here = set(main.reg_image_ids())
+    for model in others:
+        for photo in here.intersection(model.reg_image_ids()):
+            model.deregister_frame(model.image(photo).frame_id)
+    return [main, *others], look.settled & here
+
+
+class _Again:
+    """Looks at a model, and moves what is better elsewhere.
+
+    Args:
+        database: COLMAP's database; only read.
+        copy: A copy of it, made when it is needed, in which pairs are laid aside.
+        others: The other models.
+        cancelled: Whether nobody waits for the answer any more.
+    """
+
+    def __init__(
+        self, database: Path, copy: Path, others: Models, cancelled: Callable[[], bool]
+    ) -> None:
+        self._database, self.copy, self._others = database, copy, others
+        self._cancelled = cancelled
+        self._aside: frozenset[tuple[int, int]] = frozenset()
+
+    def look(self, model: "pycolmap.Reconstruction") -> Look:
+        """What pairs say of the photos that are doubtful in a model, or not in it."""
+        with _opened(self._database) as database:
+            return self._look(model, Pairs(model, database))
+
+    def _look(self, model: "pycolmap.Reconstruction", pairs: Pairs) -> Look:
+        poses, elsewhere = poses_of(model), self._elsewhere(pairs)
+        better, settled = {}, set[int]()
+        for photo in sorted(pairs.partners):
+            if self._cancelled():
+                break
+            sights = pairs.sights(photo, poses)
+            here = support(sights, poses[photo]) if photo in poses else Support()
+            matches = sum(len(sight.features) for sight in sights)
+            if photo in poses and here.matches >= _DOUBTFUL * matches:
+                continue
+            least = _BETTER * max(here, elsewhere.get(photo, here)).matches
+            found, pose = best_place(model, sights)
+            if pose is not None and found.enough and found.matches >= least:
+                better[photo] = pose
+            elif photo in poses and here.enough:
+                settled.add(photo)
+        return Look(better, frozenset(settled))
+
+    def _elsewhere(self, pairs: Pairs) -> dict[int, Support]:
+        """What speaks for the poses in the other models."""
+        found = {}
+        for model in self._others:
+            poses = poses_of(model)
+            for photo, pose in poses.items():
+                found[photo] = support(pairs.sights(photo, poses), pose)
+        return found
+
+    def move(self, model: "pycolmap.Reconstruction", look: Look) -> None:
+        """Places photos, and lays pairs aside that contradict the poses; those that did are back.
+
+        A photo that few pairs agree with when the others have moved, too, is left out.
+        """
+        if not self.copy.exists():
+            shutil.copyfile(self._database, self.copy)
+        with _opened(self._database) as database, _opened(self.copy) as copied:
+            for photo, pose in look.better.items():
+                _place(model, database, photo, pose)
+            pairs, poses = Pairs(model, database), poses_of(model)
+            for photo in look.better:
+                if not support(pairs.sights(photo, poses), poses[photo]).enough:
+                    model.deregister_frame(model.image(photo).frame_id)
+            against = pairs.contradicting(poses_of(model))
+            for one, two in sorted(self._aside ^ against):
+                geometry = database.read_two_view_geometry(one, two)
+                if (one, two) in against:
+                    geometry.inlier_matches = np.zeros((0, 2), dtype=np.uint32)
+                copied.update_two_view_geometry(one, two, geometry)
+            self._aside = against
+
+
+@contextmanager
+def _opened(path: Path) -> "Iterator[pycolmap.Database]":
+    import pycolmap
+
+    database = pycolmap.Database.open(path)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def poses_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Rigid3d]":
+    """Photo -> its pose, world to camera."""
+    return {photo: model.image(photo).cam_from_world() for photo in model.reg_image_ids()}
+
+
+def _place(
+    model: "pycolmap.Reconstruction",
+    database: "pycolmap.Database",
+    photo: int,
+    pose: "pycolmap.Rigid3d",
+) -> None:
+    """Gives a photo a pose in a model, which need not have it yet."""
+    import pycolmap
+
+    image = database.read_image(photo)
+    number = image.frame_id
+    if photo not in model.images:
+        frame = database.read_frame(number)
+        if not model.exists_camera(image.camera_id):
+            model.add_camera(database.read_camera(image.camera_id))
+        if not model.exists_rig(frame.rig_id):
+            model.add_rig(database.read_rig(frame.rig_id))
+        if not model.exists_frame(number):
+            model.add_frame(frame)
+        points = np.asarray(database.read_keypoints(photo)[:, :2], dtype=np.float64)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in points])
+        model.add_image(image)
+    frame = model.frame(number)
+    if frame.has_pose():
+        model.deregister_frame(number)
+    frame.set_cam_from_world(image.camera_id, pose)
+    model.register_frame(number)
