@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crossgrad_core.commands import UserError, write_atomically
+from crossgrad_core.commands import UserError, disk_errors, write_atomically
 from crossgrad_plugins.prepare.contradictions import contradicted
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
@@ -170,7 +170,10 @@ def _looked_again(
             )
             return max(models.values(), key=lambda model: model.num_reg_images())
 
-        return looked_again(models, layout.database, scratch, adjust, lambda: token.is_cancelled)
+        with disk_errors(scratch):
+            return looked_again(
+                models, layout.database, scratch, adjust, lambda: token.is_cancelled
+            )
 
     return waited("placing doubtful photos", call, lambda: "")
 
