@@ -26,6 +26,7 @@ from crossgrad_core.plugin import footprint_of
 from crossgrad_core.run.afterwards import How, evaluated_file, evaluated_on
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_plugins.compare.contrasts import contrast, judged
+from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 
@@ -75,11 +76,13 @@ class Probes:
         runs: Arm -> scene and seed -> run.
         values: Folder of a run -> photo -> figure.
         bands: The views.
+        quantity: What the figure is.
     """
 
     runs: Mapping[str, Mapping[tuple[str, int], Run]]
     values: Mapping[Path, Mapping[str, float]]
     bands: Sequence[Band]
+    quantity: Quantity
 
     def mean(self, run: Run, band: Band) -> float | None:
         """The mean over the views of a band that the run was not trained on."""
@@ -107,7 +110,7 @@ class Probes:
             contrast(
                 (arm, baseline),
                 (self.runs[arm], self.runs[baseline]),
-                PSNR,
+                self.quantity,
                 partial(self.mean, band=band),
                 band.title,
             )
@@ -133,7 +136,7 @@ def figures_of(run: Path, scene: Path, figure: str, *, file: bool) -> dict[str, 
             result = evaluated_on(run, scene, how)[0]
         write_per_view(run, result, table.name)
     with table.open(encoding="utf-8", newline="") as lines:
-        return {row["name"]: float(row[figure]) for row in csv.DictReader(lines)}
+        return {row["name"]: float(row[figure]) for row in csv.DictReader(lines) if row[figure]}
 
 
 def main() -> None:
@@ -162,7 +165,12 @@ def main() -> None:
     if len(sizes) != 1:
         parser.error(f"runs of one size of photos are needed; there are {sizes or 'none'}")
     values = {each: figures_of(each, given.on, given.figure, file=given.files) for each in folders}
-    probes = Probes(runs, values, bands_of(given.on, *sizes, given.folders, given.bands))
+    probes = Probes(
+        runs,
+        values,
+        bands_of(given.on, *sizes, given.folders, given.bands),
+        Quantity.of(given.figure),
+    )
     print("\n".join(probes.means()))
     if given.baseline is not None:
         print()

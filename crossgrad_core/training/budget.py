@@ -48,7 +48,8 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     """
     _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
-    state, pace, share = first_state(probed), probed.schedule.pace, setup.pixel_share
+    state = first_state(unwatched(setup))
+    pace, share = probed.schedule.pace, setup.pixel_share
     steps, each = _probed(probed, state, seconds)
     note = f"{steps} probed steps took {each * pace.at(1) * 1000:.1f} ms each"
     pixels = setup.selection.resolution.pixels(probed.schedule, 1) / pace.at(1)

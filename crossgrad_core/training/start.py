@@ -32,6 +32,8 @@ RANDOM_POINTS = 20_000
 #: The share of a bound on primitives that a run begins with where its points would make more
 #: (docs/schedules.md), and under which name such a run keeps how many they would have been.
 BEGINNING, THINNED = 2 / 3, "thinned"
+#: The share of points that are left, at most, for another try.
+_LESS = 0.8
 
 
 def first_state(setup: Setup) -> TrainState:
@@ -79,9 +81,14 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
     if bound is None or bound == AUTO or present <= bound:
         return parameters, None
-    share = BEGINNING if setup.schedule.grows else 1.0
-    few = thinned(begun, share * bound / present, rng)
-    return setup.backbone.create(few, rng), present
+    wanted = (BEGINNING if setup.schedule.grows else 1.0) * bound
+    share, made = wanted / present, present
+    while made > bound and share * len(begun.points) >= 1.0:
+        parameters = setup.backbone.create(thinned(begun, share, rng), rng)
+        made = primitives_of(setup.blocks, parameters)
+        # Where several points make one primitive, or one makes several, it takes more than one try.
+        share *= min(_LESS, wanted / made)
+    return parameters, present
 
 
 def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
@@ -117,7 +124,8 @@ def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
     """The scene with grey points uniform in a cube of three extents around the cameras."""
     points = rng.uniform(-1.5, 1.5, (RANDOM_POINTS, 3))
     colors = np.full((RANDOM_POINTS, 3), 127, dtype=np.uint8)
-    return replace(scene, points=points, point_colors=colors)
+    views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in scene.views)
+    return replace(scene, views=views, points=points, point_colors=colors)
 
 
 def unwatched(setup: Setup) -> Setup:

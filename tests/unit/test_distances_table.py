@@ -36,9 +36,13 @@ def write_run(folder, place, steps, seed, figures):
     RunFolder(seed=seed, settings={"steps": steps}).write(folder)
     with (folder / f"per_view_on_{place.name}.csv").open("w", newline="") as file:
         lines = csv.writer(file)
-        lines.writerow(["name", "regime", "psnr"])
+        lines.writerow(["name", "regime", "psnr", "ssim"])
         # A run leaves out what it was trained on.
-        lines.writerows((n, n[:6], figures[n[:6]]) for n in NAMES if n != "street/0003.png")
+        lines.writerows(
+            (n, n[:6], figures[n[:6]], "" if n == NAMES[0] else 0.5)
+            for n in NAMES
+            if n != "street/0003.png"
+        )
 
 
 def test_near_views_come_first_and_arms_are_compared_band_by_band(tmp_path, place, printed):
@@ -60,6 +64,8 @@ def test_near_views_come_first_and_arms_are_compared_band_by_band(tmp_path, plac
     assert [cell.strip() for cell in one] == ["300 steps", "3", *["25.20 ± 0.20"] * 2,
                                               *["20.20 ± 0.20"] * 2]  # fmt: skip
     assert two[4].strip() == "21.20 ± 0.20"
+    (others,) = printed(tmp_path / "runs", "--of", "city", "--on", place, "--figure", "ssim")
+    assert [cell.strip() for cell in others[2][2:]] == ["0.50 ± 0.00"] * 2
     (row,) = differences[2:]
     assert row[0].strip() == "600 steps"
     assert row[1].strip().startswith("+0.00 [") and "equivalent" in row[1]

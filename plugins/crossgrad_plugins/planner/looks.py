@@ -112,7 +112,7 @@ def scale_filter(evidence: Evidence) -> Decision:
             f"footprints range over {spread:.1f}", decided=True, saved="the filter", figures=figures
         )
     return plain.found(
-        f"footprints range over {spread:.1f}; at the distances of photos a filter gains 0.3 dB at "
-        "most, and a file drawn without it may lose 0.8; between them it gains up to 1.3",
+        f"footprints range over {spread:.1f}; at the distances of photos a filter gains 0.3 dB on "
+        "average, and a file drawn without it may lose 0.8; between them it gains up to 1.3",
         figures=figures,
     )

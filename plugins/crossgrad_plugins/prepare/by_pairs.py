@@ -8,7 +8,7 @@ Multiple View Geometry, 9.6, for the relative pose; the rest is ours.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -77,6 +77,8 @@ class Sight:
 
         options = pycolmap.TwoViewGeometryOptions()
         options.compute_relative_pose, options.ransac.random_seed = True, 0
+        # Verification has looked for them; these cameras have no borders.
+        options.detect_watermark = False
         cameras = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
             for focal in self.focals
@@ -127,6 +129,11 @@ class Pairs:
                 focals = self.rays.focal(other), self.rays.focal(photo)
                 found.append(Sight(other, poses[other], focals, rays, rows[:, 0]))
         return sorted(found, key=lambda sight: (-len(sight.features), sight.other))
+
+    def without(self, aside: Collection[tuple[int, int]]) -> frozenset[int]:
+        """The photos that have no pair beside these."""
+        left = {photo for pair in self.matches if pair not in aside for photo in pair}
+        return frozenset(self.partners.keys() - left)
 
     def contradicting(self, poses: "Mapping[int, pycolmap.Rigid3d]") -> frozenset[tuple[int, int]]:
         """The pairs of photos with poses that do not agree with these."""

@@ -4,6 +4,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -152,30 +153,35 @@ def _looked_again(
     models: "list[pycolmap.Reconstruction]",
 ) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
     """The models after a second look at doubtful photos, and those for which nothing is better."""
+    adjust = partial(_adjusted, threads, Path(plan.photos))
+    with disk_errors(scratch):
+        return waited(
+            "placing doubtful photos",
+            lambda token: looked_again(
+                models, layout.database, scratch, partial(adjust, token), lambda: token.is_cancelled
+            ),
+            lambda: "",
+        )
+
+
+def _adjusted(
+    threads: int, photos: Path, token: "pycolmap.CancellationToken", database: Path, place: Path
+) -> "pycolmap.Reconstruction":
+    """The model in a folder with its points made anew by a database, and mapped on from there."""
     import pycolmap
 
-    def call(
-        token: "pycolmap.CancellationToken",
-    ) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
-        def adjust(database: Path, place: Path) -> "pycolmap.Reconstruction":
-            anew, found = (emptied(place / name) for name in ("anew", "found"))
-            options, photos = _options(threads), Path(plan.photos)
-            options.multiple_models = False
-            pycolmap.triangulate_points(
-                pycolmap.Reconstruction(place), database, photos, anew,
-                options=options, cancellation_token=token,
-            ).write(anew)  # fmt: skip
-            models = pycolmap.incremental_mapping(
-                database, photos, found, options=options, input_path=anew, cancellation_token=token
-            )
-            return max(models.values(), key=lambda model: model.num_reg_images())
-
-        with disk_errors(scratch):
-            return looked_again(
-                models, layout.database, scratch, adjust, lambda: token.is_cancelled
-            )
-
-    return waited("placing doubtful photos", call, lambda: "")
+    anew, found = (emptied(place / name) for name in ("anew", "found"))
+    options = _options(threads)
+    options.multiple_models = False
+    model = pycolmap.triangulate_points(
+        pycolmap.Reconstruction(place), database, photos, anew, options=options,
+        cancellation_token=token,
+    )  # fmt: skip
+    model.write(anew)
+    models = pycolmap.incremental_mapping(
+        database, photos, found, options=options, input_path=anew, cancellation_token=token
+    )
+    return max(models.values(), key=lambda each: each.num_reg_images(), default=model)
 
 
 def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:

@@ -70,11 +70,12 @@ def looked_again(
         return [], frozenset()
     main, *others = sorted(models, key=lambda model: -model.num_reg_images())
     again = _Again(database, scratch / "pairs.db", others, cancelled)
-    look = again.look(main)
+    look, moved = again.look(main), set[int]()
     for number in range(_ROUNDS):
         if not look.better or cancelled():
             break
         again.move(main, look)
+        moved |= look.better.keys()
         place = scratch / str(number)
         place.mkdir()
         main.write(place)
@@ -82,7 +83,7 @@ def looked_again(
         look = again.look(main)
     here = set(main.reg_image_ids())
     for model in others:
-        for photo in here.intersection(model.reg_image_ids()):
+        for photo in (here & moved).intersection(model.reg_image_ids()):
             model.deregister_frame(model.image(photo).frame_id)
     return [main, *others], look.settled & here
 
@@ -107,10 +108,15 @@ class _Again:
     def look(self, model: "pycolmap.Reconstruction") -> Look:
         """What pairs say of the photos that are doubtful in a model, or not in it."""
         with _opened(self._database) as database:
-            return self._look(model, Pairs(model, database))
+            return self._look(model, Pairs(model, database), self._elsewhere(database))
 
-    def _look(self, model: "pycolmap.Reconstruction", pairs: Pairs) -> Look:
-        poses, elsewhere = poses_of(model), self._elsewhere(pairs)
+    def _look(
+        self,
+        model: "pycolmap.Reconstruction",
+        pairs: Pairs,
+        elsewhere: Mapping[int, Support],
+    ) -> Look:
+        poses = poses_of(model)
         better, settled = {}, set[int]()
         for photo in sorted(pairs.partners):
             if self._cancelled():
@@ -120,19 +126,20 @@ class _Again:
             matches = sum(len(sight.features) for sight in sights)
             if photo in poses and here.matches >= _DOUBTFUL * matches:
                 continue
-            least = _BETTER * max(here, elsewhere.get(photo, here)).matches
+            there = elsewhere.get(photo, Support())
+            now = here if photo in poses else there
             found, pose = best_place(model, sights)
-            if pose is not None and found.enough and found.matches >= least:
+            if pose is not None and found.enough and found.matches >= _BETTER * now.matches:
                 better[photo] = pose
-            elif photo in poses and here.enough:
+            elif photo in poses and here.enough and there <= here:
                 settled.add(photo)
         return Look(better, frozenset(settled))
 
-    def _elsewhere(self, pairs: Pairs) -> dict[int, Support]:
-        """What speaks for the poses in the other models."""
+    def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
+        """What speaks for the poses in the other models, by their own cameras."""
         found = {}
         for model in self._others:
-            poses = poses_of(model)
+            pairs, poses = Pairs(model, database), poses_of(model)
             for photo, pose in poses.items():
                 found[photo] = support(pairs.sights(photo, poses), pose)
         return found
@@ -152,6 +159,9 @@ class _Again:
                 if not support(pairs.sights(photo, poses), poses[photo]).enough:
                     model.deregister_frame(model.image(photo).frame_id)
             against = pairs.contradicting(poses_of(model))
+            # Mapping does not know of photos without a pair.
+            for photo in pairs.without(against) & poses_of(model).keys():
+                model.deregister_frame(model.image(photo).frame_id)
             for one, two in sorted(self._aside ^ against):
                 geometry = database.read_two_view_geometry(one, two)
                 if (one, two) in against:

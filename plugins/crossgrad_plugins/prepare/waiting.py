@@ -69,7 +69,7 @@ def waited(
                     if progress.due:
                         told = ", ".join(filter(None, [far(), f"{monotonic() - begun:.0f} s"]))
                         progress.tell(f"{what}: {told}")
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, IndexError) as error:
             raise UserError(
                 f"pycolmap failed: {what}",
                 found=str(error),

@@ -1,10 +1,13 @@
 """Photos that mapping left out or misplaced are placed by their pairs, and only those."""
 
+from functools import partial
+
 import numpy as np
 import pycolmap
 import pytest
 
-from crossgrad_plugins.prepare.by_pairs import Pairs, Support, best_place, support
+from crossgrad_plugins.prepare import mapping
+from crossgrad_plugins.prepare.by_pairs import Pairs, Sight, Support, best_place, support
 from crossgrad_plugins.prepare.second_look import looked_again, poses_of
 
 PHOTOS, POINTS = 8, 120
@@ -146,6 +149,43 @@ def test_wrong_pairs_are_outvoted_and_laid_aside(made):
     assert adjust.aside == 3 and laid_aside(path) == 0
     # Three of seven are many: it stays doubtful, but nothing better is known.
     assert settled == {lost}
+
+
+def test_mapping_goes_on_where_a_photo_has_no_pair_left(made, tmp_path):
+    """One photo is misplaced; all pairs of another one tell of nothing, so that they go aside."""
+    model, path = made
+    truth, (lost, strange, *_) = truth_of(model), numbers(model)
+    rng = np.random.default_rng(0)
+
+    def mixed(one, two, matches):
+        if strange in (one, two):
+            matches[:, 1] = rng.permutation(matches[:, 1])
+        return matches
+
+    change_matches(path, mixed)
+    misplace(model, lost)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (found,), _ = looked_again(
+        [model],
+        path,
+        tmp_path / "scratch",
+        partial(mapping._adjusted, 1, photos, pycolmap.CancellationToken()),
+    )
+    assert strange not in numbers(found) and lost in numbers(found)
+    others = [number for number in truth if number != strange]
+    assert numbers(found) == sorted(others)
+
+
+def test_level_photos_of_flat_ground_tell_directions(made):
+    """All matches of a pair shift alike, as a watermark would."""
+    rays = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2)).astype(np.float32)
+    shifted = rays + np.float32([0.1, 0.0])
+    still = pycolmap.Rigid3d()
+    sight = Sight(1, still, (600.0, 600.0), (rays, shifted), np.arange(200))
+    relative = sight.relative()
+    assert relative is not None
+    assert np.allclose(relative.rotation.matrix(), np.eye(3), atol=0.05)
 
 
 def test_one_pair_alone_places_nothing(made):

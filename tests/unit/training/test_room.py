@@ -183,6 +183,34 @@ def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
     assert not torch.equal(means(0), means(1))
 
 
+def test_random_points_know_nothing_of_the_rows_of_sfm_points():
+    """A scene with more SfM points than random ones: views know them by large rows."""
+    scene = sample_scene()
+    rows = np.arange(30_000) % len(scene.points)
+    views = tuple(replace(view, seen=np.array([29_999])) for view in scene.views)
+    scene = replace(
+        scene, views=views, points=scene.points[rows], point_colors=scene.point_colors[rows]
+    )
+    config = RunConfig(steps=4, max_gaussians=300, reading={"init": "random"})
+    setup = assemble(config, scene, "none")
+    assert first_state(setup).primitives(setup) == 300
+
+
+def test_a_bound_is_kept_where_many_points_make_one_anchor():
+    scene = sample_scene()
+    spread = np.random.default_rng(0).uniform(-1, 1, (4_000, 3))
+    colors = np.zeros((4_000, 3), dtype=np.uint8)
+    scene = replace(scene, points=spread, point_colors=colors)
+    scene = replace(scene, views=tuple(replace(v, seen=np.arange(9)) for v in scene.views))
+    wide = {"name": "scaffold", "voxel_size": 0.4}
+    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide)
+    whole = first_state(setup := assemble(config, scene, "none")).primitives(setup)
+    assert whole < 400  # Ten points and more in each.
+    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide, max_gaussians=whole // 2)
+    setup = assemble(config, scene, "none")
+    assert 0 < first_state(setup).primitives(setup) <= whole // 2
+
+
 def test_points_that_a_start_added_are_kept_where_they_fit():
     scene = sample_scene()
     count = len(scene.points)
