@@ -37,7 +37,7 @@ _SAME_ROTATION, _SAME_DIRECTION = 0.9962, 0.9994
 
 @dataclass(frozen=True, order=True)
 class Support:
-    """What speaks for a place: agreeing matches, and the pairs that they are of."""
+    """Evidence for a place: agreeing matches, and the pairs that they are of."""
 
     matches: int = 0
     pairs: int = 0

@@ -35,7 +35,7 @@ Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
 
 @dataclass(frozen=True)
 class Look:
-    """What pairs say of doubtful photos.
+    """The places of doubtful photos by their pairs.
 
     Attributes:
         better: Photo -> a pose that more speaks for than for its own, or that it has none yet.
