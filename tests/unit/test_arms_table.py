@@ -1,24 +1,16 @@
 """`benchmarks/arms.py`: a row for each scene and arm, with what it cost and the code that ran."""
 
-import runpy
-import sys
-from pathlib import Path
-
 import pytest
 from support.run_folders import RunFolder
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from support.scripts import printed_by
 
 
 @pytest.fixture
 def printed(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["arms.py", *map(str, arguments)])
-        runpy.run_path(str(BENCHMARKS / "arms.py"), run_name="__main__")
+        out = printed_by("arms.py", arguments, monkeypatch, capsys)
         # Of several tables the last one.
-        head, rule, *rows = capsys.readouterr().out.rpartition("\n\n")[2].splitlines()
+        head, rule, *rows = out.rpartition("\n\n")[2].splitlines()
         assert set(rule) == {"|", "-"}
         titles = [cell.strip() for cell in head.strip("|").split("|")]
         cells = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)

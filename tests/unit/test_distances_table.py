@@ -1,26 +1,19 @@
 """`benchmarks/distances.py`: figures on views elsewhere in bands of distance, near ones first."""
 
 import csv
-import runpy
-import sys
-from pathlib import Path
 
 import pytest
 from support.run_folders import RunFolder
 from support.scenes import write_tiny_scene
+from support.scripts import printed_by
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 NAMES = [f"{folder}/{number:04}.png" for folder in ("street", "aerial") for number in range(4)]
 
 
 @pytest.fixture
 def printed(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["distances.py", *map(str, arguments)])
-        runpy.run_path(str(BENCHMARKS / "distances.py"), run_name="__main__")
-        tables = capsys.readouterr().out.rstrip().split("\n\n")
+        tables = printed_by("distances.py", arguments, monkeypatch, capsys).rstrip().split("\n\n")
         return [[line.strip("|").split("|") for line in each.splitlines()] for each in tables]
 
     return run

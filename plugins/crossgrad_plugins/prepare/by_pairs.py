@@ -99,14 +99,14 @@ class Pairs:
     """All verified pairs of a database, as a model sees them.
 
     Args:
-        model: Poses and cameras.
+        model: Its cameras are taken.
         database: COLMAP's database, open.
     """
 
     def __init__(self, model: "pycolmap.Reconstruction", database: "pycolmap.Database") -> None:
         import pycolmap
 
-        self.model, self.rays = model, Rays(model, database)
+        self.rays = Rays(model, database)
         self.matches: dict[tuple[int, int], NDArray[np.int64]] = {}
         self.partners: dict[int, list[int]] = {}
         pairs, counts = database.read_two_view_geometry_num_inliers()
