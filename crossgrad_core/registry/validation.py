@@ -1,12 +1,16 @@
 """Pydantic's validation errors in the words of a user error."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from types import NoneType, UnionType
+from typing import Annotated, TypeAlias, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.wording import did_you_mean, listed, sentences
+
+_Location: TypeAlias = Sequence[int | str]
 
 _PREFIXES = ("Input should be ", "Value error, ", "Assertion failed, ")
 
@@ -24,40 +28,80 @@ def as_user_error(
         todo: What the user can do about it.
     """
     details = error.errors(include_url=False)
-    first, others = details[0], details[1:]
-    more = f"also wrong: {listed(_path(each['loc']) for each in others)}" if others else ""
-    options = _options(model, first["loc"][:-1])
-    key = _path(first["loc"])
+    first = details[0]
+    place, holder = _place(model, first["loc"])
+    # A value that fits no branch of a union is reported once for each branch.
+    branches = [each for each in details if _place(model, each["loc"])[0] == place]
+    paths = dict.fromkeys(".".join(_place(model, each["loc"])[0]) for each in details)
+    key, *others = paths
+    more = f"also wrong: {listed(others)}" if others else ""
     where = ".".join(part for part in (prefix, key) if part) or subject
     if first["type"] == "extra_forbidden":
+        options = list(holder.model_fields) if holder else []
         return UserError(
             f"{subject} has no option {key!r}",
             where=where,
             expected=f"one of {listed(options)}" if options else "no options; it has none",
-            todo=sentences(did_you_mean(str(first["loc"][-1]), options), more, todo),
+            todo=sentences(did_you_mean(place[-1], options), more, todo),
         )
     return UserError(
         f"option {key} of {subject} is not valid" if key else f"{subject} is not valid",
         where=where,
-        expected=_expected(first),
+        expected=", or ".join(dict.fromkeys(_expected(each) for each in branches)),
         found=_found(first),
         todo=sentences(more, todo),
     )
 
 
-def _path(location: Iterable[int | str]) -> str:
-    return ".".join(str(part) for part in location)
+def _place(
+    model: type[BaseModel], location: _Location
+) -> tuple[tuple[str, ...], type[BaseModel] | None]:
+    """The place in the input that a location of pydantic means, and the model that holds it.
+
+    A location also names the branch of a union that was tried, which no user has written.
+    """
+    parts: list[str] = []
+    holder: type[BaseModel] | None = None
+    annotation: object = model
+    rest = list(location)
+    while rest:
+        annotation, branches = _unwrapped(annotation)
+        if len(branches) > 1:
+            label = str(rest.pop(0))
+            annotation = next((each for each in branches if _name(each) == label), None)
+            continue
+        part = str(rest.pop(0))
+        parts.append(part)
+        holder, annotation = _inside(annotation, part)
+    return tuple(parts), holder
 
 
-def _options(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
-    """Field names of the model at a place inside `model`; empty where there is none."""
-    for part in location:
-        field = model.model_fields.get(str(part))
-        inner = field.annotation if field else None
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            return []
-        model = inner
-    return list(model.model_fields)
+def _unwrapped(annotation: object) -> tuple[object, Sequence[object]]:
+    """An annotation without `Annotated` and `None`, and its branches where it is a union."""
+    while True:
+        if get_origin(annotation) is Annotated:
+            annotation = get_args(annotation)[0]
+        elif get_origin(annotation) in (Union, UnionType):
+            branches = [each for each in get_args(annotation) if each is not NoneType]
+            if len(branches) > 1:
+                return annotation, branches
+            annotation = branches[0]
+        else:
+            return annotation, ()
+
+
+def _name(annotation: object) -> str:
+    return getattr(_unwrapped(annotation)[0], "__name__", "")
+
+
+def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
+    """The model that holds a part, if it is one, and the annotation of that part."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        field = annotation.model_fields.get(part)
+        return annotation, field.annotation if field else None
+    # The values of a list, a tuple or a mapping.
+    arguments = [each for each in get_args(annotation) if each is not ...]
+    return None, arguments[-1] if arguments else None
 
 
 def _expected(detail: ErrorDetails) -> str:

@@ -1,7 +1,9 @@
 """Validation errors of nested configurations."""
 
+from typing import Annotated, Literal
+
 import pytest
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError, field_validator
 
 from crossgrad_core.registry.validation import as_user_error
 
@@ -66,3 +68,33 @@ def test_an_error_of_the_whole_names_the_whole():
 @pytest.mark.parametrize("values", [{"": 3}, 3])
 def test_what_has_no_name_is_placed_too(values):
     assert explained(Outer, values).where == "a run"
+
+
+class Unions(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    count: Annotated[PositiveInt | Literal["auto"] | None, "help"] = None
+    up: Literal["auto"] | tuple[float, float, float] = "auto"
+    parts: list[Inner | Outer] = []
+    inner: Inner | None = None
+
+
+def test_a_value_that_fits_no_branch_of_a_union_is_told_once_with_what_each_would_take():
+    error = explained(Unions, {"count": 0})
+    assert error.where == "count"
+    assert error.what == "option count of a run is not valid"
+    assert error.expected == "greater than 0, or 'auto'"
+    assert error.todo == "read the help"
+
+
+def test_a_place_inside_a_branch_is_told_without_the_branch():
+    error = explained(Unions, {"up": (0, "x", 0), "count": "many"})
+    assert error.where == "count"
+    assert error.todo == "also wrong: up, up.1; read the help"
+
+
+def test_an_unknown_key_in_a_branch_suggests_the_keys_of_that_branch():
+    error = explained(Unions, {"parts": [{"inner": {"sise": 1}}]})
+    assert error.where == "parts.0.inner"
+    assert error.expected == "one of size"
+    assert explained(Unions, {"inner": {"sise": 1}}).todo == "did you mean 'size'?; read the help"
