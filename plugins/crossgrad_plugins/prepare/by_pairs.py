@@ -96,17 +96,19 @@ class Sight:
 
 
 class Pairs:
-    """All verified pairs of a database, as a model sees them.
+    """All verified pairs of a database, as cameras see them.
 
     Args:
-        model: Its cameras are taken.
+        cameras: By number; those of the database where one is missing.
         database: COLMAP's database, open.
     """
 
-    def __init__(self, model: "pycolmap.Reconstruction", database: "pycolmap.Database") -> None:
+    def __init__(
+        self, cameras: "Mapping[int, pycolmap.Camera]", database: "pycolmap.Database"
+    ) -> None:
         import pycolmap
 
-        self.rays = Rays(model, database)
+        self.rays = Rays(cameras, database)
         self.matches: dict[tuple[int, int], NDArray[np.int64]] = {}
         self.partners: dict[int, list[int]] = {}
         pairs, counts = database.read_two_view_geometry_num_inliers()

@@ -113,7 +113,7 @@ def _judged(
     import pycolmap
 
     poses = {number: model.image(number).cam_from_world() for number in model.reg_image_ids()}
-    rays = Rays(model, database)
+    rays = Rays(dict(model.cameras.items()), database)
     pairs, counts = database.read_two_view_geometry_num_inliers()
     for pair, count in zip(pairs, counts, strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)

@@ -1,5 +1,6 @@
 """Features of photos as rays, and how far matches are from what two poses make of them."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +14,14 @@ class Rays:
     """Features of photos without lens distortion, read when they are asked for, and kept.
 
     Args:
-        model: Its cameras are taken; those of the database for photos that it does not have.
+        cameras: By number; those of the database where one is missing.
         database: COLMAP's database, open.
     """
 
-    def __init__(self, model: "pycolmap.Reconstruction", database: "pycolmap.Database") -> None:
-        self._model, self._database = model, database
+    def __init__(
+        self, cameras: "Mapping[int, pycolmap.Camera]", database: "pycolmap.Database"
+    ) -> None:
+        self._given, self._database = cameras, database
         self._cameras: dict[int, pycolmap.Camera] = {}
         self._rays: dict[int, NDArray[np.float32]] = {}
 
@@ -27,9 +30,7 @@ class Rays:
         if number not in self._cameras:
             camera = self._database.read_image(number).camera_id
             self._cameras[number] = (
-                self._model.camera(camera)
-                if camera in self._model.cameras
-                else self._database.read_camera(camera)
+                self._given[camera] if camera in self._given else self._database.read_camera(camera)
             )
         return self._cameras[number]
 

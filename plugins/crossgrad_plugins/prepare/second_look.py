@@ -40,10 +40,12 @@ class Look:
     Attributes:
         better: Photo -> a pose that more speaks for than for its own, or that it has none yet.
         settled: Photos with a pose for which there is no better one.
+        agreeing: Matches that agree with the poses of the model, over all photos.
     """
 
     better: Poses
     settled: frozenset[int]
+    agreeing: int
 
 
 def looked_again(
@@ -63,29 +65,36 @@ def looked_again(
         cancelled: Whether nobody waits for the answer any more; asked at every photo.
 
     Returns:
-        The models, and photos of the largest one for which no better place is known, though pairs
-        speak against theirs.
+        The models, the largest one as it was when most matches agreed with its poses, and photos
+        of it for which no better place is known, though pairs speak against theirs.
     """
     if not models:
         return [], frozenset()
+    import pycolmap
+
     main, *others = sorted(models, key=lambda model: -model.num_reg_images())
     again = _Again(database, scratch / "pairs.db", others, cancelled)
-    look, moved = again.look(main), set[int]()
+    look, moved = again.look(main), frozenset[int]()
+    best, seen, gone = main, look, moved
     for number in range(_ROUNDS):
         if not look.better or cancelled():
             break
-        again.move(main, look)
+        changed = pycolmap.Reconstruction(main)
+        again.move(changed, look)
         moved |= look.better.keys()
         place = scratch / str(number)
         place.mkdir()
-        main.write(place)
+        changed.write(place)
         main = adjust(again.copy, place)
         look = again.look(main)
-    here = set(main.reg_image_ids())
+        # What speaks for a photo alone need not hold for all that were moved with it.
+        if look.agreeing >= seen.agreeing:
+            best, seen, gone = main, look, moved
+    here = set(best.reg_image_ids())
     for model in others:
-        for photo in (here & moved).intersection(model.reg_image_ids()):
+        for photo in (here & gone).intersection(model.reg_image_ids()):
             model.deregister_frame(model.image(photo).frame_id)
-    return [main, *others], look.settled & here
+    return [best, *others], seen.settled & here
 
 
 class _Again:
@@ -94,7 +103,7 @@ class _Again:
     Args:
         database: COLMAP's database; only read.
         copy: A copy of it, made when it is needed, in which pairs are laid aside.
-        others: The other models.
+        others: The other models; cameras that the largest one lacks are taken as they have them.
         cancelled: Whether nobody waits for the answer any more.
     """
 
@@ -103,12 +112,20 @@ class _Again:
     ) -> None:
         self._database, self.copy, self._others = database, copy, others
         self._cancelled = cancelled
+        self._cameras = {
+            number: camera
+            for model in reversed(others)
+            for number, camera in _cameras_of(model).items()
+        }
         self._aside: frozenset[tuple[int, int]] = frozenset()
 
     def look(self, model: "pycolmap.Reconstruction") -> Look:
         """What pairs say of the photos that are doubtful in a model, or not in it."""
         with _opened(self._database) as database:
-            return self._look(model, Pairs(model, database), self._elsewhere(database))
+            return self._look(model, self._pairs(model, database), self._elsewhere(database))
+
+    def _pairs(self, model: "pycolmap.Reconstruction", database: "pycolmap.Database") -> Pairs:
+        return Pairs({**self._cameras, **_cameras_of(model)}, database)
 
     def _look(
         self,
@@ -117,12 +134,13 @@ class _Again:
         elsewhere: Mapping[int, Support],
     ) -> Look:
         poses = poses_of(model)
-        better, settled = {}, set[int]()
+        better, settled, agreeing = {}, set[int](), 0
         for photo in sorted(pairs.partners):
             if self._cancelled():
                 break
             sights = pairs.sights(photo, poses)
             here = support(sights, poses[photo]) if photo in poses else Support()
+            agreeing += here.matches
             matches = sum(len(sight.features) for sight in sights)
             if photo in poses and here.matches >= _DOUBTFUL * matches:
                 continue
@@ -133,13 +151,13 @@ class _Again:
                 better[photo] = pose
             elif photo in poses and here.enough and there <= here:
                 settled.add(photo)
-        return Look(better, frozenset(settled))
+        return Look(better, frozenset(settled), agreeing)
 
     def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
         """What speaks for the poses in the other models, by their own cameras."""
         found = {}
         for model in self._others:
-            pairs, poses = Pairs(model, database), poses_of(model)
+            pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
             for photo, pose in poses.items():
                 found[photo] = support(pairs.sights(photo, poses), pose)
         return found
@@ -153,8 +171,8 @@ class _Again:
             shutil.copyfile(self._database, self.copy)
         with _opened(self._database) as database, _opened(self.copy) as copied:
             for photo, pose in look.better.items():
-                _place(model, database, photo, pose)
-            pairs, poses = Pairs(model, database), poses_of(model)
+                _place(model, database, self._cameras, photo, pose)
+            pairs, poses = self._pairs(model, database), poses_of(model)
             for photo in look.better:
                 if not support(pairs.sights(photo, poses), poses[photo]).enough:
                     model.deregister_frame(model.image(photo).frame_id)
@@ -186,21 +204,31 @@ def poses_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Rigid3d]":
     return {photo: model.image(photo).cam_from_world() for photo in model.reg_image_ids()}
 
 
+def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]":
+    """The cameras of photos with poses, which mapping has refined."""
+    numbers = {model.image(photo).camera_id for photo in model.reg_image_ids()}
+    return {number: model.camera(number) for number in numbers}
+
+
 def _place(
     model: "pycolmap.Reconstruction",
     database: "pycolmap.Database",
+    cameras: "Mapping[int, pycolmap.Camera]",
     photo: int,
     pose: "pycolmap.Rigid3d",
 ) -> None:
-    """Gives a photo a pose in a model, which need not have it yet."""
+    """Gives a photo a pose in a model, which need not have it, or its camera, yet."""
     import pycolmap
 
     image = database.read_image(photo)
     number = image.frame_id
+    known = cameras.get(image.camera_id)
+    if known and model.exists_camera(image.camera_id) and image.camera_id not in _cameras_of(model):
+        model.camera(image.camera_id).params = list(known.params)
     if photo not in model.images:
         frame = database.read_frame(number)
         if not model.exists_camera(image.camera_id):
-            model.add_camera(database.read_camera(image.camera_id))
+            model.add_camera(known or database.read_camera(image.camera_id))
         if not model.exists_rig(frame.rig_id):
             model.add_rig(database.read_rig(frame.rig_id))
         if not model.exists_frame(number):

@@ -217,6 +217,60 @@ def test_a_photo_goes_over_from_a_smaller_model(made, tmp_path):
     assert all(close_to(poses_of(large)[number], truth[number]) for number in truth)
 
 
+def test_a_round_that_fewer_matches_agree_with_is_not_kept(made):
+    """Mapping goes on and throws all photos but two about, as often as it is asked."""
+    model, path = made
+    truth, lost = truth_of(model), numbers(model)[0]
+    misplace(model, lost)
+    before = truth_of(model)
+
+    def thrown_about(_, place):
+        thrown = pycolmap.Reconstruction(place)
+        for turn, number in enumerate(numbers(thrown)[2:]):
+            for _ in range(turn + 1):
+                misplace(thrown, number)
+        return thrown
+
+    (found,), _ = looked_again([model], path, path.parent / "scratch", thrown_about)
+    assert truth_of(found)[lost] == pytest.approx(before[lost])
+    assert all(
+        close_to(pose, truth[number]) for number, pose in poses_of(found).items() if number != lost
+    )
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_camera_that_the_largest_model_lacks_is_taken_as_another_one_has_it(tmp_path, is_there):
+    """Each photo has its own camera; the database only guesses their focal lengths."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = PHOTOS, 1, POINTS
+    pycolmap.set_random_seed(0)
+    path = tmp_path / "database.db"
+    database = pycolmap.Database.open(path)
+    model = pycolmap.synthesize_dataset(options, database)
+    known = {number: camera.params.copy() for number, camera in model.cameras.items()}
+    for number in known:
+        camera = database.read_camera(number)
+        camera.params = camera.params * np.array([1.6, *[1.0] * (len(camera.params) - 1)])
+        database.update_camera(camera)
+    database.close()
+    truth, lost = truth_of(model), numbers(model)[0]
+    camera = model.image(lost).camera_id
+    for name in ("small", "scratch"):
+        (tmp_path / name).mkdir()
+    model.write(tmp_path / "small")
+    small = pycolmap.Reconstruction(tmp_path / "small")
+    for number in numbers(model)[3:]:
+        small.deregister_frame(small.image(number).frame_id)
+    model.deregister_frame(model.image(lost).frame_id)
+    model.camera(camera).params = known[camera] * np.array([1.6, *[1.0] * (len(known[camera]) - 1)])
+    if not is_there:
+        model.tear_down()
+    assert model.exists_camera(camera) == is_there
+    (found, _), _ = looked_again([model, small], path, tmp_path / "scratch", Adjust())
+    assert close_to(poses_of(found)[lost], truth[lost])
+    assert found.camera(camera).params == pytest.approx(known[camera])
+
+
 def test_nothing_is_moved_when_nobody_waits(made):
     model, path = made
     misplace(model, numbers(model)[0])
@@ -233,7 +287,7 @@ def test_what_speaks_for_a_place(made):
     model, path = made
     number = numbers(model)[0]
     database = pycolmap.Database.open(path)
-    pairs = Pairs(model, database)
+    pairs = Pairs(model.cameras, database)
     sights = pairs.sights(number, poses_of(model))
     database.close()
     assert len(sights) == PHOTOS - 1
