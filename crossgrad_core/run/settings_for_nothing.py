@@ -21,7 +21,7 @@ from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
 
 _SLOTS = ("grouping", *ALWAYS)
-_TIMES = ("densify_from", "densify_until", "densify_every", "fewest_edits", "max_gaussians")
+_TIMES = ("densify_from", "densify_until", "densify_every", "fewest_edits")
 
 
 def refuse_labels_for_nothing(setup: Setup) -> None:
@@ -99,6 +99,11 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
         yield "reset_every", f"densifier {name} resets no opacities"
     if config.growth == "curve" and not densifier.edits:
         yield "growth", f"densifier {name} never edits"
+    # A number bounds the start of points, too.
+    if not densifier.edits and config.max_gaussians == AUTO:
+        yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
+    elif not densifier.edits and config.max_gaussians and config.reading.init_file is not None:
+        yield "max_gaussians", f"densifier {name} never edits, and a PLY is taken as it is"
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -81,7 +81,8 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
     if bound is None or bound == AUTO or present <= bound:
         return parameters, None
-    wanted = (BEGINNING if setup.schedule.grows else 1.0) * bound
+    grows = setup.densifier.edits and setup.schedule.grows
+    wanted = (BEGINNING if grows else 1.0) * bound
     share, made = wanted / present, present
     while made > bound and share * len(begun.points) >= 1.0:
         parameters = setup.backbone.create(thinned(begun, share, rng), rng)

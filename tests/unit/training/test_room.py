@@ -167,10 +167,12 @@ def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
         assert state.primitives(setup) == whole and told_of_start(state) == ()
 
 
-def test_without_density_control_all_of_the_bound_is_there_at_once():
-    config = RunConfig(start={"name": "sfm"}, steps=4, max_gaussians=9)
+@pytest.mark.parametrize(
+    "settings", [{"steps": 4}, {"steps": 2_000, "densifier": {"name": "none"}}]
+)
+def test_without_density_control_all_of_the_bound_is_there_at_once(settings):
+    config = RunConfig(start={"name": "sfm"}, max_gaussians=9, **settings)
     setup = assemble(config, sample_scene(), "none")
-    assert not setup.schedule.grows
     assert first_state(setup).primitives(setup) == 9
 
 

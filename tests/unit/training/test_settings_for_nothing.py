@@ -11,10 +11,12 @@ from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.app import run
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.export import export_scene
 from crossgrad_core.run.opening import set_up
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.start import first_state
 
 IDLE = [
     (
@@ -73,7 +75,7 @@ IDLE = [
     ({"grouping": {"name": "radial"}}, "grouping"),
     ({"grouping": {"name": "radial"}, "sampler": {"name": "random-split"}}, "grouping"),
     ({"densifier": {"name": "none"}, "densify_every": 10}, "densify_every"),
-    ({"densifier": {"name": "none"}, "max_gaussians": 10}, "max_gaussians"),
+    ({"densifier": {"name": "none"}, "max_gaussians": "auto"}, "max_gaussians"),
     ({"densifier": {"name": "none"}, "growth": "curve"}, "growth"),
     ({"densifier": {"name": "none"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
@@ -145,6 +147,7 @@ AT_WORK = [
     {"grouping": {"name": "gmm"}, "operator": {"name": "gradnorm"}},
     {"grouping": {"name": "gmm"}, "observers": [{"name": "diagnostics"}]},
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
+    {"densifier": {"name": "none"}, "max_gaussians": 10},
     {"max_gaussians": "auto", "growth": "curve"},
     {"densifier": {"name": "adc"}, "growth": "curve"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
@@ -182,6 +185,17 @@ def test_settings_that_do_something_are_not(settings):
     # What a run wrote down repeats it.
     config = resolved(setup)
     refuse_settings_for_nothing(config, assemble(config, sample_scene(), "none"))
+
+
+def test_gaussians_of_a_file_are_not_bounded(tmp_path):
+    setup = assemble(RunConfig(steps=4), sample_scene(), "none")
+    export_scene(setup, first_state(setup), tmp_path / "start.ply")
+    settings = {"reading": {"init": str(tmp_path / "start.ply")}, "max_gaussians": 10}
+    refusal(settings)
+    with pytest.raises(UserError) as caught:
+        refusal({**settings, "densifier": {"name": "none"}})
+    assert caught.value.where == "max_gaussians"
+    assert "a PLY is taken as it is" in caught.value.found
 
 
 @pytest.mark.parametrize("slot", ["backbones", "samplers", "operators", "rasterizers"])
