@@ -18,6 +18,7 @@ from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.run.results.lock import locked, writer_of
+from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
@@ -81,6 +82,7 @@ __all__ = [
     "check_file",
     "check_folder",
     "chosen",
+    "clear_half_written",
     "configured",
     "counting_of",
     "did_you_mean",

@@ -9,15 +9,23 @@ from numpy.typing import NDArray
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.prepare.plan import Plan, Position
 
+#: Degrees of longitude in half a turn.
+_HALF = 180.0
+
 
 def origin_of(plan: Plan) -> Position | None:
     """The middle of where the photos were taken; None where none has GPS."""
     places = [photo.position for photo in plan.located if photo.position is not None]
     if not places:
         return None
+    longitudes = [place.longitude for place in places]
+    if max(longitudes) - min(longitudes) > _HALF:
+        # On both sides of the date line.
+        longitudes = [each % (2 * _HALF) for each in longitudes]
+    east = median(longitudes)
     return Position(
         latitude=median(place.latitude for place in places),
-        longitude=median(place.longitude for place in places),
+        longitude=east - 2 * _HALF if east > _HALF else east,
         altitude=median(place.altitude for place in places),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import UserError, check_folder, disk_errors
+from crossgrad_core.commands import UserError, check_folder, clear_half_written, disk_errors
 
 #: The folder of what is needed on the way, and the file that says that `prepare` made it.
 WORK: Final = "prepare"
@@ -61,6 +61,11 @@ class Layout:
     def placed(self) -> Path:
         """The model of the scene, in its place on Earth where that is known."""
         return self.work / "placed"
+
+    @property
+    def undistorted(self) -> Path:
+        """Photos on their way to their place; only its scratch folder is ever there."""
+        return self.work / "undistorted"
 
     @property
     def images(self) -> Path:
@@ -129,18 +134,29 @@ def emptied(folder: Path) -> Path:
         UserError: The disk is full, or the folder may not be written to.
     """
     with disk_errors(folder):
-        shutil.rmtree(folder, ignore_errors=True)
+        _delete(folder)
         folder.mkdir(parents=True)
     return folder
 
 
 def clear_leftovers(layout: Layout) -> None:
-    """Deletes what a killed process left half-made; only one process works in the folder."""
+    """Deletes what a killed process left half-made; only one process works in the folder.
+
+    Other hidden files and folders are the user's, such as those of version control.
+    """
+    for made in (layout.undistorted, layout.placed, layout.models):
+        _delete(scratch_of(made))
     for folder in (layout.work, layout.scene):
-        for path in folder.glob(".*"):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        clear_half_written(folder)
     for path in layout.masks.rglob(".*.tmp.png"):
         path.unlink()
+
+
+def _delete(path: Path) -> None:
+    if path.is_symlink():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
 
 
 def scratch_of(path: Path) -> Path:

@@ -110,7 +110,8 @@ def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]
     """The models of a folder in the order of their numbers."""
     import pycolmap
 
-    for path in sorted(folder.iterdir(), key=lambda path: int(path.name)):
+    models = [path for path in folder.iterdir() if path.name.isdecimal()]
+    for path in sorted(models, key=lambda path: int(path.name)):
         with quiet():
             yield path, pycolmap.Reconstruction(path)
 

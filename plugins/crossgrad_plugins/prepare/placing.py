@@ -24,6 +24,8 @@ _AGREEING: Final = 0.6
 _SPREAD: Final = 3.0
 #: Cameras that lie less across their line than this share of its length have no direction but it.
 _STRAIGHT: Final = 0.05
+#: So many photos of a line are compared with each other, at most.
+_ASKED: Final = 1_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,8 @@ def _on_a_line(
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
     """A similarity of points [N, 3] on a line, with any roll about it, and which agree with it.
 
-    Its scale and direction are the medians of those of all pairs (Theil and Sen).
+    Its scale and direction are the medians of those of all pairs (Theil and Sen); of many photos,
+    of those of some all along it.
     """
     import pycolmap
     from scipy.spatial.transform import Rotation
@@ -148,7 +151,8 @@ def _on_a_line(
     if across > _STRAIGHT * along:
         return None
     places = (here - middle) @ direction
-    first, second = np.triu_indices(len(places), 1)
+    asked = np.linspace(0, len(places) - 1, min(len(places), _ASKED)).astype(np.int64)
+    first, second = (asked[rows] for rows in np.triu_indices(len(asked), 1))
     gaps = places[first] - places[second]
     apart = np.abs(gaps) > _STRAIGHT * along
     slopes = (there[first] - there[second])[apart] / gaps[apart, None]

@@ -150,7 +150,7 @@ def _gps(report: Report) -> Iterator[str]:
     elif located:
         yield f"GPS: {located} photos have it, but {report.result.parts[0].unplaced}"
     else:
-        yield "GPS: no photo has it; scale and direction of the scene are arbitrary"
+        yield "GPS: no photo has it and an altitude; the scene's scale and direction are arbitrary"
 
 
 def _missing(report: Report, most: int) -> Iterator[str]:

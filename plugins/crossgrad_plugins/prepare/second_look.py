@@ -7,6 +7,7 @@ come first. So doubtful photos are placed once more, by all their pairs (by_pair
 contradict the poses are laid aside, points are made anew, and mapping goes on from there.
 """
 
+import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -26,6 +27,9 @@ _ROUNDS: Final = 5
 #: A photo is doubtful where less than this share of its matches agrees with its place; another
 #: place has to have so many times as many agreeing matches.
 _DOUBTFUL, _BETTER = 0.6, 1.3
+#: Least and most focal length in photo sizes, and most lens distortion: COLMAP's own limits.
+_POSSIBLE: Final = (0.1, 10.0, 1.0)
+_LOG = logging.getLogger(__name__)
 
 Models: TypeAlias = "list[pycolmap.Reconstruction]"
 #: Makes points anew for the model in a folder, by a database, and goes on mapping from there.
@@ -73,7 +77,7 @@ def looked_again(
     import pycolmap
 
     main, *others = sorted(models, key=lambda model: -model.num_reg_images())
-    again = _Again(database, scratch / "pairs.db", others, cancelled)
+    again = _Again(database, scratch / "pairs.db", main, others, cancelled)
     look, moved = again.look(main), frozenset[int]()
     best, seen, gone = main, look, moved
     for number in range(_ROUNDS):
@@ -85,7 +89,12 @@ def looked_again(
         place = scratch / str(number)
         place.mkdir()
         changed.write(place)
-        main = adjust(again.copy, place)
+        try:
+            main = adjust(again.copy, place)
+        except (RuntimeError, ValueError) as error:
+            _LOG.warning("doubtful photos stay where they are: pycolmap failed: %s", error)
+            break
+        _leave_out_impossible(main)
         look = again.look(main)
         # What speaks for a photo alone need not hold for all that were moved with it.
         if look.agreeing >= seen.agreeing:
@@ -103,20 +112,23 @@ class _Again:
     Args:
         database: COLMAP's database; only read.
         copy: A copy of it, made when it is needed, in which pairs are laid aside.
-        others: The other models; cameras that the largest one lacks are taken as they have them.
+        main: The largest model.
+        others: The other models.
         cancelled: Whether nobody waits for the answer any more.
     """
 
     def __init__(
-        self, database: Path, copy: Path, others: Models, cancelled: Callable[[], bool]
+        self,
+        database: Path,
+        copy: Path,
+        main: "pycolmap.Reconstruction",
+        others: Models,
+        cancelled: Callable[[], bool],
     ) -> None:
         self._database, self.copy, self._others = database, copy, others
         self._cancelled = cancelled
-        self._cameras = {
-            number: camera
-            for model in reversed(others)
-            for number, camera in _cameras_of(model).items()
-        }
+        with _opened(database) as opened:
+            self._cameras = _best_known([main, *others], opened)
         self._aside: frozenset[tuple[int, int]] = frozenset()
 
     def look(self, model: "pycolmap.Reconstruction") -> Look:
@@ -208,6 +220,40 @@ def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]
     """The cameras of photos with poses, which mapping has refined."""
     numbers = {model.image(photo).camera_id for photo in model.reg_image_ids()}
     return {number: model.camera(number) for number in numbers}
+
+
+def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pycolmap.Camera]":
+    """Every camera as the first of the models has refined it, else with a better guess.
+
+    A focal length that nothing is known of is a guess from the size of the photos. What mapping
+    made of the same guess for other cameras corrects it: places by a wrong one are far off, and
+    adjusting all together does not always come back from there.
+    """
+    known: dict[int, pycolmap.Camera] = {}
+    for model in models:
+        known = {**_cameras_of(model), **known}
+    guessed = [
+        camera for camera in database.read_all_cameras() if not camera.has_prior_focal_length
+    ]
+    ratios = [
+        known[camera.camera_id].mean_focal_length() / camera.mean_focal_length()
+        for camera in guessed
+        if camera.camera_id in known
+    ]
+    for camera in guessed:
+        if ratios and camera.camera_id not in known:
+            for place in camera.focal_length_idxs():
+                camera.params[place] *= float(np.median(ratios))
+            known[camera.camera_id] = camera
+    return known
+
+
+def _leave_out_impossible(model: "pycolmap.Reconstruction") -> None:
+    """Takes photos out whose camera no lens has; their matches may agree all the same."""
+    for photo in list(model.reg_image_ids()):
+        image = model.image(photo)
+        if model.camera(image.camera_id).has_bogus_params(*_POSSIBLE):
+            model.deregister_frame(image.frame_id)
 
 
 def _place(

@@ -35,7 +35,7 @@ def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
         model = pycolmap.Reconstruction(layout.placed)
     images = [model.image(number) for number in model.reg_image_ids()]
     names = sorted(image.name for image in images)
-    work = scratch_of(layout.work / "undistorted")
+    work = scratch_of(layout.undistorted)
     done = [name for name in names if (layout.images / name).is_file()]
     left = [name for name in names if name not in set(done)]
     for start in range(0, max(1, len(left)), _BATCH):
@@ -54,7 +54,7 @@ def _undistort(layout: Layout, plan: Plan, names: Sequence[str], threads: int, f
     """Writes some photos and the model of all to the scratch folder."""
     import pycolmap
 
-    work = emptied(scratch_of(layout.work / "undistorted"))
+    work = emptied(scratch_of(layout.undistorted))
     waited(
         "undistorting photos",
         lambda token: pycolmap.undistort_images(

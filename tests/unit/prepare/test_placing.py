@@ -1,9 +1,12 @@
 """Models on Earth: similarities from GPS with outliers, and models that GPS joins."""
 
+import tracemalloc
+
 import numpy as np
 import pycolmap
 import pytest
 
+from crossgrad_plugins.prepare import placing
 from crossgrad_plugins.prepare.gravity import top_of
 from crossgrad_plugins.prepare.placing import centers_of, merged, placement_of
 
@@ -97,6 +100,18 @@ def test_on_a_straight_way_level_photos_tell_which_way_is_up(orientation, pitch,
     up = placement.similarity.rotation.matrix() @ wanted.rotation.matrix() @ [0.0, 0.0, 1.0]
     assert up[2] > np.cos(np.deg2rad(3.0))
     assert placement.rms < 0.5
+
+
+def test_a_long_straight_way_takes_no_memory_for_all_pairs_of_photos():
+    rng = np.random.default_rng(0)
+    here = np.arange(3_000.0)[:, None] * [1.0, 0.2, 0.0]
+    there = 4.0 * here + rng.normal(0.0, 0.5, here.shape)
+    tracemalloc.start()
+    similarity, agrees = placing._on_a_line(here, there)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert similarity.scale == pytest.approx(4.0, rel=1e-3) and agrees.all()
+    assert most < 100 * 2**20
 
 
 def test_on_a_straight_way_photos_that_all_look_aside_tell_nothing():

@@ -17,7 +17,8 @@ from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.app import prepared
-from crossgrad_plugins.prepare.plan import Plan, Settings
+from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.plan import Plan, Position, Settings
 from crossgrad_plugins.prepare.report import data_of, summary_lines
 from crossgrad_plugins.prepare.waiting import rows_of
 from crossgrad_plugins.readers.colmap import ColmapReader
@@ -132,6 +133,20 @@ def test_the_scene_lies_where_gps_says(report, scene, truth):
     assert any("residuals" in line for line in summary_lines(report))
 
 
+@pytest.mark.parametrize(
+    ("longitudes", "middle"), [((-70.0, -70.2, -70.1), -70.1), ((179.8, -179.6, 179.9), 179.9)]
+)
+def test_the_origin_lies_among_the_photos(report, longitudes, middle):
+    places = [Position(latitude=-17.0, longitude=each, altitude=5.0) for each in longitudes]
+    photos = [
+        photo.model_copy(update={"position": place})
+        for photo, place in zip(report.plan.used, places, strict=False)
+    ]
+    plan = report.plan.model_copy(update={"used": photos})
+    assert origin_of(plan).longitude == pytest.approx(middle)
+    assert max(np.linalg.norm(at) for at in local_positions(plan).values()) < 1e5
+
+
 def test_what_is_of_no_use_is_named_with_the_reason(report):
     why = {each.name: each.why for each in report.plan.left_out}
     assert set(why) == {"kite/cut.jpg", "phone.HEIC", "kite/icon.png", "mast/z.jpg"}
@@ -172,6 +187,25 @@ def test_again_it_changes_nothing(report, photos, scene):
     again = prepared(photos, scene, Settings())
     assert data_of(again) == data_of(report)
     assert content(scene) == before
+
+
+def test_hidden_files_of_others_stay_and_its_own_remains_go(report, photos, scene, tmp_path):
+    (scene / ".git").mkdir()
+    (scene / ".git" / "HEAD").write_text("ref")
+    (scene / ".cache").symlink_to(tmp_path)
+    (scene / "prepare" / "models" / ".DS_Store").write_text("")
+    before = content(scene)
+    (scene / "prepare" / ".models.tmp").mkdir()
+    (scene / ".report.md.12.tmp").write_text("half")
+    (scene / "prepare" / ".placed.tmp").symlink_to(tmp_path)
+    (scene / "report.json").unlink()
+    prepared(photos, scene, Settings())
+    assert content(scene).keys() == before.keys()
+    assert (scene / ".cache").is_symlink() and tmp_path.is_dir()
+    assert not list((scene / "prepare").glob(".*.tmp"))
+    shutil.rmtree(scene / ".git")
+    (scene / ".cache").unlink()
+    (scene / "prepare" / "models" / ".DS_Store").unlink()
 
 
 def test_without_its_last_stages_it_comes_out_the_same(report, photos, scene):

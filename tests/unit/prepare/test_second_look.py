@@ -16,14 +16,20 @@ PHOTOS, POINTS = 8, 120
 @pytest.fixture
 def made(tmp_path):
     """A model of a few photos of one camera with distortion, and the database of its matches."""
+    return made_of(tmp_path, rigs=1)
+
+
+def made_of(folder, rigs):
+    """The same with so many cameras."""
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, PHOTOS, POINTS
+    options.num_rigs, options.num_frames_per_rig = rigs, PHOTOS // rigs
+    options.num_points3D = POINTS
     pycolmap.set_random_seed(0)
-    path = tmp_path / "database.db"
+    path = folder / "database.db"
     database = pycolmap.Database.open(path)
     model = pycolmap.synthesize_dataset(options, database)
     database.close()
-    (tmp_path / "scratch").mkdir()
+    (folder / "scratch").mkdir()
     return model, path
 
 
@@ -238,16 +244,13 @@ def test_a_round_that_fewer_matches_agree_with_is_not_kept(made):
     )
 
 
+@pytest.mark.parametrize("in_other", [False, True])
 @pytest.mark.parametrize("is_there", [False, True])
-def test_a_camera_that_the_largest_model_lacks_is_taken_as_another_one_has_it(tmp_path, is_there):
+def test_a_camera_that_the_largest_model_lacks_is_as_others_tell(tmp_path, is_there, in_other):
     """Each photo has its own camera; the database only guesses their focal lengths."""
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = PHOTOS, 1, POINTS
-    pycolmap.set_random_seed(0)
-    path = tmp_path / "database.db"
-    database = pycolmap.Database.open(path)
-    model = pycolmap.synthesize_dataset(options, database)
+    model, path = made_of(tmp_path, rigs=PHOTOS)
     known = {number: camera.params.copy() for number, camera in model.cameras.items()}
+    database = pycolmap.Database.open(path)
     for number in known:
         camera = database.read_camera(number)
         camera.params = camera.params * np.array([1.6, *[1.0] * (len(camera.params) - 1)])
@@ -255,11 +258,11 @@ def test_a_camera_that_the_largest_model_lacks_is_taken_as_another_one_has_it(tm
     database.close()
     truth, lost = truth_of(model), numbers(model)[0]
     camera = model.image(lost).camera_id
-    for name in ("small", "scratch"):
-        (tmp_path / name).mkdir()
+    (tmp_path / "small").mkdir()
     model.write(tmp_path / "small")
     small = pycolmap.Reconstruction(tmp_path / "small")
-    for number in numbers(model)[3:]:
+    others = numbers(model)[:3] if in_other else numbers(model)[-3:]
+    for number in set(numbers(model)) - set(others):
         small.deregister_frame(small.image(number).frame_id)
     model.deregister_frame(model.image(lost).frame_id)
     model.camera(camera).params = known[camera] * np.array([1.6, *[1.0] * (len(known[camera]) - 1)])
@@ -269,6 +272,35 @@ def test_a_camera_that_the_largest_model_lacks_is_taken_as_another_one_has_it(tm
     (found, _), _ = looked_again([model, small], path, tmp_path / "scratch", Adjust())
     assert close_to(poses_of(found)[lost], truth[lost])
     assert found.camera(camera).params == pytest.approx(known[camera])
+
+
+def test_a_mapping_that_fails_leaves_the_model_that_was_there(made, caplog):
+    model, path = made
+    misplace(model, numbers(model)[0])
+    before = truth_of(model)
+
+    def failing(*_):
+        raise RuntimeError("no room for points")
+
+    (found,), _ = looked_again([model], path, path.parent / "scratch", failing)
+    assert all(np.array_equal(pose.matrix(), before[n]) for n, pose in poses_of(found).items())
+    assert "doubtful photos stay where they are" in caplog.text
+
+
+def test_a_photo_whose_camera_no_lens_is_like_is_left_out(tmp_path):
+    model, path = made_of(tmp_path, rigs=PHOTOS)
+    one, two, strange, *others = numbers(model)
+    misplace(model, one)
+    misplace(model, two)
+
+    def exploded(_, place):
+        found = pycolmap.Reconstruction(place)
+        camera = found.camera(found.image(strange).camera_id)
+        camera.params = [1e6 * each for each in camera.params]
+        return found
+
+    (found,), _ = looked_again([model], path, tmp_path / "scratch", exploded)
+    assert numbers(found) == [one, two, *others]
 
 
 def test_nothing_is_moved_when_nobody_waits(made):
