@@ -9,12 +9,21 @@ what is missing: on another machine, too. The same sweep gives the same file.
 """
 
 import argparse
+import csv
+import io
 import sys
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
-from crossgrad_core.commands import UserError, summary_of
+from crossgrad_core.commands import UserError, read_rows, summary_of, write_atomically
+from crossgrad_core.system.tables import csv_bytes
+
+#: The table of a sweep: which run is what.
+TABLE = "runs.csv"
+#: The rows of that table, the first one its header.
+Rows: TypeAlias = Sequence[Sequence[str]]
 
 #: Files of a run that are kept; those of the second line are of the observer `diagnostics`, the
 #: last ones of views elsewhere (distances.py).
@@ -36,10 +45,11 @@ def pack(sweep: Path, archive: Path) -> int:
         How many runs it holds.
 
     Raises:
-        UserError: The folder is no sweep, or none of its runs has finished.
+        UserError: The folder is no sweep, none of its runs has finished, or one has no row in the
+            table of the sweep.
     """
     runs = [each for each in sorted((sweep / "runs").glob("*")) if _is_finished(each)]
-    if not runs or not (sweep / "runs.csv").is_file():
+    if not runs or not (sweep / TABLE).is_file():
         raise UserError(
             "nothing to keep",
             where=sweep,
@@ -47,6 +57,7 @@ def pack(sweep: Path, archive: Path) -> int:
             found=f"{len(runs)} finished runs" if runs else "none",
             todo="name the folder that `crossgrad sweep` printed",
         )
+    _check_labelled(sweep, [run.name for run in runs])
     archive.parent.mkdir(parents=True, exist_ok=True)
     part = archive.with_name(f"{archive.name}.part")
     with tarfile.open(part, "w:xz", preset=9) as file:
@@ -56,12 +67,29 @@ def pack(sweep: Path, archive: Path) -> int:
     return len(runs)
 
 
+def _check_labelled(sweep: Path, runs: Iterable[str]) -> None:
+    """Refuses runs without a row: what they are would be lost with the folder."""
+    known = {row[0] for row in _table(sweep) if row}
+    if without := [run for run in runs if run not in known]:
+        raise UserError(
+            "runs are not in the table of the sweep",
+            where=sweep / TABLE,
+            expected="a row for each folder below runs/",
+            found=f"none for {len(without)} of them: {', '.join(without[:5])}",
+            todo="unpack the file that they came from once more, or move the folders away",
+        )
+
+
+def _table(sweep: Path) -> Rows:
+    return read_rows(sweep / TABLE, "the table of the sweep", "restore it, or remove it")
+
+
 def _is_finished(run: Path) -> bool:
     return (summary_of(run) or {}).get("status") == "finished"
 
 
 def _kept(sweep: Path, runs: list[Path]) -> Iterator[Path]:
-    yield sweep / "runs.csv"
+    yield sweep / TABLE
     # File by file, so that what is alike in all runs lies close together: a third of the size.
     for name in FILES:
         yield from (path for run in runs for path in sorted(run.glob(name)))
@@ -77,18 +105,48 @@ def _without_owner(entry: tarfile.TarInfo) -> tarfile.TarInfo:
 def unpack(archive: Path, sweep: Path) -> int:
     """Adds the runs of a file to the folder of a sweep; runs that are there stay as they are.
 
+    Rows of their table that the sweep's does not have are added below its own, those of runs that
+    were there before included.
+
     Returns:
         How many runs were added.
+
+    Raises:
+        UserError: The two tables of runs have different columns.
     """
     with tarfile.open(archive, "r:xz") as file:
         entries = file.getmembers()
         here = {path.name for path in (sweep / "runs").glob("*")}
-        new = {entry.name.split("/")[1] for entry in entries if "/" in entry.name} - here
-        wanted = [entry for entry in entries if _run_of(entry) in new]
-        if not (sweep / "runs.csv").exists():
-            wanted += [entry for entry in entries if entry.name == "runs.csv"]
+        kept = {_run_of(entry) for entry in entries} - {""}
+        table = _merged(sweep, _rows_of(file), kept)
+        wanted = [entry for entry in entries if _run_of(entry) in kept - here]
         file.extractall(sweep, wanted, filter="data")
-    return len(new)
+    if table is not None:
+        write_atomically(sweep / TABLE, csv_bytes(table))
+    return len(kept - here)
+
+
+def _rows_of(file: tarfile.TarFile) -> Rows:
+    """The table of the runs in a file; empty where it has none."""
+    content = file.extractfile(TABLE) if TABLE in file.getnames() else None
+    return [] if content is None else list(csv.reader(io.TextIOWrapper(content, "utf-8")))
+
+
+def _merged(sweep: Path, rows: Rows, runs: Container[str]) -> Rows | None:
+    """The table of a sweep with the rows of these runs; None where it stays as it is."""
+    own = _table(sweep) if (sweep / TABLE).exists() else []
+    if not own or not rows:
+        return rows or None
+    if list(own[0]) != list(rows[0]):
+        raise UserError(
+            "the tables of runs have different columns",
+            where=sweep / TABLE,
+            expected=", ".join(rows[0]),
+            found=", ".join(own[0]),
+            todo="unpack into a folder of its own",
+        )
+    new = [row for row in rows[1:] if row not in own and row and row[0] in runs]
+    return [*own, *new] if new else None
 
 
 def _run_of(entry: tarfile.TarInfo) -> str:

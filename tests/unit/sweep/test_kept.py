@@ -68,10 +68,54 @@ def test_runs_that_belong_to_no_sweep_are_refused_and_nothing_is_left(script, sw
 def test_what_is_there_stays(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     (sweep / "runs" / "r0" / "metrics.csv").write_text("newer")
-    (sweep / "runs.csv").write_text("newer")
+    (sweep / "runs.csv").write_text("run,configuration\nr2,a\nr1,a\nr0,a\n")
     (sweep / "runs" / "r2").rename(tmp_path / "gone")
     before = contents(sweep)
     assert script.unpack(tmp_path / "grid.tar.xz", sweep) == 1
     after = contents(sweep)
     assert {name: after[name] for name in before} == before
     assert {name.split("/")[1] for name in set(after) - set(before)} == {"r2"}
+
+
+def labels(sweep):
+    return {
+        run.name.rpartition("/")[2]: run.label for run in read_runs([sweep], skip_broken=False).runs
+    }
+
+
+def test_runs_that_are_added_keep_their_labels(script, sweep, tmp_path):
+    script.pack(sweep, tmp_path / "grid.tar.xz")
+    other = tmp_path / "other"
+    RunFolder(seed=7).write(other / "runs" / "r7")
+    RunFolder(seed=0).write(other / "runs" / "r0")
+    (other / "runs.csv").write_text("run,configuration\nr7,b\nr0,b\n")
+    assert script.unpack(tmp_path / "grid.tar.xz", other) == 2
+    lines = ["run,configuration", "r7,b", "r0,b", "r0,a", "r1,a", "r2,a"]
+    assert (other / "runs.csv").read_text().splitlines() == lines
+    assert {run: label for run, label in labels(other).items() if run != "r0"} == {
+        "r1": "a", "r2": "a", "r7": "b",
+    }  # fmt: skip
+    script.pack(other, tmp_path / "both.tar.xz")
+    script.unpack(tmp_path / "both.tar.xz", tmp_path / "back")
+    assert labels(tmp_path / "back") == labels(other)
+
+
+def test_lost_labels_come_back(script, sweep, tmp_path):
+    script.pack(sweep, tmp_path / "grid.tar.xz")
+    (sweep / "runs.csv").write_text("run,configuration\nr0,a\n")
+    with pytest.raises(UserError, match="not in the table") as error:
+        script.pack(sweep, tmp_path / "again.tar.xz")
+    assert "r1, r2" in error.value.found
+    assert script.unpack(tmp_path / "grid.tar.xz", sweep) == 0
+    assert set(labels(sweep).values()) == {"a"}
+    script.pack(sweep, tmp_path / "again.tar.xz")
+    assert (tmp_path / "again.tar.xz").read_bytes() == (tmp_path / "grid.tar.xz").read_bytes()
+
+
+def test_tables_of_another_form_are_refused_before_anything_is_written(script, sweep, tmp_path):
+    script.pack(sweep, tmp_path / "grid.tar.xz")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "runs.csv").write_text("run,name\n")
+    with pytest.raises(UserError, match="different columns"):
+        script.unpack(tmp_path / "grid.tar.xz", tmp_path / "other")
+    assert list(contents(tmp_path / "other")) == ["runs.csv"]
