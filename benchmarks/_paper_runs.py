@@ -6,6 +6,7 @@ from math import isfinite
 from pathlib import Path
 from statistics import fmean
 
+from _asked import Asked, asked_for, of_earlier_grids, only
 from _paper_data import Reading
 
 from crossgrad_core.commands import find_runs, read_rows
@@ -29,12 +30,14 @@ class Results:
         planned: Arm -> scenes and seeds that its grid has.
         failed: Arm -> scenes and seeds whose run failed.
         grids: Arm -> the grid that it belongs to.
+        left_out: Arm -> folders of its runs that are not what the grid asks for.
     """
 
     runs: Mapping[str, Runs]
     planned: Mapping[str, frozenset[tuple[str, int]]]
     failed: Mapping[str, frozenset[tuple[str, int]]] = field(default_factory=dict)
     grids: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def missing(self, arms: Sequence[str], scenes: Sequence[str] = ()) -> tuple[int, int]:
         """How many pairs of scene and seed the arms share by plan, and how many are to come."""
@@ -50,15 +53,19 @@ class Results:
         return len(wanted), len(wanted) - len(ended)
 
 
-def read_results(sweeps: Mapping[str, Path], grids: Mapping[str, Grid]) -> Results:
+def read_results(
+    sweeps: Mapping[str, Path], grids: Mapping[str, Grid], assignments: Sequence[str] = ()
+) -> Results:
     """Reads the runs of all sweeps that there are.
 
     Args:
         sweeps: Grid -> the folder of its sweep, which need not be there.
         grids: Grid -> its content.
+        assignments: `KEY=VALUE` texts that the sweeps were started with.
 
     Raises:
-        UserError: Runs of one scene differ in views or photos, or a file is damaged.
+        UserError: Runs of one scene differ in views or photos, a file is damaged, or an arm has
+            several configurations that its grid does not tell apart.
     """
     planned, home = {}, {}
     for name, grid in grids.items():
@@ -66,17 +73,52 @@ def read_results(sweeps: Mapping[str, Path], grids: Mapping[str, Grid]) -> Resul
         for choice in choices(grid):
             planned[choice.label], home[choice.label] = pairs, name
     places = [path for path in sweeps.values() if path.is_dir() and find_runs(path)]
+    if not places:
+        return Results({}, planned, grids=home)
+    found = read_runs(places, skip_broken=False)
+    ended = (*found.runs, *found.failed)
+    cells: dict[tuple[str, str, int], list[Run]] = {}
+    for run in ended:
+        label = run.label or ""
+        if (run.scene, run.seed) in planned.get(label, ()):
+            cells.setdefault((label, run.scene, run.seed), []).append(run)
+    asked = {
+        (choice.label, scene_name(scene)): Asked.of(grid, choice, scene, assignments)
+        for grid in grids.values()
+        for choice in choices(grid)
+        for scene in grid.scenes
+    }
+    runs, failed, left_out = _chosen(cells, asked, of_earlier_grids(ended))
+    check_scenes([run for by in runs.values() for run in by.values()])
+    return Results(runs, planned, failed, home, left_out)
+
+
+def _chosen(
+    cells: Mapping[tuple[str, str, int], Sequence[Run]],
+    asked: Mapping[tuple[str, str], Asked],
+    earlier: frozenset[Run],
+) -> tuple[
+    dict[str, dict[tuple[str, int], Run]],
+    dict[str, frozenset[tuple[str, int]]],
+    dict[str, tuple[Path, ...]],
+]:
+    """Arm -> the runs that its grid asks for, what failed of them, and which runs it does not."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
-    failed: dict[str, set[tuple[str, int]]] = {}
-    if places:
-        found = read_runs(places, skip_broken=False)
-        check_scenes(found.runs)
-        for run in found.runs:
-            if (run.scene, run.seed) in planned.get(run.label or "", ()):
-                runs.setdefault(str(run.label), {})[run.scene, run.seed] = run
-        for run in found.failed:
-            failed.setdefault(str(run.label), set()).add((run.scene, run.seed))
-    return Results(runs, planned, {a: frozenset(each) for a, each in failed.items()}, home)
+    failed: dict[str, frozenset[tuple[str, int]]] = {}
+    left_out: dict[str, tuple[Path, ...]] = {}
+    for (label, scene, seed), own in cells.items():
+        meant = asked_for(own, asked[label, scene], earlier)
+        others = tuple(run.results.folder for run in own if run not in meant)
+        if others:
+            left_out[label] = (*left_out.get(label, ()), *others)
+        if not meant:
+            continue
+        run = only(meant, label)
+        if run.status == "failed":
+            failed[label] = failed.get(label, frozenset()) | {(scene, seed)}
+        else:
+            runs.setdefault(label, {})[scene, seed] = run
+    return runs, failed, left_out
 
 
 def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+from _asked import of_earlier_grids, only
+
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.checks.scenes import check_scenes
 from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
@@ -35,19 +37,30 @@ class Runs:
 
     @classmethod
     def read(cls, places: Sequence[Path]) -> "Runs":
-        """All finished runs at or below the places."""
+        """All finished runs at or below the places, without those of earlier grids of a sweep.
+
+        Raises:
+            UserError: There is none, a file is damaged, runs of one scene differ in views or
+                photos, or an arm has several configurations with one seed.
+        """
         found = read_runs(places, skip_broken=False)
-        check_scenes(found.runs)
+        earlier = of_earlier_grids(found.runs)
+        if earlier:
+            print(f"{len(earlier)} runs of earlier grids are left out", file=sys.stderr)
+        runs = [run for run in found.runs if run not in earlier]
+        check_scenes(runs)
         lengths: dict[str, set[tuple[str, float]]] = {}
-        for run in found.runs:
+        for run in runs:
             lengths.setdefault(run.label or "", set()).add(run.length)
-        by_arm: dict[str, dict[tuple[str, int], Run]] = {}
-        for run in sorted(found.runs, key=lambda run: (run.label or "", run.length)):
+        cells: dict[str, dict[tuple[str, int], list[Run]]] = {}
+        for run in sorted(runs, key=lambda run: (run.label or "", run.length)):
             arm = run.label or ""
             if len(lengths[arm]) > 1:
                 arm = f"{arm}, {run.length_text}".removeprefix(", ")
-            by_arm.setdefault(arm, {})[run.scene, run.seed] = run
-        return cls(by_arm)
+            cells.setdefault(arm, {}).setdefault((run.scene, run.seed), []).append(run)
+        return cls(
+            {arm: {at: only(own, arm) for at, own in by.items()} for arm, by in cells.items()}
+        )
 
     @property
     def scenes(self) -> list[str]:

@@ -145,7 +145,8 @@ class Paper:
         return self._read(self.grids())
 
     def _read(self, grids: Mapping[str, Grid]) -> Results:
-        return read_results({name: self.place.sweep(name) for name in grids}, grids)
+        sweeps = {name: self.place.sweep(name) for name in grids}
+        return read_results(sweeps, grids, self.given.set or ())
 
     # The steps of `run`.
 
@@ -244,6 +245,9 @@ class Paper:
         self.place.page.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self.place.page, text.encode())
         print(f"the page is in {self.place.page}", flush=True)
+        for arm, folders in results.left_out.items():
+            print(f"left out of {arm}: {len(folders)} runs that its grid does not ask for, such as "
+                  f"{folders[0]}", file=sys.stderr)  # fmt: skip
 
     def tell(self) -> None:
         """Prints how many core hours each grid takes, and what is left."""

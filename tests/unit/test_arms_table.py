@@ -74,3 +74,49 @@ def test_a_baseline_that_is_no_arm_is_refused(tmp_path, printed, capsys):
         printed(tmp_path, "--baseline", "other")
     assert ended.value.code == 2
     assert "no arm other" in capsys.readouterr().err
+
+
+def write_sweep(folder, *rows):
+    """Runs of two grids in one folder: the learning rates of an arm were changed."""
+    for seed in (0, 1):
+        for prefix, factor in (("a", 20), ("m", 2)):
+            run = RunFolder(seed=seed, settings={"rate_factor": factor}, final=20.0 + factor)
+            run.write(folder / "runs" / f"{prefix}{seed}")
+    (folder / "runs.csv").write_text("\n".join(["run,scene,configuration,seed", *rows]) + "\n")
+
+
+def test_runs_of_earlier_grids_are_left_out(tmp_path, printed, capsys):
+    new, old = ("a0,city,B,0", "a1,city,B,1"), ("m0,city,B,0", "m1,city,B,1")
+    write_sweep(tmp_path, *new, *old)
+    (row,) = printed(tmp_path)
+    assert (row["arm"], row["seeds"], row["rates"], row["psnr"]) == (
+        "B",
+        "2",
+        "x 20",
+        "40.00 ± 0.00",
+    )
+    (tmp_path / "runs" / "a1" / "summary.json").unlink()
+    (row,) = printed(tmp_path)
+    assert (row["seeds"], row["rates"]) == ("1", "x 20")
+
+
+def test_an_arm_that_was_renamed_keeps_its_runs(tmp_path, printed):
+    new = "a0,city,B,0", "a1,city,B,1", "m0,city,once B,0", "m1,city,once B,1"
+    write_sweep(tmp_path, *new, "m0,city,B,0", "m1,city,B,1")
+    found = {row["arm"]: (row["seeds"], row["rates"]) for row in printed(tmp_path)}
+    assert found == {"B": ("2", "x 20"), "once B": ("2", "x 2")}
+
+
+def test_two_configurations_of_one_arm_are_refused(tmp_path, printed, capsys):
+    write_sweep(tmp_path / "one", "a0,city,B,0", "a1,city,B,1")
+    write_sweep(tmp_path / "two", "m0,city,B,0", "m1,city,B,1")
+    for folder, names in (("one", "m"), ("two", "a")):
+        for seed in (0, 1):
+            (tmp_path / folder / "runs" / f"{names}{seed}" / "config.yaml").unlink()
+    with pytest.raises(SystemExit) as ended:
+        printed(tmp_path)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert "B has two configurations with seed 0 on city" in said
+    assert "one/runs/a0" in said and "two/runs/m0" in said
+    assert "rate_factor 20 against 2" in said

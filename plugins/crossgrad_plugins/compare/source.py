@@ -171,11 +171,13 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for line in lines:
         if len(line) == len(header):
-            found[line[at]] = tuple(dict.fromkeys((*found.get(line[at], ()), _arm(line[called]))))
+            found[line[at]] = tuple(
+                dict.fromkeys((*found.get(line[at], ()), without_length(line[called])))
+            )
     return found
 
 
-def _arm(label: str) -> str:
+def without_length(label: str) -> str:
     """A label without what makes no arm: the length, and the name of the only arm of a grid."""
     parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
     named = parts[1:] if parts[:1] == [_ONLY] else parts

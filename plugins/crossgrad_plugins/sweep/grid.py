@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
 
-from crossgrad_core.commands import UserError, did_you_mean, listed, read_settings
+from crossgrad_core.commands import UserError, did_you_mean, layered, listed, read_settings
 from crossgrad_plugins.sweep.problems import Problem, refuse
 
 Settings: TypeAlias = dict[str, Any]
@@ -148,6 +148,23 @@ class Choice(_Part):
         """What the configuration is called in tables."""
         values = [f"{name}={value}" for name, value in self.parameters.items()]
         return ", ".join([self.arm.name, *values])
+
+    def settings(
+        self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
+    ) -> Settings:
+        """What its runs on a scene are started with, all but the seed.
+
+        Args:
+            base: The settings of all runs of the grid.
+            scene: The scene's folder; None is the bundled scene.
+            assignments: `KEY=VALUE` texts that win over the grid.
+
+        Raises:
+            UserError: An assignment, or a key with a dot, makes no sense.
+        """
+        own = self.arm.by_scene.get(scene_name(scene), {})
+        layers = (base, self.arm.settings, self.parameters, own)
+        return {**layered(layers, assignments), **({} if scene is None else {"scene": scene})}
 
 
 def _values(parameter: object) -> object:

@@ -14,11 +14,10 @@ from crossgrad_core.commands import (
     chosen,
     configured,
     fingerprint,
-    layered,
     read_scene,
     resolved,
 )
-from crossgrad_plugins.sweep.grid import Choice, Grid, choices, scene_name
+from crossgrad_plugins.sweep.grid import Choice, Grid, Settings, choices, scene_name
 from crossgrad_plugins.sweep.job import Job, run_id
 from crossgrad_plugins.sweep.problems import Problem, refuse
 
@@ -90,7 +89,7 @@ class _Checked:
 class _Planner:
     """Checks configurations and collects what is wrong, each thing once."""
 
-    base: Mapping[str, Any]
+    base: Settings
     assignments: tuple[str, ...]
     _wrong: dict[str, list[str]] = field(default_factory=dict)
     _scenes: dict[str, Any] = field(default_factory=dict)
@@ -103,7 +102,7 @@ class _Planner:
         """The configuration on that scene; None where something is wrong with it."""
         place = choice.label
         try:
-            settings = self._settings(scene, choice)
+            settings = choice.settings(self.base, scene, self.assignments)
             config = configured(settings)
         except UserError as error:
             self._note(place, error)
@@ -121,12 +120,6 @@ class _Planner:
             return None
         final = {**resolved(setup), "seconds": config.seconds}
         return _Checked(settings, final, found[2])
-
-    def _settings(self, scene: str | None, choice: Choice) -> dict[str, Any]:
-        arm = choice.arm
-        own = arm.by_scene.get(scene_name(scene), {})
-        layers = (self.base, arm.settings, choice.parameters, own)
-        return {**layered(layers, self.assignments), **({} if scene is None else {"scene": scene})}
 
     def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
         """The scene as the configuration reads it; None where it cannot be read."""

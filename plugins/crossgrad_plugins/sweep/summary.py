@@ -60,13 +60,38 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay in it."""
+    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay below it."""
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
-    if layout.plan.is_file():
-        earlier = [tuple(row) for row in read_rows(layout.plan, "the table of runs", "remove it")]
-        rows += [
-            (run, scene, label, seed)
-            for run, scene, label, seed in (row for row in earlier[1:] if len(row) == len(_COLUMNS))
-            if (run, scene, label, seed) not in rows and layout.run(run).is_dir()
-        ]
+    rows += [
+        (run, scene, label, seed)
+        for run, scene, label, seed in _read_plan(layout)
+        if (run, scene, label, seed) not in rows and layout.run(run).is_dir()
+    ]
     write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])
+
+
+def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
+    """Run and configuration of the rows of runs.csv that are those of earlier grids.
+
+    The newest grid stands on top: a scene, configuration and seed that has another run above is
+    that one now, whether it has finished or not.
+
+    Raises:
+        UserError: The table cannot be read.
+    """
+    newest: dict[tuple[str, ...], str] = {}
+    return frozenset(
+        (run, label)
+        for run, scene, label, seed in _read_plan(layout)
+        if newest.setdefault((scene, label, seed), run) != run
+    )
+
+
+def _read_plan(layout: Layout) -> list[list[str]]:
+    """The rows of runs.csv; none where there is no such table, or one with other columns."""
+    if not layout.plan.is_file():
+        return []
+    header, *rows = read_rows(layout.plan, "the table of runs", "remove it") or [[]]
+    if tuple(header) != _COLUMNS:
+        return []
+    return [row for row in rows if len(row) == len(_COLUMNS)]

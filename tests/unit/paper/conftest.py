@@ -31,7 +31,7 @@ def modules():
 def planted(tmp_path_factory):
     """Writes a sweep whose arms differ by what is planted, with noise that pairs do not share."""
 
-    def write(name, arms, scenes=SCENES, noise=0.02, status="finished"):
+    def write(name, arms, scenes=SCENES, noise=0.02, settings=(), **more):
         root = tmp_path_factory.mktemp("sweeps")
         rng = np.random.default_rng(0)
         lines = []
@@ -41,7 +41,9 @@ def planted(tmp_path_factory):
                     run = f"r{len(lines)}"
                     psnr = 20.0 + SCENES.index(scene) + 0.3 * seed + level
                     folder = root / name / "runs" / run
-                    write_run(folder, scene, seed, psnr + noise * rng.normal(), status=status)
+                    psnr += noise * rng.normal()
+                    own = dict(settings).get(arm, {})
+                    write_run(folder, scene, seed, psnr, settings=own, **more)
                     lines.append((run, arm))
         with (root / name / "runs.csv").open("w", newline="") as file:
             csv.writer(file).writerows([("run", "configuration"), *lines])

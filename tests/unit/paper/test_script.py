@@ -83,8 +83,14 @@ def test_the_estimate_counts_what_is_there_from_packed_tables(paper, planted, mo
         return float(views.split()[-2])
 
     before = left()
-    arms = dict.fromkeys(("one view, 60 s", "two random views, 60 s"), 0.0)
-    modules.paper.pack(planted("views", arms, SCENES[:2]), found.place.archive("views"))
+    same = {"clock": "cpu", "fewest_edits": 6, "reading": {"max_size": 400}}
+    settings = {
+        "one view, 60 s": {**same, "sampler": {"name": "epoch"}},
+        "two random views, 60 s": {**same, "sampler": {"name": "random"}, "views_per_step": 2},
+    }
+    arms = dict.fromkeys(settings, 0.0)
+    sweep = planted("views", arms, SCENES[:2], settings=settings, planned=60.0)
+    modules.paper.pack(sweep, found.place.archive("views"))
     found.unpack()
     assert before - left() == pytest.approx(12 * (60 + modules.paper.BESIDES) / 3600, abs=0.011)
 

@@ -14,7 +14,7 @@ from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.records import append, read_records
 from crossgrad_plugins.sweep.screen import Screen
 from crossgrad_plugins.sweep.standing import Standing
-from crossgrad_plugins.sweep.summary import table, write_plan
+from crossgrad_plugins.sweep.summary import earlier_rows, table, write_plan
 from crossgrad_plugins.sweep.watch import Watch
 
 JOBS = [Job(f"id{n}", "arm", "city", n, {}) for n in range(4)]
@@ -130,6 +130,23 @@ def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
         'id2,city,"arm, k=1",2',
         "id0,city,arm,0",
     ]
+
+
+def test_rows_of_earlier_grids_are_told_from_those_of_the_newest(tmp_path):
+    layout = Layout(tmp_path)
+    assert earlier_rows(layout) == frozenset()
+    layout.make()
+    layout.run("id0").mkdir()
+    layout.run("id1").mkdir()
+    was = [Job("id0", "a", "city", 1, {}), Job("id1", "b", "city", 1, {})]
+    write_plan(layout, was)
+    assert earlier_rows(layout) == frozenset()
+    # Another configuration is a now, and what it was is called c.
+    now = [Job("id2", "a", "city", 1, {}), Job("id0", "c", "city", 1, {})]
+    write_plan(layout, now)
+    assert earlier_rows(layout) == {("id0", "a")}
+    write_plan(layout, was)
+    assert earlier_rows(layout) == frozenset()
 
 
 def test_a_record_of_a_clock_that_is_behind_is_seen(sweep, monkeypatch):

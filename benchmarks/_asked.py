@@ -1,0 +1,139 @@
+"""Which runs are what a grid asks for: the folder of a sweep keeps those of earlier grids, too."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from crossgrad_core.commands import RunConfig, UserError, configured
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.settings import ABSENT, Settings, settings_of
+from crossgrad_plugins.compare.source import without_length
+from crossgrad_plugins.sweep.grid import Choice, Grid
+from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.summary import earlier_rows
+
+#: What a run decides at its start.
+_LEFT_OPEN: Final = ("auto", ABSENT)
+_LENGTHS: Final = frozenset({"steps", "max_views", "seconds"})
+#: Paths, which a grid may name from its own folder.
+_PATHS: Final = ("exposure_from", "reading.init")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a grid names for an arm on a scene; what it leaves out may be anything.
+
+    Attributes:
+        config: The configuration.
+        settings: Those that can make an arm.
+        has_length: Whether a length is named.
+    """
+
+    config: RunConfig
+    settings: Settings
+    has_length: bool
+
+    @classmethod
+    def of(
+        cls, grid: Grid, choice: Choice, scene: str | None, assignments: Sequence[str] = ()
+    ) -> "Asked":
+        """What the grid says, without a look at the scene.
+
+        Args:
+            grid: The grid.
+            choice: A configuration of it.
+            scene: A scene of it.
+            assignments: `KEY=VALUE` texts that win over the grid.
+
+        Raises:
+            UserError: A setting does not exist or has a wrong value.
+        """
+        settings = choice.settings(grid.base, scene, assignments)
+        config = configured(settings)
+        named = settings_of(config.model_dump(mode="json", exclude_unset=True))
+        return cls(config, named, bool(_LENGTHS & settings.keys()))
+
+    def fits(self, run: Run) -> bool:
+        """Whether a run has all that is named; what a run decides or does not know fits."""
+        return (not self.has_length or self._fits_length(run)) and all(
+            asked in {run.settings.get(name, asked), *_LEFT_OPEN}
+            for name, asked in self.settings.items()
+            if name not in _PATHS
+        )
+
+    def _fits_length(self, run: Run) -> bool:
+        asked, found = self.config, run.config
+        if asked.seconds is not None:
+            return run.length == ("s CPU" if asked.clock == "cpu" else "s", asked.seconds)
+        if asked.max_views is None:
+            return found.get("steps") == asked.steps
+        # A run writes a length in views down in steps.
+        views = ViewPlan.parsed(str(found.get("views_per_step") or 1))
+        return asked.max_views == found.get("max_views") or (
+            views.steps_of(asked.max_views) == found.get("steps")
+        )
+
+
+def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
+    """Those of the runs that were what, by the table of their sweep, other runs are now.
+
+    Raises:
+        UserError: A table cannot be read.
+    """
+    tables = {
+        sweep: {(name, without_length(label)) for name, label in earlier_rows(Layout(sweep))}
+        for sweep in {run.results.folder.parent.parent for run in runs}
+    }
+    return frozenset(
+        run
+        for run in runs
+        if (run.results.folder.name, run.label) in tables[run.results.folder.parent.parent]
+    )
+
+
+def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> list[Run]:
+    """Of runs with one label, scene and seed those that the grid asks for.
+
+    Args:
+        runs: The runs.
+        asked: What the grid names.
+        earlier: Runs of earlier grids by the table of their sweep. Where it has another run that
+            has not ended, none of these counts; where that run is not what is asked for, the table
+            is that of another grid, and says nothing.
+    """
+    fitting = [run for run in runs if asked.fits(run)]
+    current = [run for run in fitting if run not in earlier]
+    is_of_another_grid = any(run not in earlier for run in runs)
+    return current or (fitting if is_of_another_grid else [])
+
+
+def only(runs: Sequence[Run], label: str) -> Run:
+    """The first of runs with one label, scene and seed, which the others repeat.
+
+    Raises:
+        UserError: They are different configurations.
+    """
+    first, *others = runs
+    for other in others:
+        if difference := _difference(first, other):
+            raise UserError(
+                f"{label or 'an arm'} has two configurations with seed {first.seed}"
+                f" on {first.scene}",
+                where=f"{first.results.folder}, {other.results.folder}",
+                expected="one: the folder of a sweep may hold runs of an earlier grid",
+                found=difference,
+                todo="move the folder of the run away that is not meant",
+            )
+    return first
+
+
+def _difference(first: Run, second: Run) -> str:
+    """In which settings that both have two runs differ; empty where in none."""
+    found = [
+        f"{name} {value} against {second.settings[name]}"
+        for name, value in first.settings.items()
+        if second.settings.get(name, value) != value
+    ]
+    lengths = [run.length_text for run in (first, second)]
+    return ", ".join([*found, *([" against ".join(lengths)] if len(set(lengths)) > 1 else [])])
