@@ -22,7 +22,7 @@ _PATHS: Final = ("exposure_from", "reading.init")
 
 @dataclass(frozen=True)
 class Asked:
-    """What a grid names for an arm on a scene; what it leaves out may be anything.
+    """The settings that a grid names for an arm on a scene; what it leaves out may be anything.
 
     Attributes:
         config: The configuration.
