@@ -208,17 +208,29 @@ def _second_view(results: Results) -> Iterator[str]:
         for scene in _scenes(results)
         for name, (a, b) in EQUAL.items()
     }
-    verdicts = {
-        (each.pairs[0].scene, name): each.verdict.value
-        for name in EQUAL
-        for each in judged(contrasts[scene, name] for scene in _scenes(results))
-    }
+    # One table, one family of comparisons.
+    whole = [
+        key
+        for key, each in contrasts.items()
+        if each.estimate is not None and not _lacking(results, *key)
+    ]
+    verdicts = dict(zip(whole, judged(contrasts[key] for key in whole), strict=True))
     yield from ("| scene | at | two views minus one | by regime | verdict |", "|---" * 5 + "|")
     for (scene, name), each in contrasts.items():
         regimes = _regimes(results, EQUAL[name], scene)
-        verdict = verdicts.get((scene, name), Outcome.NOT_RUN.value)
+        verdict = (
+            verdicts[scene, name].verdict.value
+            if (scene, name) in verdicts
+            else f"{Outcome.NOT_RUN.value}{_lacking(results, scene, name)}"
+        )
         yield f"| {scene} | {name} | {figure_of(each)} | {regimes} | {verdict} |"
     yield ""
+
+
+def _lacking(results: Results, scene: str, name: str) -> str:
+    """Which pairs of a comparison on a scene are still to come; empty where none is."""
+    wanted, missing = results.missing(EQUAL[name], (scene,))
+    return f": {wanted - missing} of {wanted} pairs so far" if missing else ""
 
 
 def _regimes(results: Results, arms: tuple[str, str], scene: str) -> str:

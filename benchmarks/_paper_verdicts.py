@@ -1,7 +1,7 @@
 """Verdicts on the paper's claims, from pairs of runs with the statistics of `crossgrad compare`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isinf
 
@@ -12,9 +12,11 @@ from crossgrad_plugins.compare.contrasts import Contrast, Pair, contrast
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
-from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
-from crossgrad_plugins.compare.words import interval_text, needed_text
+from crossgrad_plugins.compare.statistics.verdict import Verdict, corrected, verdicts
+from crossgrad_plugins.compare.words import interval_text, needed_text, opposed_text
 
+#: A p-value below which something is sure, and the share of pairs whose loss leaves a claim open.
+_SURE, _LOST = 0.05, 0.25
 #: What verdicts are about: where the exposure of a held-out photo is guessed wrongly, plain PSNR is
 #: the guess more than the scene, and arms look alike that are not.
 PSNR = Quantity.of("psnr_cc")
@@ -57,25 +59,50 @@ class _Measured:
     missing: int
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """What a comparison shows, beside the others of its table.
+
+    Attributes:
+        verdict: Of `crossgrad compare`.
+        is_small: Whether the difference is surely within the margin.
+        is_not_above: Whether it is surely not above the margin.
+    """
+
+    verdict: Verdict = Verdict.INCONCLUSIVE
+    is_small: bool = False
+    is_not_above: bool = False
+
+
 def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[Answer]:
     """The answers to checks that are shown in one table, whose p-values are corrected together."""
     measured = [_measured(check, results) for check in checks]
     # Two statements about the same two arms are one comparison.
     family = {_key(each): _estimate(each) for each in measured if _is_judged(each)}
-    found = dict(zip(family, verdicts(list(family.values())), strict=True))
+    found = dict(zip(family, judgements(list(family.values())), strict=True))
     return [_answer(each, found.get(_key(each)), tables) for each in measured]
+
+
+def judgements(family: Sequence[Estimate]) -> list[Judgement]:
+    """The judgements on comparisons that are shown together."""
+    small = corrected([each.p_equivalent for each in family])
+    above = corrected([each.p_above for each in family])
+    return [
+        Judgement(verdict, p_small < _SURE, p_above < _SURE)
+        for verdict, p_small, p_above in zip(verdicts(family), small, above, strict=True)
+    ]
 
 
 def _key(each: _Measured) -> tuple[Pairing | None, Probe | None]:
     return each.check.test, each.check.probe
 
 
-def _answer(each: _Measured, verdict: Verdict | None, tables: Tables) -> Answer:
+def _answer(each: _Measured, judgement: Judgement | None, tables: Tables) -> Answer:
     if not _is_whole(each):
         return _unjudged(each, tables)
     if each.check.within is not None:
         return Answer(_located(each.check.within, _estimate(each).wide), each.figure)
-    return _judged(each, verdict or Verdict.INCONCLUSIVE)
+    return _judged(each, judgement or Judgement())
 
 
 def _is_judged(each: _Measured) -> bool:
@@ -177,19 +204,23 @@ def _unjudged(each: _Measured, tables: Tables) -> Answer:
     return Answer(Outcome.OPEN, "", "all runs ended, and none of the pairs has the figure")
 
 
-def _judged(each: _Measured, verdict: Verdict) -> Answer:
-    found = each.contrast
-    if found is None or found.estimate is None:
+def _judged(each: _Measured, judgement: Judgement) -> Answer:
+    if each.contrast is None or each.contrast.estimate is None:
         raise ValueError("only what was measured is judged")
-    outcome = outcome_of(each.check.expected or "equal", verdict, found)
+    found = replace(each.contrast, verdict=judgement.verdict)
+    outcome = outcome_of(each.check.expected or "equal", judgement, found)
+    lost = each.wanted - len(found.pairs)
     details = []
-    if outcome is Outcome.OPEN:
-        details.append(needed_text(found))
-    elif verdict is Verdict.DIFFERENT and found.is_small:
-        details.append("by less than the margin")
-    lost = each.wanted - found.estimate.pairs
     if lost > 0:
         details.append(f"{lost} of {each.wanted} pairs failed or have no figure")
+    if lost >= _LOST * each.wanted:
+        outcome = Outcome.OPEN
+    elif found.opposed:
+        details.append(opposed_text(found))
+    elif outcome is Outcome.OPEN:
+        details.append(needed_text(found))
+    elif judgement.verdict is Verdict.DIFFERENT and judgement.is_small:
+        details.append("by less than the margin")
     return Answer(outcome, each.figure, "; ".join(details))
 
 
@@ -201,28 +232,26 @@ def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outc
     return Outcome.FAILS if high < within[0] or low > within[1] else Outcome.OPEN
 
 
-def outcome_of(expected: Expected, verdict: Verdict, found: Contrast) -> Outcome:
-    """The verdict on a statement about two arms, from the verdict on their difference."""
-    if verdict is Verdict.INCONCLUSIVE:
-        return _of_an_open_one(expected, found)
-    if verdict is Verdict.EQUIVALENT:
-        return Outcome.HOLDS if expected in {"equal", "not better"} else Outcome.FAILS
+def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Outcome:
+    """The verdict on a statement about two arms, from the judgement on their difference.
+
+    What holds on all scenes together is open where some scene surely contradicts it.
+    """
     ahead = found.favours == found.first
+    verdict = judgement.verdict
+    if verdict is Verdict.INCONCLUSIVE:
+        # What has one side only can be settled where the other side is open.
+        settled = expected == "not better" and judgement.is_not_above
+        return Outcome.HOLDS if settled else Outcome.OPEN
     holds = {
-        "better": ahead,
-        "worse": not ahead,
-        "equal": found.is_small,
-        "not better": not ahead or found.is_small,
+        "better": verdict is Verdict.DIFFERENT and ahead,
+        "worse": verdict is Verdict.DIFFERENT and not ahead,
+        "equal": verdict is Verdict.EQUIVALENT or judgement.is_small,
+        "not better": verdict is Verdict.EQUIVALENT or not ahead or judgement.is_small,
     }
-    return Outcome.HOLDS if holds[expected] else Outcome.FAILS
-
-
-def _of_an_open_one(expected: Expected, found: Contrast) -> Outcome:
-    """What has one side only can be settled where the other side is open."""
-    if expected != "not better" or found.estimate is None:
-        return Outcome.OPEN
-    below = found.estimate.narrow[1] < found.quantity.margin
-    return Outcome.HOLDS if below else Outcome.OPEN
+    if holds[expected]:
+        return Outcome.OPEN if found.opposed else Outcome.HOLDS
+    return Outcome.FAILS
 
 
 def _calculated(claim: Arithmetic, tables: Tables) -> Answer:

@@ -7,8 +7,8 @@ from typing import TypeAlias
 from crossgrad_plugins.compare.cells import Problem
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
-from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+from crossgrad_plugins.compare.statistics.estimate import Estimate, SceneEstimate, estimate
+from crossgrad_plugins.compare.statistics.verdict import Verdict, opposed, verdicts
 
 #: A run -> its value; None where it has none.
 Reading: TypeAlias = Callable[[Run], float | None]
@@ -73,6 +73,13 @@ class Contrast:
             return False
         low, high = self.estimate.narrow
         return -self.quantity.margin < low and high < self.quantity.margin
+
+    @property
+    def opposed(self) -> tuple[SceneEstimate, ...]:
+        """The scenes that surely contradict the verdict."""
+        if self.estimate is None:
+            return ()
+        return opposed(self.estimate, self.verdict, self.quantity.margin)
 
 
 def contrast(

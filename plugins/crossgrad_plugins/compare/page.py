@@ -178,7 +178,12 @@ def contrast_rows(contrasts: Sequence[Contrast]) -> list[dict[str, Any]]:
                 "pairs": found.pairs,
                 "ahead": each.ahead,
                 "scenes": found.scenes,
-                "needed": words.needed_text(each) if each.verdict == "inconclusive" else "",
+                "needed": (
+                    words.needed_text(each)
+                    if each.verdict == "inconclusive"
+                    else words.opposed_text(each)
+                ),
+                "opposed": bool(each.opposed),
                 "inside": each.inside,
             }
         )

@@ -92,6 +92,7 @@ def _contrast(contrast: Contrast) -> Row:
         "low_90": found.narrow[0],
         "high_90": found.narrow[1],
         "verdict": str(contrast.verdict),
+        "opposed": " ".join(each.scene for each in contrast.opposed),
         "margin": contrast.quantity.margin,
         "pairs": found.pairs,
         "first_better": contrast.ahead,

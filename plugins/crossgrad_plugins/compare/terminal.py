@@ -48,7 +48,7 @@ def _contrasts(rows: Sequence[dict[str, str]]) -> tuple[list[str], list[list[str
             str(row["where"]),
             str(row["difference"]),
             str(row["wide"]),
-            str(row["verdict"]),
+            f"{row['verdict']}{', scenes differ' if row['opposed'] else ''}",
             str(row["pairs"]),
         ]
         for row in rows

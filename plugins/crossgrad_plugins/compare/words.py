@@ -48,10 +48,23 @@ def claim(contrast: Contrast) -> str:
     size = _size(contrast)
     if contrast.verdict is Verdict.DIFFERENT:
         small = f", by less than the margin of {_margin(contrast)}" if contrast.is_small else ""
-        return f"{better} is better than {worse} by {size}{small}"
+        return f"{better} is better than {worse} by {size}{small}{_except(contrast)}"
     if contrast.verdict is Verdict.EQUIVALENT:
-        return f"{contrast.first} and {contrast.second} are equivalent within {_margin(contrast)}"
+        both = f"{contrast.first} and {contrast.second}"
+        return f"{both} are equivalent within {_margin(contrast)}{_except(contrast)}"
     return f"Inconclusive: {better} is {size} ahead of {worse}, which may be noise"
+
+
+def _except(contrast: Contrast) -> str:
+    return f", but {opposed_text(contrast)}" if contrast.opposed else ""
+
+
+def opposed_text(contrast: Contrast) -> str:
+    """On which scenes it is surely not so, with the differences there."""
+    shown = [
+        f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
+    ]
+    return f"surely not on {', '.join(shown)}" if shown else ""
 
 
 def support(contrast: Contrast) -> str:

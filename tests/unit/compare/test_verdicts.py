@@ -12,7 +12,7 @@ from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate
 from crossgrad_plugins.compare.statistics.holm import holm
 from crossgrad_plugins.compare.statistics.iqm import iqm
 from crossgrad_plugins.compare.statistics.student import pairs_needed
-from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+from crossgrad_plugins.compare.statistics.verdict import Verdict, opposed, verdicts
 
 RNG = np.random.default_rng(0)
 
@@ -156,3 +156,27 @@ def test_more_than_five_comparisons_are_corrected():
     assert 0.01 < found.p_different < 0.05
     assert verdicts([found] * 5) == [Verdict.DIFFERENT] * 5
     assert verdicts([found] * 6) == [Verdict.INCONCLUSIVE] * 6
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict", "contradicting"),
+    [
+        ((0.3, 0.3, 0.3, -0.4), Verdict.DIFFERENT, ["s3"]),
+        ((0.3, 0.3, 0.3, 0.02), Verdict.DIFFERENT, []),
+        ((-0.3, -0.3, -0.3, 0.4), Verdict.DIFFERENT, ["s3"]),
+        ((0.0, 0.0, 0.0, 0.5), Verdict.EQUIVALENT, ["s3"]),
+        ((0.0, 0.0, 0.0, 0.08), Verdict.EQUIVALENT, []),
+    ],
+)
+def test_scenes_that_contradict_a_verdict_are_told(levels, verdict, contradicting):
+    """The interquartile mean leaves a scene out that is unlike the others."""
+    scenes = [f"s{number}" for number in range(4) for _ in range(3)]
+    values = np.repeat(levels, 3) + np.tile([-0.02, 0.0, 0.02], 4)
+    found = estimate(values, scenes, 0.1)
+    assert verdicts([found]) == [verdict]
+    assert [each.scene for each in opposed(found, verdict, 0.1)] == contradicting
+    assert opposed(found, Verdict.INCONCLUSIVE, 0.1) == ()
+
+
+def test_one_scene_contradicts_nothing():
+    assert estimate([0.1, 0.2, 0.3], ["a"] * 3, 0.1).by_scene == ()

@@ -1,5 +1,8 @@
 """Verdicts on claims, from planted runs of which the answer is known."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from support.paper_runs import SCENES, write_probes
 
@@ -75,14 +78,48 @@ def test_a_sweep_that_is_under_way_is_not_judged(modules, planted, grid_of):
     assert "6 of 12 pairs" in found.detail and "+1.0" in found.figure
 
 
-def test_failed_runs_do_not_leave_a_claim_waiting_for_ever(modules, planted, grid_of):
-    good = planted("good", {"a": 0.0, "b": 1.0}, scenes=SCENES[:3])
-    bad = planted("bad", {"a": 0.0, "b": 1.0}, scenes=SCENES[3:], status="failed")
-    sweeps, grid = {"good": good, "bad": bad}, grid_of("ab")
-    results = modules.runs.read_results(sweeps, {"good": grid})
+@pytest.mark.parametrize(("failed", "outcome"), [(1, "holds"), (3, "inconclusive")])
+def test_failed_runs_leave_a_claim_open_where_they_are_many(
+    modules, planted, grid_of, failed, outcome
+):
+    """A whole scene of four, here, that an arm cannot be trained on."""
+    sweep = planted("some", {"a": 0.0, "b": 1.0})
+    results = modules.runs.read_results({"some": sweep}, {"some": grid_of("ab")})
+    gone = sorted(results.runs["b"])[:failed]
+    kept = {key: run for key, run in results.runs["b"].items() if key not in gone}
+    results = replace(results, runs={**results.runs, "b": kept}, failed={"b": frozenset(gone)})
     (found,) = answers_of(modules, results, compare(modules, "b", "a", "better"))
+    assert found.outcome == outcome
+    assert f"{failed} of 12 pairs failed" in found.detail
+
+
+@pytest.mark.parametrize(
+    ("level", "elsewhere", "says"), [(0.3, -0.3, "better"), (-0.3, 0.3, "worse"), (0, 0.5, "equal")]
+)
+def test_a_scene_that_contradicts_the_others_leaves_a_claim_open(
+    modules, planted, grid_of, level, elsewhere, says
+):
+    most = planted("most", {"a": 0.0, "b": level}, scenes=SCENES[:3])
+    last = planted("last", {"a": 0.0, "b": elsewhere}, scenes=SCENES[3:])
+    grids = {"most": grid_of("ab")}
+    results = modules.runs.read_results({"most": most, "last": last}, grids)
+    (found,) = answers_of(modules, results, compare(modules, "b", "a", says))
+    assert found.outcome == "inconclusive"
+    assert f"surely not on {SCENES[3]}" in found.detail
+    results = modules.runs.read_results({"most": most}, {"most": grid_of("ab", SCENES[:3])})
+    (found,) = answers_of(modules, results, compare(modules, "b", "a", says))
     assert found.outcome == "holds"
-    assert "3 of 12 pairs failed" in found.detail
+
+
+def test_statements_of_one_side_are_corrected_together_too(modules):
+    """Each p-value is below 0.05; of six, only the least is after Holm's correction."""
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=9)
+    noise = (noise - noise.mean()) / noise.std(ddof=1)
+    found = [modules.verdicts.estimate(0.03 + 0.1 * noise, ["s"] * 9, 0.1) for _ in range(6)]
+    assert 0.05 / 6 < found[0].p_above < 0.05
+    assert modules.verdicts.judgements(found[:1])[0].is_not_above
+    assert not any(each.is_not_above for each in modules.verdicts.judgements(found))
 
 
 def test_scenes_can_be_chosen(modules, results):

@@ -20,7 +20,22 @@ MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 
 Interval: TypeAlias = tuple[float, float]
-_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float]
+_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class SceneEstimate:
+    """The mean difference on one scene, from two pairs of it or more.
+
+    Attributes:
+        scene: Its name.
+        center: The mean.
+        wide: The 95 % interval by Student's t.
+    """
+
+    scene: str
+    center: float
+    wide: Interval
 
 
 @dataclass(frozen=True)
@@ -37,8 +52,11 @@ class Estimate:
         deviation: Standard deviation of the pairs' differences; NaN for a single pair.
         p_different: Two-sided p-value of no difference.
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
+        p_above: p-value of a difference of at least the margin upwards (a one-sided test).
         needed: Pairs after which the 90 % interval is as narrow as the margin; None where that
             cannot be told. The bootstrap's interval knows no differences between scenes.
+        by_scene: The scenes by themselves; empty where all pairs are of one. The interquartile
+            mean leaves out a scene that is unlike the others.
     """
 
     pairs: int
@@ -50,7 +68,9 @@ class Estimate:
     deviation: float
     p_different: float
     p_equivalent: float
+    p_above: float
     needed: int | None
+    by_scene: tuple[SceneEstimate, ...] = ()
 
 
 def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
@@ -64,7 +84,7 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
     values = np.asarray(differences, dtype=np.float64)
     enough = len(values) >= BOOTSTRAP_FROM
     found = _by_bootstrap(values, scenes, margin) if enough else _by_student(values, margin)
-    center, wide, narrow, different, equivalent, noise = found
+    center, wide, narrow, different, equivalent, above, noise = found
     return Estimate(
         pairs=len(values),
         scenes=len(set(scenes)),
@@ -75,8 +95,21 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
         deviation=_deviation(values),
         p_different=different,
         p_equivalent=equivalent,
+        p_above=above,
         needed=student.pairs_needed(noise, margin) if isfinite(noise) else None,
+        by_scene=_by_scene(values, scenes),
     )
+
+
+def _by_scene(values: NDArray[np.float64], scenes: Sequence[str]) -> tuple[SceneEstimate, ...]:
+    names = np.asarray(scenes)
+    found = []
+    for scene in dict.fromkeys(scenes):
+        own = values[names == scene]
+        if 1 < len(own) < len(values):
+            law = student.Law.of(own)
+            found.append(SceneEstimate(scene, law.center, law.interval(WIDE)))
+    return tuple(found)
 
 
 def _deviation(values: NDArray[np.float64]) -> float:
@@ -86,16 +119,18 @@ def _deviation(values: NDArray[np.float64]) -> float:
 def _by_student(values: NDArray[np.float64], margin: float) -> _Found:
     center, noise = float(values.mean()), _deviation(values)
     if len(values) == 1:
-        return center, _UNKNOWN, _UNKNOWN, nan, nan, noise
+        return center, _UNKNOWN, _UNKNOWN, nan, nan, nan, noise
     law = student.Law.of(values)
-    equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
+    above = law.upper_tail(margin)
+    equivalent = max(above, law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, noise
+    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, above, noise
 
 
 def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: float) -> _Found:
     law = Bootstrap.of(values, scenes)
-    equivalent = max(law.upper_tail(margin), law.lower_tail(-margin))
+    above = law.upper_tail(margin)
+    equivalent = max(above, law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
     wide, narrow = law.interval(WIDE), law.interval(NARROW)
-    return float(iqm(values)), wide, narrow, different, equivalent, law.noise
+    return float(iqm(values)), wide, narrow, different, equivalent, above, law.noise

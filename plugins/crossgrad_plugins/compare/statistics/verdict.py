@@ -5,7 +5,7 @@ from enum import StrEnum
 from math import isnan
 from typing import Final
 
-from crossgrad_plugins.compare.statistics.estimate import NARROW, WIDE, Estimate
+from crossgrad_plugins.compare.statistics.estimate import NARROW, WIDE, Estimate, SceneEstimate
 from crossgrad_plugins.compare.statistics.holm import holm
 
 #: Up to so many comparisons are judged one by one.
@@ -27,11 +27,33 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
     within the margin. Of more than five comparisons the p-values of either test are corrected with
     Holm's method first.
     """
-    different = [each.p_different for each in family]
-    equivalent = [each.p_equivalent for each in family]
-    if len(family) > UNCORRECTED:
-        different, equivalent = holm(different), holm(equivalent)
+    different = corrected([each.p_different for each in family])
+    equivalent = corrected([each.p_equivalent for each in family])
     return [_verdict(*each) for each in zip(different, equivalent, strict=True)]
+
+
+def corrected(values: Sequence[float]) -> list[float]:
+    """The p-values of one test of comparisons that are shown together: Holm's above five."""
+    return holm(values) if len(values) > UNCORRECTED else list(values)
+
+
+def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
+    """The scenes that surely contradict a verdict on all of them, by their own 95 % intervals.
+
+    Of a difference those that differ the other way, of equivalence those beyond the margin.
+    """
+    if verdict is Verdict.INCONCLUSIVE:
+        return ()
+    sign = 1.0 if found.center > 0.0 else -1.0
+    return tuple(
+        each
+        for each in found.by_scene
+        if (
+            max(sign * limit for limit in each.wide) < 0.0
+            if verdict is Verdict.DIFFERENT
+            else each.wide[0] > margin or each.wide[1] < -margin
+        )
+    )
 
 
 def _verdict(p_different: float, p_equivalent: float) -> Verdict:
