@@ -86,7 +86,10 @@ def _opening(claims: Claims, results: Results, outcomes: Mapping[Outcome, int]) 
         "scenes of uneven exposure is mostly the guess at the exposure of held-out photos, so that "
         "arms look alike in it. The margin is 0.1 dB. A statement of equality holds where the 90 % "
         "interval lies within the margin, one of order where the 95 % interval excludes zero; "
-        "p-values of a table with more than five are corrected together. Every arm has its own "
+        "p-values of a table with more than five are corrected together. The interquartile mean of "
+        "12 pairs leaves out a scene that is unlike the others: where the 95 % interval of a scene "
+        "by itself contradicts what all together say, it is named and the claim does not hold. "
+        "Every arm has its own "
         "best factor of the learning rates, found on a seed that is not counted, or that of an arm "
         "with as many views per step (`benchmarks/paper_data/plan.yaml`).",
         "",

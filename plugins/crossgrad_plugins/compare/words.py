@@ -64,7 +64,7 @@ def opposed_text(contrast: Contrast) -> str:
     shown = [
         f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
     ]
-    return f"surely not on {', '.join(shown)}" if shown else ""
+    return f"surely otherwise on {', '.join(shown)}" if shown else ""
 
 
 def support(contrast: Contrast) -> str:
