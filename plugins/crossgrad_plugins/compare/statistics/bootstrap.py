@@ -8,6 +8,10 @@ percentile interval (2015), with n - S degrees of freedom for n pairs of S scene
 12 pairs of 4 scenes found a difference between equal methods in 12 % of all trials, with them in
 5 % (tests/unit/compare/test_harness.py).
 
+Two pairs of a scene have deviations of one size, so that resampling them by themselves is far from
+any law: those of all such scenes are drawn from together. Before, 10 pairs of 5 scenes found a
+difference between equal methods in 8 % of all trials, since then in 4 %.
+
 Values are stretched about the mean of their scene, and one bad run moves that mean, with it all
 other values of the scene, but hardly the interquartile mean: the estimates are moved by what the
 stretching alone changes, so that they lie about the estimate of the values themselves.
@@ -25,6 +29,7 @@ from crossgrad_plugins.compare.statistics.iqm import iqm
 from crossgrad_plugins.compare.statistics.student import quantile
 
 DRAWS: Final = 2000
+_TWO: Final = 2
 _SEED: Final = 20_150_101
 
 
@@ -53,13 +58,16 @@ class Bootstrap:
         rng = np.random.default_rng(_SEED)
         strata, squares = _strata(scenes), 0.0
         stretched, resampled = np.empty(len(values)), np.empty((DRAWS, len(values)))
+        of_two = [each for each in strata if len(each) == _TWO]
+        pool = _deviations(values, of_two)
         for stratum in strata:
             own, count = values[stratum], len(stratum)
             stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
             stretched[stratum] = own.mean() + stretch * (own - own.mean())
             squares += float(np.sum((own - own.mean()) ** 2))
-            drawn = rng.integers(0, count, (DRAWS, count))
-            resampled[:, stratum] = stretched[stratum][drawn]
+            source = own.mean() + pool if count == _TWO else stretched[stratum]
+            drawn = rng.integers(0, len(source), (DRAWS, count))
+            resampled[:, stratum] = source[drawn]
         draws = iqm(resampled) + (iqm(values) - iqm(stretched))
         freedom = max(1, len(values) - len(strata))
         return cls(np.sort(draws), freedom, sqrt(squares / freedom))
@@ -94,6 +102,14 @@ class Bootstrap:
             spread = float(self.draws.std())
             place = min(place, -distance / spread) if spread > 0.0 else -inf
         return float(stdtr(self.freedom, place))
+
+
+def _deviations(
+    values: NDArray[np.float64], strata: Sequence[NDArray[np.intp]]
+) -> NDArray[np.float64]:
+    """The stretched deviations of scenes with two pairs from the means of their scenes."""
+    found = [sqrt(_TWO) * (values[each] - values[each].mean()) for each in strata]
+    return np.concatenate(found) if found else np.zeros(0)
 
 
 def _share(draws: NDArray[np.float64], border: float) -> float:
