@@ -61,7 +61,7 @@ class _Measured:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a comparison shows, beside the others of its table.
+    """The judgement on a comparison, beside the others of its table.
 
     Attributes:
         verdict: Of `crossgrad compare`.

@@ -3,7 +3,7 @@
 import os
 import unicodedata
 from collections import defaultdict
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from crossgrad_core.errors import UserError
@@ -117,11 +117,27 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
     )
 
 
+def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Folders at and below a folder, those behind links included, each once.
+
+    Yields:
+        The path below the folder with forward slashes (`.` for itself), the names of its folders,
+        of which those that are taken out of the list are not looked into, and of its files.
+    """
+    seen = set()
+    for base, folders, files in os.walk(folder, followlinks=True):
+        place = os.path.realpath(base)
+        if place in seen:  # A link that leads back.
+            folders.clear()
+            continue
+        seen.add(place)
+        yield Path(base).relative_to(folder).as_posix(), folders, files
+
+
 def _list_photos(folder: Path) -> tuple[str, ...]:
     """Names of all photos below a folder, sorted, with forward slashes."""
     names = []
-    for base, _, files in os.walk(folder):
-        below = Path(base).relative_to(folder).as_posix()
+    for below, _, files in walked(folder):
         prefix = "" if below == "." else below + "/"
         names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in _SUFFIXES]
     return tuple(sorted(names))

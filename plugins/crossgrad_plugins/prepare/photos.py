@@ -1,7 +1,6 @@
 """The photos of a folder: those that can be used, with what their files say, and the others."""
 
 import hashlib
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -11,6 +10,7 @@ import numpy as np
 
 from crossgrad_core.commands import UserError
 from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.photo_files import walked
 from crossgrad_core.scene.pillow import opened
 from crossgrad_plugins.prepare.exif import camera_of, orientation_of, position_of
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, Settings
@@ -19,12 +19,10 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 #: Photo files that pycolmap reads, and others that cameras and editors write.
-_READ: Final = frozenset(
-    {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
-)
+_READ: Final = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"})
 _UNREAD: Final = frozenset(
     {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef",
-     ".orf", ".psd", ".raf", ".rw2"}
+     ".orf", ".psd", ".raf", ".rw2", ".webp"}
 )  # fmt: skip
 _MASKS: Final = "masks"
 _MASK_ENDS: Final = ("_mask", ".mask")
@@ -86,10 +84,10 @@ def _check_folder(root: Path) -> None:
 
 def _names(root: Path) -> Iterator[str]:
     """Paths of all files below a folder, sorted in each folder; hidden ones are left out."""
-    for base, folders, files in os.walk(root):
+    for below, folders, files in walked(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        below = Path(base).relative_to(root)
-        yield from ((below / file).as_posix() for file in sorted(files) if file[0] != ".")
+        here = PurePosixPath(below)
+        yield from ((here / file).as_posix() for file in sorted(files) if file[0] != ".")
 
 
 def _listed(root: Path) -> tuple[list[str], list[LeftOut]]:

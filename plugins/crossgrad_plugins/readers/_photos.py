@@ -1,10 +1,11 @@
 """Photos of a folder by what other programs call them: with or without folder or suffix."""
 
-import os
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+
+from crossgrad_core.scene.photo_files import walked
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,9 @@ class PhotoNames:
     def of(cls, folder: Path) -> "PhotoNames":
         """The files below a folder; none where it is not there."""
         exact, short = set(), defaultdict(set)
-        for base, _, files in os.walk(folder):
-            below = Path(base).relative_to(folder)
+        for below, _, files in walked(folder):
             for file in files:
-                name = (below / file).as_posix()
+                name = (PurePosixPath(below) / file).as_posix()
                 exact.add(name)
                 for spelling in {file, PurePosixPath(file).stem}:
                     short[spelling].add(name)

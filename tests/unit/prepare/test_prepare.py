@@ -18,6 +18,7 @@ from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.app import prepared
 from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.photos import find_photos
 from crossgrad_plugins.prepare.plan import Plan, Position, Settings
 from crossgrad_plugins.prepare.report import data_of, summary_lines
 from crossgrad_plugins.prepare.waiting import rows_of
@@ -283,6 +284,20 @@ def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):
         Image.new("RGB", (100, 100)).save(photos / name, format="JPEG")
     assert ended("prepare", photos, tmp_path / "scene") == 2
     assert todo in capsys.readouterr().err
+
+
+def test_photos_of_linked_folders_are_found_once(tmp_path):
+    """One regime lies elsewhere; another link leads back to the folder itself."""
+    source = sorted((bundled_scene() / "images").rglob("*.jpg"))[:3]
+    for place, photo in zip(("street", "street", "elsewhere"), source, strict=True):
+        folder = tmp_path / ("photos/street" if place == "street" else "elsewhere")
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photo, folder)
+    (tmp_path / "photos" / "aerial").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "photos" / "back").symlink_to(tmp_path / "photos")
+    used, left_out = find_photos(tmp_path / "photos", Settings(), lambda *_: None)
+    assert [photo.folder for photo in used] == ["aerial", "street", "street"]
+    assert left_out == ()
 
 
 def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):
