@@ -370,9 +370,18 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
     yield over_seeds("ratio_of_means", "opacities+f_dc")
     for metric, columns in (("plain", ("sigma_w2", "sigma_b2", "rho")), ("adam", ("rho",))):
         row = next((r for r in tables[0] if r["block"] == "all" and r["metric"] == metric), {})
-        for column in columns:
-            low, high = _cell(row, f"{column}_low"), _cell(row, f"{column}_high")
-            yield f"{_cell(row, column)} ({low} to {high})" if low and high else _cell(row, column)
+        yield from (_with_interval(row, column) for column in columns)
+
+
+def _with_interval(row: Mapping[str, str], column: str) -> str:
+    """An estimate with its 95 % interval; no value >= 0 may be credible beside one below 0."""
+    value, low, high = (number(row, f"{column}{end}") for end in ("", "_low", "_high"))
+    # Tables of before 2026-11-25 have [0, 0] there.
+    if value is not None and value < 0.0 and (low, high) in {(None, None), (0.0, 0.0)}:
+        return f"{_cell(row, column)} (none, the estimate is below 0)"
+    if low is None or high is None:
+        return _cell(row, column)
+    return f"{_cell(row, column)} ({_cell(row, f'{column}_low')} to {_cell(row, f'{column}_high')})"
 
 
 def _noise(results: Results) -> Iterator[str]:

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 from math import isfinite, isnan
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from crossgrad_core.plugin import ONE_MODE
 from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, Modes
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.planner.probe import Probe
 
 #: sigma_b^2 / sigma_w^2 from which pairs pay: they take its share out of a step's variance.
 LEAST_RHO: Final = 0.1
@@ -59,7 +62,7 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     if probe is None:
         return plain.found(f"two modes; sigma_b^2 / sigma_w^2 is {_NOT_KNOWN}")
     if probe.problem or not isfinite(probe.rho_low + probe.rho_high):
-        return plain.found(f"the probe tells nothing: {probe.problem or 'no variance'}")
+        return plain.found(f"the probe tells nothing: {probe.problem or _without_interval(probe)}")
     figures = {"rho": probe.rho, "rho_low": probe.rho_low, "rho_high": probe.rho_high}
     shown = f"sigma_b^2 / sigma_w^2 {probe.rho:.3f} [{probe.rho_low:.3f}, {probe.rho_high:.3f}]"
     if probe.rho_low < LEAST_RHO:
@@ -74,6 +77,13 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
         f"--sampler {plain.choice}",
         f"{probe.rho / (1.0 + probe.rho):.0%} of a step's gradient variance",
     )
+
+
+def _without_interval(probe: "Probe") -> str:
+    """Why sigma_b^2 / sigma_w^2 has no interval that could decide."""
+    if probe.rho < 0.0 and isnan(probe.rho_low):
+        return f"sigma_b^2 / sigma_w^2 {probe.rho:.3f}, 95 % interval none, the estimate is below 0"
+    return "no variance"
 
 
 def views_per_step(evidence: Evidence) -> Decision:

@@ -160,6 +160,18 @@ def test_a_wide_gap_is_told_from_none():
     assert ends(rows, near)[1, 0] == 0.0
 
 
+def test_an_estimate_far_below_zero_has_no_interval():
+    """Groups with the same views, whose means lie nearer than those of any two samples."""
+    rows = np.tile(np.random.default_rng(0).normal(size=(12, 300)), (2, 1))
+    gramian, groups = rows @ rows.T, Groups(np.arange(24) < 12)
+    found = split_intervals(gramian, groups, np.random.default_rng(0))
+    assert variance_split(gramian, groups).between < 0.0
+    assert np.isnan([found.between.low, found.between.high]).all()
+    assert np.isnan([found.ratio.low, found.ratio.high]).all()
+    assert not found.between.holds(0.0)
+    assert found.within.low > 0.0
+
+
 def test_probing_every_camera_leaves_no_doubt():
     rows, near = sample()
     groups = Groups(near, cameras=(9, 7))

@@ -126,6 +126,19 @@ def test_runs_are_shown_scene_by_scene_and_over_training(modules, planted, grid_
     assert line.endswith("| holds |")
 
 
+@pytest.mark.parametrize(("low", "high"), [("", ""), (0.0, 0.0)], ids=["now", "before"])
+def test_an_estimate_below_zero_without_an_interval_says_so(modules, planted, grid_of, low, high):
+    sweep = planted("below", {"symmetric": 0.0})
+    figures = {"sigma_w2": 4.0, "sigma_w2_low": 3.0, "sigma_w2_high": 5.0, "rho": -0.0105}
+    figures |= {"rho_low": low, "rho_high": high, "sigma_b2": -0.042, "conflict_rate": 0.5}
+    figures |= {"sigma_b2_low": 0.0, "sigma_b2_high": 0.1, "exponent_depth": 1.0}
+    write_probes(sweep, {(m, "all"): figures for m in ("plain", "adam")})
+    results = modules.runs.read_results({"x": sweep}, {"x": grid_of(["symmetric"])})
+    text = modules.page.page(modules.data.read_claims(), results, modules.data.read_tables())
+    none = "-0.0105 (none, the estimate is below 0)"
+    assert f"| 4 (3 to 5) | -0.042 (0 to 0.1) | {none} | {none} |" in text
+
+
 def test_the_same_results_make_the_same_page(modules, planted, grid_of):
     sweep = planted("again", {"symmetric": 0.0, "near-far": 0.0})
     pages = []

@@ -168,6 +168,12 @@ def test_pairs_by_the_whole_interval(low, rho, high, status, changes):
     assert not groups.pairs(evidence_of("city_unimodal", probe)).settings
 
 
+def test_an_estimate_below_zero_without_an_interval_decides_nothing():
+    found = groups.pairs(evidence_of("city_hybrid", Probe(rho=-0.0105, conflict=0.5)))
+    assert (found.basis, dict(found.settings)) == ("default", {})
+    assert "-0.011, 95 % interval none, the estimate is below 0" in found.evidence
+
+
 def test_pairs_are_not_drawn_by_an_odd_number_of_views():
     probe = Probe(rho=0.5, rho_low=0.2, rho_high=0.9)
     found = groups.pairs(evidence_of("city_hybrid", probe, views_per_step=3))

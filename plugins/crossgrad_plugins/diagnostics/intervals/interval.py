@@ -5,7 +5,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval; NaN where it cannot be told, infinite where there is no upper end."""
+    """A confidence interval; infinite where there is no upper end.
+
+    Both ends are NaN where it cannot be told, or where no value that there can be is credible.
+    """
 
     low: float
     high: float

@@ -49,7 +49,8 @@ def split_intervals(
     the more of its noise comes from sigma_w^2, the more of its error falls on its upper end. The
     ends are never negative, whereas the estimate may be.
 
-    Unknown (NaN) with fewer than four views in a group, or without any variance.
+    Unknown (NaN) with fewer than four views in a group, or without any variance, and of sigma_b^2
+    and the ratio where the estimate lies so far below 0 that even 0 is rejected.
 
     Source: bootstrap-t and intervals by test inversion, Efron and Tibshirani 1993; variance of the
     statistic, Chen and Qin 2010. Coverage: `benchmarks/interval_coverage.py`.

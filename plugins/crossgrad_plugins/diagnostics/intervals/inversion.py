@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.diagnostics.intervals.interval import Interval
+from crossgrad_plugins.diagnostics.intervals.interval import UNKNOWN, Interval
 
 _DOUBLINGS = 60
 _BISECTIONS = 24
@@ -34,13 +34,16 @@ class Pivot:
 
 
 def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Interval:
-    """The values >= 0 that are not rejected.
+    """The values >= 0 that are not rejected; unknown (NaN) where there are none.
 
     Args:
         pivot: Value -> studentised estimate if that value is the true one.
         start: Positive; about as large as the upper end.
         level: Of the interval.
     """
+    # An estimate too low for 0 is so for all larger values: [0, 0] would say that it is exactly 0.
+    if not pivot(0.0).above(level, lower_end=False):
+        return UNKNOWN
     return Interval(
         low=_crossing(lambda value: pivot(value).above(level, lower_end=True), start),
         high=_crossing(lambda value: pivot(value).above(level, lower_end=False), start),
