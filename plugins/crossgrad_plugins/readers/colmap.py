@@ -1,5 +1,6 @@
 """Reads COLMAP scenes: `images/` and `sparse/0/`, binary or text."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,7 @@ def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
     notes.append(
         f"COLMAP: {count(len(model.images), 'posed image')}, "
         f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
-        f"{folder.relative_to(path)} ({form})"
+        f"{os.path.relpath(folder, path)} ({form})"
     )
     return RawScene(
         root=path,

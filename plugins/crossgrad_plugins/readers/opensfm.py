@@ -28,6 +28,7 @@ from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_json
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens
+from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import at, by_gps, origin_of
 from crossgrad_plugins.readers._points import Points
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
@@ -67,7 +68,8 @@ class OpenSfmReader(Reader):
         images = inside.name(self.images, "reader.images")
         cameras = {name: _camera(fields) for name, fields in chosen.members("cameras").items()}
         shots = chosen.members("shots")
-        views = tuple(_view(inside, name, shot, cameras) for name, shot in shots.items())
+        photos = PhotoNames.of(path / images)
+        views = tuple(_view(inside, photos, each, cameras) for each in shots.items())
         points = _points(chosen)
         head = (
             f"OpenSfM: {count(len(views), 'posed image')}, {count(len(cameras), 'camera')}, "
@@ -155,11 +157,17 @@ def _camera(fields: Fields) -> Calibration:
     return lens.brown((k1, k2, k3), (fields.number("p1", 0.0), fields.number("p2", 0.0)))
 
 
-def _view(inside: Inside, name: str, shot: Fields, cameras: dict[str, Calibration]) -> RawView:
+def _view(
+    inside: Inside,
+    photos: PhotoNames,
+    named: tuple[str, Fields],
+    cameras: dict[str, Calibration],
+) -> RawView:
+    name, shot = named
     camera = shot.text("camera")
     if camera not in cameras:
         shot.wrong("camera", f"a camera of the file, such as {min(cameras, default='(none)')}")
-    return raw_view(inside.name(name, shot.here), cameras[camera], _pose(shot))
+    return raw_view(photos.full(inside.name(name, shot.here)), cameras[camera], _pose(shot))
 
 
 def _pose(shot: Fields) -> NDArray[np.float64]:

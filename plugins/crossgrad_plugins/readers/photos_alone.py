@@ -6,7 +6,7 @@ from pathlib import Path
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 
@@ -32,6 +32,12 @@ class PhotosAloneReader(Reader):
         from crossgrad_plugins.prepare.report import summary_lines
 
         photos = path.resolve()
+        if not photos.name and self.scene is None:
+            raise UserError(
+                "the prepared scene has no place beside the photos",
+                where=photos,
+                todo="name its folder with --set reader.scene=FOLDER",
+            )
         place = self.scene or photos.with_name(f"{photos.name}-scene")
         report = prepared(photos, place, Settings())
         scene = ColmapReader().read(place, options)

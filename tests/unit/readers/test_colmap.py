@@ -578,3 +578,10 @@ class TestModels:
         assert "none held out: too few views" in notes(scene)
         assert "the training cameras stand in one place" in notes(scene)
         assert np.median(np.linalg.norm(scene.points, axis=1)) == pytest.approx(1, rel=1e-6)
+
+
+def test_a_model_may_be_named_with_its_whole_path(tmp_path, monkeypatch):
+    write_tiny_scene(tmp_path / "scene")
+    monkeypatch.chdir(tmp_path)
+    scene = read(Path("scene"), ColmapReader(model=str(tmp_path / "scene" / "sparse" / "0")))
+    assert any(f"from {Path('sparse', '0')} (" in note for note in scene.notes)

@@ -133,3 +133,11 @@ def test_rotation_vectors_are_those_of_scipy(vector):
 
     found = opensfm.rotation_by(np.array(vector, dtype=float))
     np.testing.assert_allclose(found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+
+
+def test_photos_are_found_in_folders_that_names_lack(tmp_path):
+    path = write(tmp_path)
+    (path / "images" / "day0").mkdir()
+    (path / "images" / "01.jpg").rename(path / "images" / "day0" / "01.jpg")
+    scene = OpenSfmReader().read(path, SceneOptions())
+    assert [view.name for view in scene.views] == ["day0/01.jpg"]
