@@ -5,12 +5,13 @@
 
 Evaluates the finished runs of one scene on the views of another capture of the same place that they
 were not trained on, as `crossgrad eval RUN --on SCENE [--ply FILE]` does, and skips those that have
-been. The views of each folder stand in bands of distance, the size of a pixel on what they show, so
-that a table reads from near to far. Only runs that kept their checkpoints can be evaluated.
+been: beside each table stands the scene, the step and the file that it is of. The views of each
+folder stand in bands of distance, the size of a pixel on what they show, so that a table reads from
+near to far; in brackets, how many of them were measured. Only runs that kept their checkpoints can
+be evaluated.
 """
 
 import argparse
-import csv
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,12 +20,11 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 import numpy as np
+from _elsewhere import Capture, Table, no_figure
 from arms import PSNR, difference, head, read
 
-from crossgrad_core.commands import configured, read_scene
+from crossgrad_core.commands import UserError
 from crossgrad_core.plugin import footprint_of
-from crossgrad_core.run.afterwards import How, evaluated_file, evaluated_on
-from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_plugins.compare.contrasts import contrast, judged
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
@@ -46,16 +46,10 @@ class Band:
     low: float
     high: float
 
-    @property
-    def title(self) -> str:
-        """Folder, sizes and number of views."""
-        return f"{self.folder}, {self.low:.2g} to {self.high:.2g} ({len(self.names)})"
 
-
-def bands_of(scene: Path, max_size: int, folders: Sequence[str], count: int) -> list[Band]:
+def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]:
     """The views of the folders, each folder in so many bands of equal numbers, near ones first."""
-    reading = {"split": "none", "max_size": max_size}
-    found, _ = read_scene(configured({"scene": scene, "reading": reading}))
+    found = capture.scene
     unit = found.similarity.scale
     bands = []
     for folder in folders or sorted({view.regime for view in found.views}):
@@ -86,13 +80,23 @@ class Probes:
 
     def mean(self, run: Run, band: Band) -> float | None:
         """The mean over the views of a band that the run was not trained on."""
-        known = self.values[run.results.folder]
-        found = [known[name] for name in sorted(band.names) if name in known]
+        found = self._measured(run, band)
         return fmean(found) if found else None
+
+    def _measured(self, run: Run, band: Band) -> list[float]:
+        known = self.values[run.results.folder]
+        return [known[name] for name in sorted(band.names) if name in known]
+
+    def title(self, band: Band) -> str:
+        """Folder, sizes and number of views that were measured, of all runs."""
+        runs = [run for own in self.runs.values() for run in own.values()]
+        counts = sorted({len(self._measured(run, band)) for run in runs})
+        views = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+        return f"{band.folder}, {band.low:.2g} to {band.high:.2g} ({views})"
 
     def means(self) -> Iterator[str]:
         """The table of means and standard deviations over runs."""
-        yield from head("arm", "runs", *(band.title for band in self.bands))
+        yield from head("arm", "runs", *map(self.title, self.bands))
         for arm, runs in self.runs.items():
             cells = (self._spread(list(runs.values()), band) for band in self.bands)
             yield f"| {arm} | {len(runs)} | {' | '.join(cells)} |"
@@ -112,31 +116,42 @@ class Probes:
                 (self.runs[arm], self.runs[baseline]),
                 self.quantity,
                 partial(self.mean, band=band),
-                band.title,
+                self.title(band),
             )
             for arm in others
             for band in self.bands
         )
         found = {(each.first, each.where): each for each in table}
-        titles = [band.title for band in self.bands]
+        titles = list(map(self.title, self.bands))
         yield from head("arm", *(f"{title}, less {baseline}" for title in titles))
         for arm in others:
             yield f"| {arm} | {' | '.join(difference(found.get((arm, at))) for at in titles)} |"
 
 
-def figures_of(run: Path, scene: Path, figure: str, *, file: bool) -> dict[str, float]:
-    """Photo -> figure of a run's model or, drawn on black, its PLY; evaluated where it is not."""
-    table = run / f"per_view_{'of_ply_' if file else ''}on_{scene.name}.csv"
-    if not table.is_file():
-        print(run, file=sys.stderr, flush=True)
-        how = How(threads=1)
-        if file:
-            result = evaluated_file(run, run / "point_cloud.ply", how, scene)[0]
-        else:
-            result = evaluated_on(run, scene, how)[0]
-        write_per_view(run, result, table.name)
-    with table.open(encoding="utf-8", newline="") as lines:
-        return {row["name"]: float(row[figure]) for row in csv.DictReader(lines) if row[figure]}
+def figures_of(
+    runs: Sequence[Run], capture: Capture, name: str, *, file: bool
+) -> dict[Path, dict[str, float]]:
+    """Folder of a run -> photo -> figure of its model or, drawn on black, its PLY.
+
+    Raises:
+        UserError: There is no such figure, or a run cannot be evaluated.
+    """
+    measured = [
+        {
+            each
+            for view in run.results.views
+            for each, value in view.values.items()
+            if value is not None
+        }
+        for run in runs
+    ]
+    if name not in (offered := set[str].intersection(*measured)):
+        raise no_figure(name, sorted(offered))
+    tables = [Table(run, capture, file) for run in runs]
+    found = {table.run.results.folder: table.figures(name) for table in tables}
+    if unmarked := sum(table.is_unmarked for table in tables):
+        print(f"{unmarked} tables do not say of which scene and step they are", file=sys.stderr)
+    return found
 
 
 def main() -> None:
@@ -152,6 +167,17 @@ def main() -> None:
     parser.add_argument("--files", action="store_true", help="their PLY on black instead")
     parser.add_argument("--baseline", metavar="ARM", help="differences from this arm")
     given = parser.parse_args()
+    try:
+        print_tables(given, _runs(given, parser))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+def _runs(
+    given: argparse.Namespace, parser: argparse.ArgumentParser
+) -> dict[str, dict[tuple[str, int], Run]]:
+    """The runs that are wanted, by arm."""
     runs = {
         arm: {at: run for at, run in own.items() if at[0] == given.of}
         for arm, own in read(given.sweeps).by_arm.items()
@@ -160,17 +186,29 @@ def main() -> None:
     runs = {arm: own for arm, own in runs.items() if own}
     if given.baseline is not None and given.baseline not in runs:
         parser.error(f"no arm {given.baseline}; there are {', '.join(runs) or 'none'}")
-    folders = [run.results.folder for own in runs.values() for run in own.values()]
     sizes = {run.config["reading"]["max_size"] for own in runs.values() for run in own.values()}
     if len(sizes) != 1:
         parser.error(f"runs of one size of photos are needed; there are {sizes or 'none'}")
-    values = {each: figures_of(each, given.on, given.figure, file=given.files) for each in folders}
-    probes = Probes(
-        runs,
-        values,
-        bands_of(given.on, *sizes, given.folders, given.bands),
-        Quantity.of(given.figure),
-    )
+    return runs
+
+
+def print_tables(
+    given: argparse.Namespace, runs: Mapping[str, Mapping[tuple[str, int], Run]]
+) -> None:
+    """Evaluates what is missing and prints the tables.
+
+    Args:
+        given: The options of the command line.
+        runs: Arm -> scene and seed -> run, all with photos of one size.
+
+    Raises:
+        UserError: The scene cannot be read, there is no such figure, or a run cannot be evaluated.
+    """
+    every = [run for own in runs.values() for run in own.values()]
+    capture = Capture.read(given.on, every[0].config["reading"]["max_size"])
+    values = figures_of(every, capture, given.figure, file=given.files)
+    bands = bands_of(capture, given.folders, given.bands)
+    probes = Probes(runs, values, bands, Quantity.of(given.figure))
     print("\n".join(probes.means()))
     if given.baseline is not None:
         print()

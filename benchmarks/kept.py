@@ -30,7 +30,7 @@ Rows: TypeAlias = Sequence[Sequence[str]]
 FILES = (
     *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
     *("diagnostics.csv", "cameras.csv", "groupings.csv"),
-    "per_view*_on_*.csv",
+    *("per_view*_on_*.csv", "per_view*_on_*.json"),
 )
 
 

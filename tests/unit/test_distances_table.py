@@ -1,11 +1,15 @@
 """`benchmarks/distances.py`: figures on views elsewhere in bands of distance, near ones first."""
 
 import csv
+import json
+from types import SimpleNamespace
 
 import pytest
 from support.run_folders import RunFolder
 from support.scenes import write_tiny_scene
 from support.scripts import printed_by
+
+from crossgrad_core.run import afterwards
 
 NAMES = [f"{folder}/{number:04}.png" for folder in ("street", "aerial") for number in range(4)]
 
@@ -50,7 +54,9 @@ def test_near_views_come_first_and_arms_are_compared_band_by_band(tmp_path, plac
     head, _, one, two = means
     titles = [each.strip() for each in head[2:]]
     assert [title.partition(",")[0] for title in titles] == ["aerial"] * 2 + ["street"] * 2
-    assert all(title.endswith("(2)") for title in titles)
+    # Of one of the near bands every run was trained on a view.
+    assert [title[-3:] for title in titles[:2]] == ["(2)", "(2)"]
+    assert sorted(title[-3:] for title in titles[2:]) == ["(1)", "(2)"]
     low = [float(title.split()[1]) for title in titles]
     # Aerial cameras stand three times as far away, and a pixel of theirs is as much larger.
     assert low[0] <= low[1] and low[2] <= low[3] and low[0] == pytest.approx(3 * low[2], rel=0.3)
@@ -74,3 +80,90 @@ def test_a_scene_or_an_arm_that_is_not_there_is_named(tmp_path, place, printed, 
         with pytest.raises(SystemExit):
             printed(tmp_path / "runs", "--on", place, *options)
         assert said in capsys.readouterr().err
+
+
+@pytest.fixture
+def evaluated(monkeypatch):
+    """Evaluates runs with a stand-in; answers the scenes, and may be told the PSNR."""
+    told = SimpleNamespace(psnr=20.0, on=[])
+
+    def evaluate(folder, on, how):
+        told.on.append(on)
+        views = [SimpleNamespace(name=n, regime=n[:6], values={"psnr": told.psnr}) for n in NAMES]
+        figure = SimpleNamespace(name="psnr")
+        return SimpleNamespace(views=views, figures=[figure]), None
+
+    monkeypatch.setattr(afterwards, "evaluated_on", evaluate)
+    monkeypatch.setattr(
+        afterwards, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how)
+    )
+    return told
+
+
+def write_evaluable(folder):
+    run = RunFolder(settings={"steps": 300}).write(folder)
+    (run / "checkpoints" / "step-000300").mkdir(parents=True)
+    (run / "point_cloud.ply").write_bytes(b"ply")
+    return run
+
+
+def psnr_of(printed, *options):
+    """The mean of the only run in the only band of each folder."""
+    (means,) = printed(*options)
+    (row,) = means[2:]
+    return [cell.strip() for cell in row[2:]]
+
+
+def test_figures_of_another_scene_of_that_name_are_not_taken(tmp_path, place, printed, evaluated):
+    write_evaluable(tmp_path / "runs" / "a")
+    options = tmp_path / "runs", "--of", "city", "--on"
+    assert psnr_of(printed, *options, place) == ["20.00"] * 2
+    evaluated.psnr = 30.0
+    assert psnr_of(printed, *options, place) == ["20.00"] * 2 and len(evaluated.on) == 1
+    other = write_tiny_scene(
+        tmp_path / "other" / place.name, views=4, folders=("street", "aerial"), scale=3.0
+    )
+    assert psnr_of(printed, *options, other) == ["30.00"] * 2
+    assert evaluated.on == [place, other]
+
+
+@pytest.mark.parametrize("files", [(), ("--files",)], ids=["model", "ply"])
+def test_figures_of_another_state_of_a_run_are_not_taken(
+    tmp_path, place, printed, evaluated, files
+):
+    run = write_evaluable(tmp_path / "runs" / "a")
+    options = tmp_path / "runs", "--of", "city", "--on", place, *files
+    assert psnr_of(printed, *options) == ["20.00"] * 2
+    if files:
+        (run / "point_cloud.ply").write_bytes(b"other")
+    else:
+        summary = json.loads((run / "summary.json").read_text())
+        (run / "summary.json").write_text(json.dumps({**summary, "step": 400}))
+    evaluated.psnr = 30.0
+    assert psnr_of(printed, *options) == ["30.00"] * 2 and len(evaluated.on) == 2
+    # Another command wrote the table: what stands beside it is not of this one.
+    table = next(run.glob("per_view*_on_*.csv"))
+    table.write_text(table.read_text().replace("30.0", "10.0"))
+    assert psnr_of(printed, *options) == ["30.00"] * 2 and len(evaluated.on) == 3
+
+
+def test_a_kept_table_that_is_of_other_views_is_refused(tmp_path, place, printed, capsys):
+    write_run(tmp_path / "runs/a", place, 300, 0, {"street": 20.0, "aerial": 25.0})
+    assert psnr_of(printed, tmp_path / "runs", "--of", "city", "--on", place)
+    other = write_tiny_scene(tmp_path / "other" / place.name, views=4, folders=("elsewhere",))
+    with pytest.raises(SystemExit) as ended:
+        printed(tmp_path / "runs", "--of", "city", "--on", other)
+    assert ended.value.code == 2
+    assert "figures of a run are of other views" in capsys.readouterr().err
+
+
+def test_a_figure_that_no_run_has_is_one_message_before_anything_is_evaluated(
+    tmp_path, place, printed, evaluated, capsys
+):
+    write_evaluable(tmp_path / "runs" / "a")
+    with pytest.raises(SystemExit) as ended:
+        printed(tmp_path / "runs", "--of", "city", "--on", place, "--figure", "lpips_vgg")
+    assert ended.value.code == 2 and not evaluated.on
+    said = capsys.readouterr().err
+    assert "there is no such figure" in said and "one of psnr, ssim" in said
+    assert "Traceback" not in said

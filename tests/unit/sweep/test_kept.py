@@ -25,6 +25,8 @@ def sweep(tmp_path):
     for seed in range(3):
         RunFolder(seed=seed).write(tmp_path / "sweep" / "runs" / f"r{seed}")
     (tmp_path / "sweep" / "runs" / "r0" / "point_cloud.ply").write_bytes(b"ply" * 1000)
+    for suffix in ("csv", "json"):
+        (tmp_path / "sweep" / "runs" / "r1" / f"per_view_on_city.{suffix}").write_text("there")
     (tmp_path / "sweep" / "runs.csv").write_text("run,configuration\nr0,a\nr1,a\nr2,a\n")
     return tmp_path / "sweep"
 
@@ -39,6 +41,7 @@ def test_tables_come_back_and_models_do_not(script, sweep, tmp_path):
     assert script.pack(sweep, archive) == 3
     assert script.unpack(archive, tmp_path / "back") == 3
     (sweep / "runs" / "r0" / "point_cloud.ply").unlink()
+    assert (tmp_path / "back" / "runs" / "r1" / "per_view_on_city.json").is_file()
     assert contents(tmp_path / "back") == contents(sweep)
     assert all(is_finished(each) for each in (tmp_path / "back" / "runs").iterdir())
     found = read_runs([tmp_path / "back"], skip_broken=False)

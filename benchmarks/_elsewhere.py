@@ -1,0 +1,157 @@
+"""Another capture of a place, and tables of figures on its views that say what they are of."""
+
+import csv
+import json
+import sys
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from crossgrad_core.commands import UserError, configured, fingerprint, read_scene, write_atomically
+from crossgrad_core.run import afterwards
+from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.scene.fingerprint import mark_of
+from crossgrad_core.system.text_files import read_json
+from crossgrad_plugins.compare.run import Run
+
+if TYPE_CHECKING:
+    from crossgrad_core.contract.scene import Scene
+
+#: What a table is of, as it stands in the file beside it.
+Origin: TypeAlias = dict[str, object]
+PLY = "point_cloud.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture of a place.
+
+    Attributes:
+        path: Its folder.
+        scene: The scene, nothing held out.
+        digest: What it is known by, wherever it lies, in this size of photos.
+    """
+
+    path: Path
+    scene: "Scene"
+    digest: str
+
+    @classmethod
+    def read(cls, path: Path, max_size: int) -> "Capture":
+        """The capture in a folder.
+
+        Raises:
+            UserError: It cannot be read.
+        """
+        reading = {"split": "none", "max_size": max_size}
+        config = configured({"scene": path, "reading": reading})
+        scene, _ = read_scene(config)
+        return cls(path, scene, fingerprint(scene, config))
+
+
+@dataclass(frozen=True)
+class Table:
+    """The figures of a run on the views of another capture, a row for each view.
+
+    Attributes:
+        run: The run.
+        capture: The capture.
+        file: Whether its PLY is drawn, on black, instead of its model.
+    """
+
+    run: Run
+    capture: Capture
+    file: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The table, as `crossgrad eval RUN --on SCENE` names it."""
+        what = "of_ply_on" if self.file else "on"
+        return self.run.results.folder / f"per_view_{what}_{self.capture.path.absolute().name}.csv"
+
+    @property
+    def is_unmarked(self) -> bool:
+        """Whether nothing says what the table is of, as of those that `crossgrad eval` writes."""
+        return self._origin() is None
+
+    def figures(self, name: str) -> dict[str, float]:
+        """Photo -> a figure, where the view has one; evaluated where the table is not of this.
+
+        Raises:
+            UserError: There is no such figure, or the run cannot be evaluated.
+        """
+        if not self.path.is_file() or not self._is_of_this():
+            self._evaluate()
+        rows = self._rows()
+        columns = list(rows[0]) if rows else []
+        if name not in columns:
+            raise no_figure(name, [each for each in columns if each not in {"name", "regime"}])
+        return {row["name"]: float(row[name]) for row in rows if row[name]}
+
+    def _rows(self) -> list[dict[str, str]]:
+        with self.path.open(encoding="utf-8", newline="") as lines:
+            return list(csv.DictReader(lines))
+
+    def _is_of_this(self) -> bool:
+        origin = self._origin()
+        if origin is not None:
+            return all(origin.get(key) == value for key, value in self._wanted().items())
+        # Kept tables of before are without; these runs cannot be evaluated again.
+        views = {view.name for view in self.capture.scene.views}
+        return not self._has_checkpoint() and all(row["name"] in views for row in self._rows())
+
+    def _origin(self) -> Origin | None:
+        """What the table is of; None where that is not known, or of a table of other bytes."""
+        path = self.path.with_suffix(".json")
+        if not path.is_file():
+            return None
+        found = read_json(path)
+        written = isinstance(found, dict) and found.get("table") == _digest(self.path)
+        return dict(found) if isinstance(found, dict) and written else None
+
+    def _wanted(self) -> Origin:
+        """What the table has to be of; without the PLY where that is no longer there."""
+        wanted: Origin = {"scene": self.capture.digest, "step": self.run.number("step")}
+        ply = self.run.results.folder / PLY
+        if self.file and ply.is_file():
+            wanted["ply"] = mark_of(ply).model_dump()
+        return wanted
+
+    def _has_checkpoint(self) -> bool:
+        return any(self.run.results.folder.glob("checkpoints/step-*"))
+
+    def _evaluate(self) -> None:
+        folder, on = self.run.results.folder, self.capture.path
+        if self.path.is_file() and not self._has_checkpoint():
+            raise UserError(
+                "the figures of a run are of other views, or of another state of the run",
+                where=self.path,
+                expected=f"those of {on} at step {self.run.number('step'):,.0f}",
+                found="a run without checkpoints, which cannot be evaluated again",
+                todo="name the scene that the table is of with --on, or leave out the run's arm",
+            )
+        print(folder, file=sys.stderr, flush=True)
+        how = afterwards.How(threads=1)
+        if self.file:
+            result = afterwards.evaluated_file(folder, folder / PLY, how, on)[0]
+        else:
+            result = afterwards.evaluated_on(folder, on, how)[0]
+        write_per_view(folder, result, self.path.name)
+        origin = {**self._wanted(), "table": _digest(self.path)}
+        write_atomically(self.path.with_suffix(".json"), f"{json.dumps(origin)}\n".encode())
+
+
+def no_figure(name: str, offered: list[str]) -> UserError:
+    """That there is no figure of that name, and which ones there are."""
+    return UserError(
+        "there is no such figure",
+        where="--figure",
+        expected=f"one of {', '.join(offered)}" if offered else "a figure that all runs measure",
+        found=name,
+        todo="copy a name, or repeat the runs with it: crossgrad run --metrics NAME",
+    )
+
+
+def _digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
