@@ -103,11 +103,12 @@ def _opening(claims: Claims, results: Results, outcomes: Mapping[Outcome, int]) 
 
 def _machines(results: Results) -> Iterator[str]:
     runs = [run for by in results.runs.values() for run in by.values()]
-    facts = {
-        f"{env.get('cpu')}, crossgrad {env.get('crossgrad')}"
-        for run in runs
-        if (env := run.summary.get("environment"))
-    }
+    code: dict[str, set[str]] = {}
+    for run in runs:
+        if env := run.summary.get("environment"):
+            machine = f"{env.get('cpu')}, crossgrad {env.get('crossgrad')}"
+            code.setdefault(machine, set()).add(str(env.get("commit") or "not known"))
+    facts = [f"{machine} (commits: {', '.join(sorted(own))})" for machine, own in code.items()]
     if facts:
         spent = [run.number("cpu_seconds") or run.number("train_seconds") or 0.0 for run in runs]
         hours = f"Training took {sum(spent) / 3600:.1f} core hours."

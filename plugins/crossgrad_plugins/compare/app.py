@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crossgrad_core.commands import Progress, table_bytes
+from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import draw_curves
@@ -63,7 +64,7 @@ def compare(
     views = worst_views(comparison)
     pictured, unreadable = with_pictures(comparison, views)
     figures = drawn_figures(comparison)
-    notes = (*comparison.notes, *unreadable)
+    notes = (*comparison.notes, *differing_code(comparison.main), *unreadable)
     page = page_of(comparison, figures, pictured, views, notes, version("crossgrad"))
     files = {PAGE: page.encode()}
     files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}

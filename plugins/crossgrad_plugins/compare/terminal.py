@@ -25,7 +25,7 @@ def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
         yield ""
         yield f"noise floor, standard deviation over seeds: {noise}"
     for note in notes:
-        yield f"not compared: {note}"
+        yield f"note: {note}"
     for name, why in comparison.left_out.items():
         yield f"left out: {name}: {why}"
 

@@ -1,11 +1,14 @@
 """What does not compare is refused, with the reason and the way out."""
 
+from html import unescape
 from pathlib import Path
 
 import pytest
 from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
+from crossgrad_plugins.compare import app
+from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Options, compared
 from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.source import read_runs
@@ -162,3 +165,59 @@ def test_what_is_advised_about_figures_can_be_done(tmp_path):
     assert "crossgrad run --metrics NAME" in lacking.value.todo
     # `crossgrad eval` measures what a run measures, and writes elsewhere.
     assert not any("crossgrad eval" in each.value.todo for each in (lacking, unlike))
+
+
+def made_with(views, seed, commit, **more):
+    return RunFolder(views_per_step=views, seed=seed, environment={"commit": commit}, **more)
+
+
+@pytest.mark.parametrize(
+    ("commits", "expected"),
+    [
+        # Of one view with seeds 0 and 1, then of two views.
+        ("aaaa", None),
+        ("abab", None),
+        ("aabb", "code differs: 'views=1' ran at commit a; 'views=2' ran at commit b: "),
+        (
+            "aaab",
+            "code differs: 'views=1' ran at commit a; 'views=2' ran at commit a and commit b: ",
+        ),
+        ("abba", "code differs within pairs: run-0 ran at commit a, run-2 ran at commit b: "),
+        (("a", "a", None, None), "'views=2' ran at crossgrad 0.2.0: "),
+    ],
+)
+def test_arms_and_pairs_of_different_code_have_a_note(tmp_path, commits, expected):
+    arms = [(views, seed) for views in (1, 2) for seed in (0, 1)]
+    runs = [made_with(*arm, commit) for arm, commit in zip(arms, commits, strict=True)]
+    notes = differing_code(comparison(tmp_path, *runs).main)
+    if expected is None:
+        assert notes == []
+    else:
+        (note,) = notes
+        assert expected in note
+        assert note.endswith("that they are equally fast is not given, and bits may differ")
+
+
+def test_runs_that_do_not_say_where_they_come_from_have_no_note(tmp_path):
+    unknown = {"commit": None, "crossgrad": None}
+    runs = RunFolder(environment=unknown), made_with(2, 0, "a")
+    assert differing_code(comparison(tmp_path, *runs).main) == []
+
+
+def test_many_arms_are_not_all_named(tmp_path):
+    runs = [made_with(views, 0, f"c{views}") for views in range(1, 7)]
+    (note,) = differing_code(comparison(tmp_path, *runs).main)
+    assert "'views=3' ran at commit c3; 3 more: " in note
+    runs = [made_with(views, 1, "a" if views == 1 else "b") for views in range(1, 7)]
+    (note,) = differing_code(comparison(tmp_path / "again", *runs).main)
+    assert "'views=2', 'views=3', 'views=4' and 2 more ran at commit b: " in note
+
+
+def test_the_command_prints_the_note(tmp_path, monkeypatch, capsys):
+    for views, commit in ((1, "aaaaaaa"), (2, "bbbbbbb")):
+        made_with(views, 0, commit).write(tmp_path / "runs" / f"{views}")
+    monkeypatch.setattr(app, "drawn_figures", lambda _: [])
+    app.compare([tmp_path / "runs"], Options(), tmp_path / "out", skip_broken=False)
+    note = "'views=1' ran at commit aaaaaaa; 'views=2' ran at commit bbbbbbb: "
+    assert f"note: code differs: {note}" in capsys.readouterr().out
+    assert note in unescape((tmp_path / "out" / "index.html").read_text())

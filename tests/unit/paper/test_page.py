@@ -139,6 +139,17 @@ def test_an_estimate_below_zero_without_an_interval_says_so(modules, planted, gr
     assert f"| 4 (3 to 5) | -0.042 (0 to 0.1) | {none} | {none} |" in text
 
 
+def test_machines_have_their_commits(modules, planted, grid_of):
+    sweeps = {
+        name: planted(name, {name: 0.0}, environment={"commit": commit})
+        for name, commit in (("symmetric", "bbbbbbb"), ("near-far", "aaaaaaa"))
+    }
+    grid = grid_of(list(sweeps))
+    results = modules.runs.read_results(sweeps, {"x": grid})
+    text = modules.page.page(modules.data.read_claims(), results, modules.data.read_tables())
+    assert "Machines: A Processor, crossgrad 0.2.0 (commits: aaaaaaa, bbbbbbb). " in text
+
+
 def test_the_same_results_make_the_same_page(modules, planted, grid_of):
     sweep = planted("again", {"symmetric": 0.0, "near-far": 0.0})
     pages = []

@@ -1,1 +1,1 @@
-"""Checks before runs are compared: scenes, metrics, machines must agree."""
+"""Checks of runs that are compared: scenes, metrics, machines must agree, code should."""
