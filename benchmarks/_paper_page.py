@@ -206,7 +206,13 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 
 def _second_view(results: Results) -> Iterator[str]:
     """The gain of the second view on each scene, at equal steps, views and seconds."""
-    yield from ("## What the second view buys, scene by scene", "")
+    yield from (
+        "## What the second view buys, scene by scene",
+        "",
+        "The p-values of all rows are corrected together: an interval of three pairs that excludes "
+        "zero is one of so many.",
+        "",
+    )
     contrasts = {
         (scene, name): paired(Pairing(first=a, second=b, scenes=(scene,)), results)
         for scene in _scenes(results)
@@ -234,6 +240,8 @@ def _second_view(results: Results) -> Iterator[str]:
 def _lacking(results: Results, scene: str, name: str) -> str:
     """Which pairs of a comparison on a scene are still to come; empty where none is."""
     wanted, missing = results.missing(EQUAL[name], (scene,))
+    if not wanted:
+        return ": in no grid"
     return f": {wanted - missing} of {wanted} pairs so far" if missing else ""
 
 
@@ -376,13 +384,13 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
 
 def _with_interval(row: Mapping[str, str], column: str) -> str:
     """An estimate with its 95 % interval; no value >= 0 may be credible beside one below 0."""
-    value, low, high = (number(row, f"{column}{end}") for end in ("", "_low", "_high"))
+    value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
     # Tables of before 2026-11-25 have [0, 0] there.
-    if value is not None and value < 0.0 and (low, high) in {(None, None), (0.0, 0.0)}:
+    if value and float(value) < 0.0 and not any(float(end) for end in (low, high) if end):
         return f"{_cell(row, column)} (none, the estimate is below 0)"
-    if low is None or high is None:
+    if not low or not high:
         return _cell(row, column)
-    return f"{_cell(row, column)} ({_cell(row, f'{column}_low')} to {_cell(row, f'{column}_high')})"
+    return f"{_cell(row, column)} ({float(low):.3g} to {float(high):.3g})"
 
 
 def _noise(results: Results) -> Iterator[str]:

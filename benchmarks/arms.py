@@ -21,6 +21,7 @@ from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.words import verdict_text
 
 PSNR = Quantity.of("psnr")
 #: Overall, and the regimes as scenes call them.
@@ -110,7 +111,7 @@ def difference(found: Contrast | None) -> str:
     if found is None or found.estimate is None:
         return ""
     center, (low, high) = found.estimate.center, found.estimate.wide
-    return f"{center:+.2f} [{low:+.2f}, {high:+.2f}], {found.verdict} ({len(found.pairs)})"
+    return f"{center:+.2f} [{low:+.2f}, {high:+.2f}], {verdict_text(found)} ({len(found.pairs)})"
 
 
 def head(*titles: str) -> Iterator[str]:

@@ -20,7 +20,7 @@ from arms import REGIMES, Runs, arms, head, read
 
 from crossgrad_plugins.compare.contrasts import Contrast, judged
 from crossgrad_plugins.compare.statistics.verdict import Verdict
-from crossgrad_plugins.compare.words import needed_text
+from crossgrad_plugins.compare.words import needed_text, verdict_text
 
 ONE, TWO = "one view", "two views"
 #: What is held equal -> two arms, the one with two views first.
@@ -65,7 +65,7 @@ def differences(runs: Runs, ending: str) -> Iterator[str]:
 
 def pooled(found: Contrast) -> str:
     """The pooled difference with its interval and its verdict, as two cells."""
-    verdict = str(found.verdict)
+    verdict = verdict_text(found)
     if found.verdict is Verdict.INCONCLUSIVE:
         verdict += f": {needed_text(found)}"
     return f"{figure_of(found)} | {verdict}"

@@ -28,12 +28,11 @@ def as_user_error(
         todo: What the user can do about it.
     """
     details = error.errors(include_url=False)
-    first = details[0]
-    place, holder = _place(model, first["loc"])
+    first, places = details[0], [_place(model, each["loc"]) for each in details]
+    place, holder = places[0]
     # A value that fits no branch of a union is reported once for each branch.
-    branches = [each for each in details if _place(model, each["loc"])[0] == place]
-    paths = dict.fromkeys(".".join(_place(model, each["loc"])[0]) for each in details)
-    key, *others = paths
+    branches = [each for each, at in zip(details, places, strict=True) if at[0] == place]
+    key, *others = dict.fromkeys(".".join(parts) for parts, _ in places)
     more = f"also wrong: {listed(others)}" if others else ""
     where = ".".join(part for part in (prefix, key) if part) or subject
     if first["type"] == "extra_forbidden":

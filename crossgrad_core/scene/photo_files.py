@@ -118,16 +118,29 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
 
 
 def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Folders at and below a folder, those behind links included, each once.
+    """Folders at and below a folder, then those behind its links to folders, each once.
+
+    Links behind links are not followed, nor one that leads to where the folder itself lies.
 
     Yields:
         The path below the folder with forward slashes (`.` for itself), the names of its folders,
         of which those that are taken out of the list are not looked into, and of its files.
     """
-    seen = set()
-    for base, folders, files in os.walk(folder, followlinks=True):
+    seen: set[str] = set()
+    links: list[Path] = []
+    for below, folders, files in _tree(folder, folder, seen):
+        yield below, folders, files
+        places = (folder / below / name for name in sorted(folders))
+        links += [place for place in places if place.is_symlink()]
+    for link in links:
+        if link.resolve() not in folder.resolve().parents:
+            yield from _tree(folder, link, seen)
+
+
+def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list[str], list[str]]]:
+    for base, folders, files in os.walk(start):
         place = os.path.realpath(base)
-        if place in seen:  # A link that leads back.
+        if place in seen:
             folders.clear()
             continue
         seen.add(place)

@@ -67,6 +67,12 @@ def opposed_text(contrast: Contrast) -> str:
     return f"surely otherwise on {', '.join(shown)}" if shown else ""
 
 
+def verdict_text(contrast: Contrast) -> str:
+    """The verdict, and on which scenes it is surely not so."""
+    found = opposed_text(contrast)
+    return f"{contrast.verdict}, {found}" if found else str(contrast.verdict)
+
+
 def support(contrast: Contrast) -> str:
     """How sure that is."""
     found = contrast.estimate

@@ -287,17 +287,28 @@ def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):
 
 
 def test_photos_of_linked_folders_are_found_once(tmp_path):
-    """One regime lies elsewhere; another link leads back to the folder itself."""
-    source = sorted((bundled_scene() / "images").rglob("*.jpg"))[:3]
-    for place, photo in zip(("street", "street", "elsewhere"), source, strict=True):
-        folder = tmp_path / ("photos/street" if place == "street" else "elsewhere")
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.copy(photo, folder)
-    (tmp_path / "photos" / "aerial").symlink_to(tmp_path / "elsewhere")
-    (tmp_path / "photos" / "back").symlink_to(tmp_path / "photos")
-    used, left_out = find_photos(tmp_path / "photos", Settings(), lambda *_: None)
-    assert [photo.folder for photo in used] == ["aerial", "street", "street"]
+    """One regime lies elsewhere; other links lead to what is there already, back, and further."""
+    photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    source = sorted((bundled_scene() / "images").rglob("*.jpg"))[:4]
+    for place, photo in zip((photos / "street", elsewhere, tmp_path / "far"), source, strict=False):
+        place.mkdir(parents=True)
+        shutil.copy(photo, place)
+    for link, there in {
+        photos / "aerial": elsewhere,
+        photos / "again": photos / "street",
+        photos / "back": photos,
+        photos / "up": tmp_path,
+        elsewhere / "further": tmp_path / "far",
+    }.items():
+        link.symlink_to(there)
+    used, left_out = find_photos(photos, Settings(), lambda *_: None)
+    assert [photo.folder for photo in used] == ["aerial", "street"]
     assert left_out == ()
+
+
+def test_photos_at_the_root_ask_for_a_place(capsys):
+    assert ended("run", "/", "--prepare") == 2
+    assert "reader.scene=FOLDER" in capsys.readouterr().err
 
 
 def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):

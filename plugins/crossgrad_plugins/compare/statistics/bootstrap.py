@@ -9,8 +9,8 @@ percentile interval (2015), with n - S degrees of freedom for n pairs of S scene
 5 % (tests/unit/compare/test_harness.py).
 
 Two pairs of a scene have deviations of one size, so that resampling them by themselves is far from
-any law: those of all such scenes are drawn from together. Before, 10 pairs of 5 scenes found a
-difference between equal methods in 8 % of all trials, since then in 4 %.
+any law: those of all such scenes are drawn from together. By themselves, 10 pairs of 5 scenes found
+a difference between equal methods in 12 to 22 of 200 trials, together in 1 to 6 (the same tests).
 
 Values are stretched about the mean of their scene, and one bad run moves that mean, with it all
 other values of the scene, but hardly the interquartile mean: the estimates are moved by what the
