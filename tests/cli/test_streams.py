@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import subprocess
 import sys
 import threading
@@ -69,7 +70,7 @@ def test_streams_of_another_kind_stay_as_they_are():
 
 @pytest.mark.parametrize("redirections", ["| head -1", ">&-", "2>&-", ">&- 2>&-", ">&- 2>&- <&-"])
 def test_listing_for_nobody_ends_quietly(redirections):
-    command = f"{sys.executable} -m crossgrad_core plugins list"
+    command = f"{shlex.quote(sys.executable)} -m crossgrad_core plugins list"
     script = f"set -o pipefail; {command} {redirections}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0

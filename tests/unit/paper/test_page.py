@@ -118,7 +118,7 @@ def test_runs_are_shown_scene_by_scene_and_over_training(modules, planted, grid_
     assert "**48 of 48 runs have finished.**" in text
     assert re.search(r"\| city \| equal steps \| \+0\.\d+ dB .*n = 3.*\| different \|", text)
     assert re.search(r"\| town \| equal views \| .*n = 3.*\| equivalent \|", text)
-    assert re.search(r"\| wood \| equal seconds \|  \|  \| not run \|", text)
+    assert re.search(r"\| wood \| equal seconds \|  \|  \| not run: in no grid \|", text)
     row = "| one view, 2x stretched | field | 20 | 0.5 (0.5) | 2 | 2 | 4 | 0.2 | 0.05 (0 to 0.11) |"
     assert row in text
     assert "Two views per step beat one at equal steps." in text
