@@ -7,6 +7,7 @@ import torch
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli.main import main
+from crossgrad_core.config import ComponentChoice
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
@@ -145,7 +146,7 @@ def test_bad_requests_are_refused(scene, tmp_path):
     with pytest.raises(UserError, match="either a scene"):
         diagnose(scene, tmp_path, {}, QUICK, None)
     with pytest.raises(UserError, match="nosuch"):
-        diagnose(scene, None, {}, Options(grouping="nosuch"), tmp_path / "a")
+        diagnose(scene, None, {}, Options(grouping=ComponentChoice(name="nosuch")), tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "diagnostics.csv").touch()
     with pytest.raises(UserError, match="holds a report"):

@@ -51,7 +51,8 @@ def test_json_has_every_figure(scene, capsys):
     assert plan["settings"] == {"densifier": "none"}
     parts = {each["part"]: each for each in plan["decisions"]}
     assert set(parts["modes"]["figures"]) == {
-        *("bimodality", "bimodality_of_heights", "far_over_near", "range", "views")
+        *("bimodality", "separability", "separability_of_even", "smaller_share"),
+        *("far_over_near", "range", "views"),
     }
     assert all(each["rule"] and each["source"] for each in parts.values())
 

@@ -120,11 +120,12 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
     groups of views and the part between them.
     """
     announce()
+    from crossgrad_core.commands import ComponentChoice
     from crossgrad_plugins.diagnostics import app
     from crossgrad_plugins.diagnostics.command import Options
 
     options = Options(
-        grouping=grouping,
+        grouping=None if grouping is None else ComponentChoice(name=grouping),
         per_group=views,
         probes=probes,
         seconds=seconds,

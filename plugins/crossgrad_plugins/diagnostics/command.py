@@ -40,7 +40,7 @@ class Options:
     """How a scene is diagnosed.
 
     Attributes:
-        grouping: Name of the grouping; by default that of the run, or else the paper's.
+        grouping: The grouping; by default that of the run, or else the paper's.
         per_group: Probed views per group.
         probes: Probes during the vanilla run, evenly spaced; the last one at its end.
         seconds: Training seconds of the vanilla run.
@@ -48,7 +48,7 @@ class Options:
         signature: File for the labels of grouping `conflict-signature`, or None.
     """
 
-    grouping: str | None = None
+    grouping: ComponentChoice | None = None
     per_group: int = 12
     probes: int = 4
     seconds: float = 60.0
@@ -121,9 +121,10 @@ def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None)
     """The views to probe; `groups` are the labels that the probed run was trained with."""
     if options.grouping is None and groups is not None:
         return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
-    name = options.grouping or DEFAULT_GROUPING
-    labels, notes = labelled(scene, name, options.seed)
-    return replace(plan_probe(scene, name, labels, options.per_group, options.seed), notes=notes)
+    grouping = options.grouping or ComponentChoice(name=DEFAULT_GROUPING)
+    labels, notes = labelled(scene, grouping.name, options.seed, grouping.options)
+    plan = plan_probe(scene, grouping.name, labels, options.per_group, options.seed)
+    return replace(plan, notes=notes)
 
 
 def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:

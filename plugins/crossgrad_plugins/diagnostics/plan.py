@@ -1,13 +1,13 @@
 """Which views a probe looks at: as many near as far ones, the same in every probe."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.commands import build
-from crossgrad_core.plugin import Grouping, Scene, UserError, footprint_of, radial_distances
+from crossgrad_core.plugin import Grouping, Json, Scene, UserError, footprint_of, radial_distances
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
 #: The grouping of a probe where the run has none: the paper's.
@@ -46,13 +46,15 @@ class ProbePlan:
         return self.labels.count(self.near_label), self.labels.count(self.far_label)
 
 
-def labelled(scene: Scene, grouping: str, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Labels of the training views by the grouping of that name, and its notes.
+def labelled(
+    scene: Scene, grouping: str, seed: int, options: Mapping[str, Json] | None = None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Labels of the training views by the grouping of that name with its options, and its notes.
 
     Raises:
         UserError: There is no such grouping, or it cannot group this scene.
     """
-    component = build(Grouping, grouping, {})
+    component = build(Grouping, grouping, options or {})
     rule = component.fit(scene, np.random.default_rng(seed))
     return rule.labels(scene.train_views), rule.notes
 

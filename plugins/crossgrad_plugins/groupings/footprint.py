@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
@@ -14,11 +15,15 @@ from crossgrad_core.plugin import (
     Scene,
     UserError,
     View,
+    centers_of,
     footprint_of,
 )
 from crossgrad_plugins.groupings.split import (
+    CUT,
     FAR,
     NEAR,
+    Cut,
+    cut_of,
     halves,
     require_groups,
     require_training_views,
@@ -29,44 +34,61 @@ class Footprint(Grouping):
     """near: views that draw a local unit over at least the median number of pixels; far: the rest.
 
     The measure of a view is the median of f/z over the SfM points that it observed, or over those
-    in its image where it observed none. It uses the focal length and needs no layout of cameras
-    around a centre.
+    in its image where it observed none; where there are none either, that of the nearest training
+    camera that has one. It uses the focal length and needs no layout of cameras around a centre.
 
-    Source: the paper, projected footprint; the fall-back is ours.
+    Source: the paper, projected footprint; Otsu's cut and what stands in are ours.
     """
+
+    cut: Cut = Field("median", description=CUT)
 
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
     ) -> Rule:
         require_training_views(scene, "footprint")
-        train = _footprints(scene, scene.train_views)
-        threshold = float(np.median(train))
-        # halves() calls small values near: a large footprint is a near camera.
-        train_labels = halves(-train, -threshold)
-        require_groups("footprint", train_labels, (NEAR, FAR), "projected footprint")
-        note = f"grouping footprint: near from {threshold:.4g} pixels per local unit"
-        return Rule(lambda views: halves(-_footprints(scene, views), -threshold), (note,))
+        own = _own(scene, scene.train_views)
+        blind = np.isnan(own)
+        if blind.all():
+            raise UserError(
+                "grouping footprint needs SfM points that the photos show",
+                where=scene.name,
+                found="no SfM point in any training image",
+                todo="choose grouping radial, which needs camera positions only",
+            )
+        known, places = own[~blind], scene.centers[~blind]
+
+        def sizes(views: Sequence[View]) -> NDArray[np.float64]:
+            """[V] small where a view is near, as halves() calls it."""
+            return -_filled(_own(scene, views), views, known, places)
+
+        train = sizes(scene.train_views)
+        threshold = -cut_of(-train, self.cut)
+        require_groups("footprint", halves(train, threshold), (NEAR, FAR), "projected footprint")
+        note = f"grouping footprint: near from {-threshold:.4g} pixels per local unit"
+        if blind.any():
+            note += f"; training views without SfM points go with the nearest other: {blind.sum()}"
+        return Rule(lambda views: halves(sizes(views), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
-        footprints = np.array([footprint_of(scene, view) for view in views])
-        return Quantity("the log depth over focal length", -np.log(footprints))
+        return Quantity("the log depth over focal length", -np.log(_own(scene, views)))
 
 
-def _footprints(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] footprints.
+def _own(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
+    """[V] footprints; NaN where a view shows no SfM point."""
+    return np.array([footprint_of(scene, view) for view in views])
 
-    Raises:
-        UserError: A view has no SfM point in its image.
-    """
-    footprints = np.array([footprint_of(scene, view) for view in views])
-    for view, footprint in zip(views, footprints, strict=True):
-        if np.isnan(footprint):
-            raise UserError(
-                "grouping footprint needs SfM points in every view",
-                where=view.name,
-                found="no SfM point in this image",
-                todo="choose grouping radial, which needs camera positions only",
-            )
-    return footprints
+
+def _filled(
+    found: NDArray[np.float64],
+    views: Sequence[View],
+    known: NDArray[np.float64],
+    places: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """[V] footprints [V], that of the nearest of the cameras at `places` [N, 3] for NaN."""
+    for place, view in enumerate(views):
+        if np.isnan(found[place]):
+            ways = np.linalg.norm(places - centers_of((view,)), axis=1)
+            found[place] = known[ways.argmin()]
+    return found

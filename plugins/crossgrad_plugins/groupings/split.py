@@ -1,11 +1,17 @@
 """Labels from a threshold, and the check that every group has training views."""
 
 from collections.abc import Callable, Sequence
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Quantity, Rule, Scene, UserError, View, radial_distances
+from crossgrad_plugins.groupings.thresholds import otsu_threshold
+
+#: Where a distance is cut in near and far: at the median, or where Otsu cuts its logarithm.
+Cut: TypeAlias = Literal["median", "otsu"]
+CUT: Final = "where near ends: the median, or Otsu's cut of the logarithms"
 
 #: Distances below this share of the median one are rounding.
 _NOWHERE = 1e-9
@@ -19,7 +25,7 @@ def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
 
 
 def rule_of_distances(
-    scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], np.floating]
+    scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], float | np.floating]
 ) -> Rule:
     """Labels `near` where the distance from the mean training camera is at most a threshold.
 
@@ -37,6 +43,13 @@ def rule_of_distances(
     require_groups(grouping, halves(train, threshold), (NEAR, FAR), "distance from their mean")
     note = f"grouping {grouping}: near up to {threshold:.4g} local units from the mean camera"
     return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
+
+
+def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:
+    """Where distances [V >= 1] are cut in two; those of 0 do not move Otsu's cut."""
+    if cut == "median" or not (distances > 0.0).any():
+        return float(np.median(distances))
+    return float(np.exp(otsu_threshold(np.log(distances[distances > 0.0]))))
 
 
 def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:

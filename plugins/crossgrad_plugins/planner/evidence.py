@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from crossgrad_core.commands import RunConfig, view_plan_of
-from crossgrad_core.plugin import Backbone, Scene, ViewPlan, build_component
-from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
+from crossgrad_core.commands import ComponentChoice, RunConfig, view_plan_of
+from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewPlan, build_component
+from crossgrad_plugins.planner.modes import Modes, modes_of
 
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
@@ -43,10 +43,20 @@ class Evidence:
         """The modes of the camera distances."""
         return modes_of(self.scene)
 
+    @cached_property
+    def sampler(self) -> Sampler:
+        """The sampler, without decisions on it."""
+        choice = self.config.sampler
+        return build_component(Sampler, choice.name, choice.options)
+
     @property
-    def grouping(self) -> str:
-        """The grouping that splits by the distances that were looked at."""
-        return "footprint" if self.modes.quantity == DEPTH else "radial"
+    def grouping(self) -> ComponentChoice:
+        """Which views are near and far: as the user has it, or where the modes part."""
+        if self.config.grouping is not None:
+            return self.config.grouping
+        if self.is_given("sampler") and self.sampler.default_grouping is not None:
+            return ComponentChoice(name=self.sampler.default_grouping)
+        return self.modes.cut.grouping
 
     @cached_property
     def probe(self) -> "Probe | None":
@@ -62,11 +72,6 @@ class Evidence:
         """How many views the steps have, without decisions on it."""
         return view_plan_of(self.config)
 
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """The numbers of views that steps have."""
-        return self.view_plan.counts
-
     @cached_property
     def backbone(self) -> Backbone:
         """The backbone as it fits itself to the scene."""
@@ -78,13 +83,6 @@ class Evidence:
         """The highest degree of its spherical harmonics; None where none can be set."""
         degree = self.backbone.model_dump().get("sh_degree")
         return degree if isinstance(degree, int) else None
-
-    @cached_property
-    def steps(self) -> int | None:
-        """Length of the run in steps; None where it follows the clock."""
-        if self.config.max_views is not None:
-            return self.view_plan.steps_of(self.config.max_views)
-        return self.config.steps
 
     def scene_note(self, word: str) -> str | None:
         """What the reader noted with that word; None where it did not."""

@@ -4,19 +4,25 @@ from dataclasses import replace
 from math import isfinite, isnan
 from typing import TYPE_CHECKING, Final
 
-from crossgrad_core.plugin import ONE_MODE
+from crossgrad_core.commands import ComponentChoice
+from crossgrad_core.plugin import ViewPlan
 from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
-from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, Modes
+from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ONE_OF, Modes
 
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
 #: sigma_b^2 / sigma_w^2 from which pairs pay: they take its share out of a step's variance.
 LEAST_RHO: Final = 0.1
+#: Share of the views that the smaller mode needs for pairs: they weigh both modes alike, so that
+#: with fewer another objective is trained.
+EVEN: Final = 0.4
 #: Conflict of gradients whose directions have nothing to do with each other.
 CHANCE: Final = 0.5
 
+#: Groups of a sampler that draws near and far views.
+_BOTH: Final = 2
 _TWO_VIEWS: Final = "docs/results/two-views.md"
 _NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
 
@@ -25,15 +31,19 @@ def modes(evidence: Evidence) -> Decision:
     """How many modes the distances of the cameras have."""
     found = evidence.modes
     rule = (
-        f"two: bimodality >= {ONE_MODE} and far / near >= {LEAST_RATIO}, from {FEWEST} views on; "
+        f"two: distances or heights that Otsu's cut separates better than the best of {ONE_OF} "
+        f"evenly spread samples, each side {LEAST_SHARE:.0%} of {FEWEST} views or more, "
+        f"far / near >= {LEAST_RATIO}; "
         f"one distance: range (95th / 5th percentile) < {LEAST_RATIO}"
     )
-    source = "Sarle's coefficient, as in the paper; 0.555 is that of a uniform sample"
+    source = "ours; Otsu 1979. Sarle's coefficient, the paper's, calls lopsided distances two modes"
     plain = Decision("modes", _name(found), "default", "", rule, source, "--grouping NAME")
     figures = {
         "bimodality": found.bimodality,
-        "bimodality_of_heights": found.height,
-        "far_over_near": found.ratio,
+        "separability": found.cut.separability,
+        "separability_of_even": found.cut.usual,
+        "smaller_share": found.cut.share,
+        "far_over_near": found.cut.ratio,
         "range": found.spread,
         "views": len(found.logs),
     }
@@ -69,14 +79,44 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
         decided = probe.rho_high < LEAST_RHO
         saved = "groups of views" if decided else NOTHING
         return plain.found(shown, decided=decided, saved=saved, figures=figures)
-    if evidence.is_given("views_per_step") and any(count % 2 for count in evidence.counts):
+    if evidence.is_given("views_per_step") and not _even(evidence.view_plan):
         return plain.found(f"{shown}; pairs need an even --views", figures=figures)
+    cut = evidence.modes.cut
+    if cut.share < EVEN:
+        return plain.found(
+            f"{shown}; but the smaller mode has {cut.share:.0%} of the views, and pairs would "
+            f"train them {0.5 / cut.share:.1f} times as often: another objective",
+            figures={**figures, "smaller_share": cut.share},
+        )
+    grouping = cut.grouping
     return plain.found(shown, figures=figures).changed(
-        f"near-far by {evidence.grouping}",
-        {"sampler": "near-far", "grouping": evidence.grouping},
+        f"near-far by {grouping.name}",
+        {"sampler": "near-far", **_settings_of(grouping)},
         f"--sampler {plain.choice}",
         f"{probe.rho / (1.0 + probe.rho):.0%} of a step's gradient variance",
     )
+
+
+def views_of_steps(evidence: Evidence) -> ViewPlan:
+    """How many views the steps have, the decision on pairs included."""
+    planned = "sampler" in pairs(evidence).settings and not evidence.is_given("views_per_step")
+    return ViewPlan((2,)) if planned else evidence.view_plan
+
+
+def _draws_pairs(evidence: Evidence) -> bool:
+    """Whether steps have near and far views: by the plan, or by the user's sampler."""
+    if "sampler" in pairs(evidence).settings:
+        return True
+    return evidence.sampler.groups == _BOTH and _even(evidence.view_plan)
+
+
+def _even(views: ViewPlan) -> bool:
+    return all(count % 2 == 0 for count in views.counts)
+
+
+def _settings_of(grouping: ComponentChoice) -> dict[str, str]:
+    options = {f"grouping.{name}": str(value) for name, value in grouping.options.items()}
+    return {"grouping": grouping.name, **options}
 
 
 def _without_interval(probe: "Probe") -> str:
@@ -92,7 +132,8 @@ def views_per_step(evidence: Evidence) -> Decision:
     if evidence.is_given("views_per_step"):
         return given(part, evidence.config.views_per_step, "--views K")
     rule = "1, unless pairs are drawn: a second view of a step costs what a further step does"
-    plain = Decision(part, str(max(evidence.counts)), "default", "", rule, _TWO_VIEWS, "--views K")
+    usual = str(max(evidence.view_plan.counts))
+    plain = Decision(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
     if evidence.is_given("sampler", "operator", "batch_rule", "density_views", "backward"):
         return plain.found("as suits what you set of sampler, operator and steps")
     if "sampler" in pairs(evidence).settings:
@@ -126,7 +167,7 @@ def operator(evidence: Evidence) -> Decision:
         return plain.found(f"the probe tells nothing: {probe.problem or 'no pairs'}")
     figures = {"conflict": probe.conflict, "conflict_low": probe.conflict_low}
     shown = f"{probe.conflict:.0%} of near-far pairs conflict, at least {probe.conflict_low:.0%}"
-    if probe.conflict_low > CHANCE and "sampler" in pairs(evidence).settings:
+    if probe.conflict_low > CHANCE and _draws_pairs(evidence):
         made = plain.found(shown, figures=figures)
         return made.changed("symmetric", {"operator": "symmetric"}, f"--operator {usual}")
     return plain.found(shown, decided=True, saved=apart, figures=figures)
@@ -142,4 +183,9 @@ def _name(found: Modes) -> str:
 
 def _figures(found: Modes) -> str:
     shown = "undefined" if isnan(found.bimodality) else f"{found.bimodality:.2f}"
-    return f"bimodality of {found.quantity} {shown}, far / near {found.ratio:.1f}"
+    cut = found.cut
+    return (
+        f"{cut.quantity} cut in two separates {cut.separability:.0%} of its variance, even samples "
+        f"{cut.usual:.0%}; far / near {cut.ratio:.1f}, smaller side {cut.share:.0%}; "
+        f"bimodality of distances {shown}"
+    )

@@ -4,7 +4,13 @@ from dataclasses import dataclass
 from math import nan, sqrt
 from typing import Final, cast
 
-from crossgrad_core.commands import Progress, RunConfig, TrainingFailedError, UserError
+from crossgrad_core.commands import (
+    ComponentChoice,
+    Progress,
+    RunConfig,
+    TrainingFailedError,
+    UserError,
+)
 from crossgrad_plugins.diagnostics.command import Options, diagnose_scene
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
@@ -38,7 +44,7 @@ class Probe:
     problem: str = ""
 
 
-def probed(config: RunConfig, seconds: float, grouping: str) -> Probe:
+def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Probe:
     """The figures of a vanilla run of so many training seconds.
 
     Args:

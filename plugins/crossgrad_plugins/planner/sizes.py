@@ -7,6 +7,7 @@ from crossgrad_core.commands import counting_of, usual_budget
 from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
 from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.groups import views_of_steps
 
 #: Share of a step's time that goes with its pixels, as docs/resolutions.md has it.
 _OF_PIXELS: Final = 0.6
@@ -51,7 +52,7 @@ def count(evidence: Evidence) -> Decision:
     part, config = "primitives", evidence.config
     if evidence.is_given("max_gaussians", "growth"):
         return given(part, config.max_gaussians or config.growth, "--max-gaussians N")
-    points, steps = len(evidence.scene.points), evidence.steps
+    points, steps = len(evidence.scene.points), _steps(evidence)
     plain = Decision(
         part,
         "as suits the length",
@@ -63,7 +64,7 @@ def count(evidence: Evidence) -> Decision:
     )
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
-    views = steps * max(evidence.counts)
+    views = steps * max(views_of_steps(evidence).counts)
     budget = usual_budget(points, views)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
@@ -99,7 +100,7 @@ def densifier(evidence: Evidence) -> Decision:
         return given(part, usual, "--densifier NAME")
     rule = "none where the schedule has no edit: the run is over before the first transient is"
     plain = Decision(part, usual, "default", "", rule, "docs/schedules.md", "--densifier NAME")
-    steps = evidence.steps
+    steps = _steps(evidence)
     if not steps:
         return plain.found("the length follows the clock, and edits follow the length")
     if evidence.is_given(*_EDITS):
@@ -116,10 +117,18 @@ def densifier(evidence: Evidence) -> Decision:
     return shown.changed("none", {"densifier": "none"}, f"--densifier {usual}", saved)
 
 
+def _steps(evidence: Evidence) -> int | None:
+    """Length of the run in steps; None where it follows the clock."""
+    config = evidence.config
+    if config.max_views is not None:
+        return views_of_steps(evidence).steps_of(config.max_views)
+    return config.steps
+
+
 def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:
     """The edits of a run, whose density control is led by a budget or not."""
     photos = len(evidence.scene.train_views)
-    counting = counting_of(evidence.config, evidence.view_plan, photos, budgeted=budgeted)
+    counting = counting_of(evidence.config, views_of_steps(evidence), photos, budgeted=budgeted)
     return Schedule.for_run(steps, evidence.config.schedule, counting).edits()
 
 

@@ -34,12 +34,38 @@ def test_a_view_that_observed_nothing_takes_the_points_in_its_image():
     assert footprint_of(posed_scene([view], points), view) == pytest.approx(10.0 / 5.0)
 
 
-def test_a_view_of_nothing_at_all_is_a_user_error():
+def test_views_of_nothing_at_all_are_a_user_error():
     view = posed_view((0, 0, 0))
     scene = posed_scene([view], [(0, -5, 0)])
     assert np.isnan(footprint_of(scene, view))
-    with pytest.raises(UserError, match=r"view\.png"):
+    with pytest.raises(UserError, match="no SfM point in any training image"):
         Footprint().fit(scene, RNG)
+
+
+@pytest.mark.parametrize(("place", "label"), [((0.1, -1, 0), "near"), ((3.9, -8, 0), "far")])
+def test_a_view_of_nothing_goes_with_the_nearest_camera(place, label):
+    views = [posed_view((i, -1.0 - 7 * (i > 2), 0), f"{i}.png", seen=[0]) for i in range(5)]
+    blind = posed_view(place, "blind.png", forward=(0, -1, 0))
+    scene = posed_scene([*views, blind], [(0, 0, 0)])
+    rule = Footprint().fit(scene, RNG)
+    assert rule.labels(scene.views) == ("near", "near", "near", "far", "far", label)
+    assert "views without SfM points go with the nearest other: 1" in rule.notes[0]
+
+
+@pytest.mark.parametrize("depths", [(1, 1.1, 1.2, 1.3, 1.4, 1.5, 9, 10), (1, 2, 7, 8, 9, 10, 11)])
+def test_otsu_cuts_where_the_gap_is_and_the_median_in_the_middle(depths):
+    views = [posed_view((i, -d, 0), f"{i}.png", seen=[i]) for i, d in enumerate(depths)]
+    scene = posed_scene(views, [(i, 0, 0) for i in range(len(depths))])
+    near = [d < 5 for d in depths]
+    cut = Footprint(cut="otsu").fit(scene, RNG).labels(scene.views)
+    assert [label == "near" for label in cut] == near
+    halved = Footprint().fit(scene, RNG).labels(scene.views)
+    assert abs(2 * halved.count("near") - len(depths)) <= 1
+    # From their mean all stand at a distance; one that stands there does not move the cut.
+    around = [posed_view((s * d, 0, 0), f"{s}{d}.png") for d in depths for s in (-1, 1)]
+    middle = posed_view((0, 0, 0), "middle.png")
+    labels = Radial(cut="otsu").fit(posed_scene([*around, middle]), RNG).labels(around)
+    assert [label == "near" for label in labels] == [each for each in near for _ in (0, 1)]
 
 
 def test_the_focal_length_decides_at_one_place():

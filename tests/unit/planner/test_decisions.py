@@ -12,31 +12,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.commands import configured, layered, read_scene
+from crossgrad_core.registry.entries import build
 from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks import gains as tracks
 from crossgrad_plugins.exposures.tracks.fit import Fit
 from crossgrad_plugins.exposures.tracks.gains import TrackGains
-from crossgrad_plugins.planner import groups, looks
+from crossgrad_plugins.planner import groups, looks, sizes
 from crossgrad_plugins.planner.evidence import Evidence
-from crossgrad_plugins.planner.modes import Modes
+from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
 from crossgrad_plugins.planner.planner import PARTS, plan_of, planned
 from crossgrad_plugins.planner.probe import Probe
 from crossgrad_plugins.planner.terminal import lines_of
 
 #: A folder with scenes of these names, where there is one.
 SCENES = Path(os.environ.get("CROSSGRAD_SCENES", "no-such-folder"))
-#: Scene -> modes, bimodality, far / near, range; the spread of gains in stops, what they take off
-#: the deviation, and the exposure. Measured on all training photos at full size (2026-11-23).
+#: Scene -> modes, what the cut separates, far / near, range; the spread of gains in stops, what
+#: they take off the deviation, and the exposure. Measured on all training photos at full size.
 MEASURED = {
-    "city_hybrid": ("two modes", 0.690, 4.63, 10.49, 0.063, -0.022, "none"),
-    "city_unimodal": ("one mode, continuous", 0.474, 2.94, 8.80, 0.040, -0.029, "none"),
-    "boruszyn_kap": ("one mode, continuous", 0.350, 1.64, 3.53, 0.398, 0.426, "gain"),
-    "ochota_kap_hybrid": ("two modes", 0.748, 2.14, 2.61, 1.456, 0.605, "gain"),
-    "ochota_kap_hybrid_gain": ("two modes", 0.748, 2.14, 2.61, 0.094, 0.040, "none"),
-    "brighton_beach": ("one mode, one distance", 0.436, 1.03, 1.05, 0.433, 0.589, "gain"),
+    "city_hybrid": ("two modes", 0.950, 3.87, 10.49, 0.063, -0.022, "none"),
+    "city_unimodal": ("one mode, continuous", 0.658, 2.94, 8.80, 0.040, -0.029, "none"),
+    "boruszyn_kap": ("one mode, continuous", 0.645, 1.64, 3.53, 0.398, 0.426, "gain"),
+    "ochota_kap_hybrid": ("two modes", 0.946, 2.14, 2.61, 1.456, 0.605, "gain"),
+    "ochota_kap_hybrid_gain": ("two modes", 0.946, 2.14, 2.61, 0.094, 0.040, "none"),
+    "brighton_beach": ("one mode, one distance", 0.751, 1.03, 1.05, 0.433, 0.589, "gain"),
 }
-TABLE = Path(__file__).with_name("log_distances.csv")
+#: Scene, depth over focal length as a logarithm, and height of each training camera.
+TABLE = Path(__file__).with_name("cameras.csv")
+PAIRS_BY_HEIGHT = {"sampler": "near-far", "grouping": "altitude", "grouping.cut": "otsu"}
 PARTS_OF_THE_TABLE = [
     *("modes", "pairs of views", "views per step", "operator", "exposure", "SH degree"),
     *("scale filter", "resolution", "primitives", "length", "densifier", "start"),
@@ -44,13 +47,21 @@ PARTS_OF_THE_TABLE = [
 ]
 
 
-def log_distances(name):
-    """The logarithms of depth over focal length of the training views, as they were measured."""
+def modes_measured(name):
+    """The modes of a scene by the distances and heights that were measured."""
     with TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
     # The copy with other brightness has the same cameras.
-    own = name.removesuffix("_gain")
-    return np.array([float(row["log_distance"]) for row in rows if row["scene"] == own])
+    own = [row for row in rows if row["scene"] == name.removesuffix("_gain")]
+    return Modes(DEPTH, *(np.array([float(r[q]) for r in own]) for q in ("log_distance", "height")))
+
+
+def modes_at(logs, heights=None):
+    return Modes(DEPTH, np.asarray(logs), np.zeros(len(logs)) if heights is None else heights)
+
+
+#: A probe by which near and far views differ.
+PAIRS_PAY = Probe(rho=0.5, rho_low=0.2, rho_high=0.9, conflict=0.7, conflict_low=0.6)
 
 
 def config_of(**given):
@@ -60,7 +71,7 @@ def config_of(**given):
 def evidence_of(name, probe=None, **given):
     """The evidence of a scene that was measured, by its table."""
     evidence = Evidence(config_of(**given), posed_scene([]))
-    vars(evidence)["modes"] = Modes("depth over focal length", log_distances(name), np.nan)
+    vars(evidence)["modes"] = modes_measured(name)
     vars(evidence)["probe"] = probe
     return evidence
 
@@ -71,11 +82,11 @@ def plan_for(scene, **given):
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_modes_as_measured(name):
-    choice, bimodality, ratio, spread, *_ = MEASURED[name]
+    choice, separability, ratio, spread, *_ = MEASURED[name]
     found = groups.modes(evidence_of(name))
     assert found.choice == choice
     assert found.basis == "decided"
-    assert found.figures["bimodality"] == pytest.approx(bimodality, abs=0.002)
+    assert found.figures["separability"] == pytest.approx(separability, abs=0.002)
     assert found.figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
     assert found.figures["range"] == pytest.approx(spread, rel=0.01)
 
@@ -100,11 +111,11 @@ def test_the_scenes_themselves(name):
         pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
     config = configured({"scene": str(SCENES / name)})
     plan = plan_of(config, read_scene(config)[0])
-    choice, bimodality, ratio, spread, *_, exposure = MEASURED[name]
+    choice, separability, ratio, spread, *_, exposure = MEASURED[name]
     figures = plan.of_part("modes").figures
     assert plan.of_part("modes").choice == choice
     assert plan.of_part("exposure").choice == exposure
-    assert figures["bimodality"] == pytest.approx(bimodality, abs=0.002)
+    assert figures["separability"] == pytest.approx(separability, abs=0.002)
     assert figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
     assert figures["range"] == pytest.approx(spread, rel=0.01)
     assert plan.seconds < 20.0
@@ -154,7 +165,7 @@ def test_pairs_need_the_probe():
 @pytest.mark.parametrize(
     ("low", "rho", "high", "status", "changes"),
     [
-        (0.2, 0.5, 0.9, "decided", {"sampler": "near-far", "grouping": "footprint"}),
+        (0.2, 0.5, 0.9, "decided", PAIRS_BY_HEIGHT),
         (0.0, 0.02, 0.04, "decided", {}),
         (0.0, 0.2, 0.6, "default", {}),
         (np.nan, np.nan, np.nan, "default", {}),
@@ -197,8 +208,13 @@ def test_pairs_bring_two_views():
 
 
 def test_views_are_counted_as_the_run_will_have_them():
-    assert evidence_of("city_hybrid").counts == (1,)
-    assert evidence_of("city_hybrid", operator={"name": "pcgrad"}).counts == (2,)
+    assert groups.views_of_steps(evidence_of("city_hybrid")).counts == (1,)
+    asked = evidence_of("city_hybrid", operator={"name": "pcgrad"})
+    assert groups.views_of_steps(asked).counts == (2,)
+    pairs = evidence_of("city_hybrid", PAIRS_PAY, max_views=6_000)
+    assert groups.views_of_steps(pairs).counts == (2,)
+    assert sizes.count(pairs).figures["views"] == 6_000
+    assert sizes.count(evidence_of("city_hybrid", PAIRS_PAY, steps=3_000)).figures["views"] == 6_000
 
 
 @pytest.mark.parametrize("name", ["sampler", "operator"])
@@ -206,6 +222,80 @@ def test_views_are_left_to_components_that_were_chosen(name):
     chosen = {"sampler": "near-far", "operator": "pcgrad"}[name]
     evidence = evidence_of("city_hybrid", **{name: {"name": chosen}})
     assert groups.views_per_step(evidence).basis == "default"
+
+
+def test_pairs_of_modes_of_unequal_size_would_train_another_objective():
+    found = groups.pairs(evidence_of("ochota_kap_hybrid", PAIRS_PAY))
+    assert (found.basis, dict(found.settings)) == ("default", {})
+    assert "the smaller mode has 34% of the views" in found.evidence
+    assert "1.5 times as often" in found.evidence
+
+
+@pytest.mark.parametrize(
+    ("given", "choice"),
+    [
+        ({"sampler": {"name": "near-far"}}, "symmetric"),
+        ({"sampler": {"name": "near-far", "alternating": True}}, "sum"),
+        ({"sampler": {"name": "random"}, "views_per_step": 2}, "sum"),
+    ],
+)
+def test_projection_for_pairs_that_the_user_s_sampler_draws(given, choice):
+    assert groups.operator(evidence_of("city_hybrid", PAIRS_PAY, **given)).choice == choice
+
+
+@pytest.mark.parametrize(
+    ("given", "grouping"),
+    [
+        ({}, {"name": "altitude", "cut": "otsu"}),
+        ({"sampler": {"name": "near-far"}}, {"name": "radial"}),
+        ({"sampler": {"name": "random"}}, {"name": "altitude", "cut": "otsu"}),
+        ({"grouping": {"name": "percentile", "q": 20}}, {"name": "percentile", "q": 20}),
+    ],
+)
+def test_the_probe_looks_at_the_groups_of_the_run(given, grouping):
+    assert evidence_of("city_hybrid", **given).grouping.model_dump() == grouping
+
+
+@pytest.mark.parametrize(
+    ("name", "grouping"), [("city_hybrid", "altitude"), ("ochota_kap_hybrid", "footprint")]
+)
+def test_modes_are_cut_where_they_part_most_cleanly(name, grouping):
+    assert evidence_of(name).grouping.name == grouping
+
+
+@pytest.mark.parametrize("views", [12, 30, 60, 200])
+@pytest.mark.parametrize("law", ["uniform", "normal", "exponential", "lognormal"])
+def test_distances_without_a_gap_are_one_mode(law, views):
+    rng = np.random.default_rng(views)
+    draw = {
+        "uniform": lambda: rng.uniform(0.0, 2.5, views),
+        "normal": lambda: rng.normal(0.0, 1.0, views),
+        "exponential": lambda: rng.exponential(1.0, views),
+        "lognormal": lambda: rng.lognormal(0.0, 0.5, views),
+    }[law]
+    wrong = sum(modes_at(draw(), draw()).two for _ in range(200))
+    # 1 % by distance and 1 % by height, and the error of 200 trials.
+    assert wrong <= 12
+
+
+@pytest.mark.parametrize("views", [12, 30, 60, 200])
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_modes_with_a_gap_are_two(share, views):
+    rng = np.random.default_rng(views)
+    far = np.arange(views) < round(share * views)
+    found = [modes_at(rng.normal(0.0, 0.07, views) + far) for _ in range(100)]
+    assert sum(each.two for each in found) >= 98
+    # Where they part is where they are cut, however many are on either side.
+    (shares,) = {round(each.cut.share * views) for each in found if each.two}
+    assert shares == round(share * views)
+
+
+@pytest.mark.parametrize("stragglers", [1, 2, 5])
+def test_stragglers_are_no_mode(stragglers):
+    logs = np.random.default_rng(5).normal(0.0, 0.1, 60)
+    logs[:stragglers] += 3.0
+    assert not modes_at(logs).two
+    assert modes_at(logs).one
 
 
 @pytest.mark.parametrize(
@@ -277,6 +367,24 @@ def test_a_street_alone_has_one_mode():
     assert plan.of_part("modes").figures["range"] > 3.0
     assert plan.of_part("operator").choice == "sum"
     assert not plan.settings
+
+
+def test_a_view_without_points_does_not_keep_pairs_from_being_drawn():
+    rng = np.random.default_rng(1)
+    cloud = rng.uniform(-1.0, 1.0, (200, 3))
+    views = [
+        posed_view((4.0 * (1 + i % 2) ** 2, 0.1 * i, 0.0), f"{i}.png", forward=(-1, 0, 0))
+        for i in range(20)
+    ]
+    blind = posed_view((4.0, 0.5, 0.0), "blind.png", forward=(1, 0, 0))
+    scene = posed_scene([*views, blind], cloud)
+    cut = modes_of(scene).cut
+    assert cut.two
+    choice = cut.grouping
+    rule = build("groupings", choice.name, choice.options).fit(scene, rng)
+    assert "without SfM points go with the nearest other: 1" in rule.notes[0]
+    assert rule.label(blind) == "near"
+    assert rule.labels(views) == ("near", "far") * 10
 
 
 def test_street_and_air_have_two_modes():
