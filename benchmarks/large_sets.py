@@ -214,7 +214,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photos", type=int, default=2000)
     parser.add_argument("--max-size", type=int, default=1600, help="0: as they are")
-    parser.add_argument("--cache-mib", type=int, default=2048, help="reading.cache_mib")
+    parser.add_argument("--cache-mib", type=int, default=1280, help="reading.cache_mib")
     parser.add_argument("--passes", type=int, default=2)
     parser.add_argument("--block", type=int, default=25, help="steps of a turn")
     parser.add_argument("--distorted", action="store_true")

@@ -35,7 +35,7 @@ class SceneOptions(BaseModel):
         description="Where training starts: the scene's points, random ones, or a PLY file. "
         "Default: points.",
     )
-    cache_mib: int = Field(2048, ge=16, description="memory for decoded photos, MiB")
+    cache_mib: int = Field(1280, ge=16, description="memory for decoded photos, MiB")
     disk_mib: int = Field(
         20480, ge=0, description="disk space for large photos in the size as trained, MiB; 0: none"
     )
