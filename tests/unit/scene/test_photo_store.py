@@ -3,6 +3,7 @@
 import os
 import shutil
 import threading
+import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,6 +111,18 @@ def test_no_damaged_entry_is_trusted(store, folder):
         assert same(store.decoded(source), whole)
         assert len(source.decoded) == before + 1
         assert entry.read_bytes() == good
+
+
+def test_an_entry_is_summed_again_only_where_others_used_it(store, folder, monkeypatch):
+    source, sums = large(3), []
+    whole = store.decoded(source)
+    monkeypatch.setattr(photo_store, "crc32", lambda data: sums.append(0) or zlib.crc32(data))
+    assert same(store.decoded(source), whole) and same(store.decoded(source), whole)
+    assert not sums
+    assert same(PhotoStore(folder, 1).decoded(source), whole)
+    assert len(sums) == 1
+    assert same(store.decoded(source), whole) and same(store.decoded(source), whole)
+    assert len(sums) == 2
 
 
 def test_an_entry_of_another_size_does_not_count(store, folder):

@@ -180,7 +180,7 @@ def _kept_seeds() -> Sequence[Case]:
 
 
 def _parse_kept(folder: Path) -> None:
-    found = photo_store._read(folder / _PHOTO, *_SIZE)
+    found = photo_store._read(folder / _PHOTO, *_SIZE, None)
     if found is None:
         return
     image, mask = found
