@@ -30,7 +30,9 @@ _UNREAD: Final = frozenset(
      ".orf", ".psd", ".raf", ".rw2", ".webp"}
 )  # fmt: skip
 _KNOWN: Final = _READ | _UNREAD
-_IMPOSSIBLE: Final = "its name has control characters, is too long or is not UTF-8: rename it"
+_IMPOSSIBLE: Final = (
+    "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
+)
 _HALF: Final = 128
 _SMALLEST: Final = 64
 #: So many times the usual most pixels may be those of a JPEG file: phones have 200 megapixels.
@@ -61,8 +63,11 @@ def find_photos(
             too large to be decoded, or a mask does not fit or is damaged.
     """
     _check_folder(root)
+    wanted = None if settings.masks is None else Path(settings.masks)
+    for folder in filter(None, (root.resolve(), wanted)):
+        _check_text(folder)
     files = [name for name in _names(root) if PurePosixPath(name).suffix.lower() in _KNOWN]
-    told = sorted_out(root, files, None if settings.masks is None else Path(settings.masks))
+    told = sorted_out(root, files, wanted)
     names, left_out = _listed(told.photos)
     left_out += told.left_out
     used: list[Photo] = []
@@ -96,6 +101,19 @@ def _check_folder(root: Path) -> None:
         )
 
 
+def _check_text(folder: Path) -> None:
+    """Refuses a folder that cannot be written down in the plan."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        raise UserError(
+            "the folder has a name that is no text",
+            where=folder,
+            expected="a path in UTF-8",
+            todo="rename it",
+        ) from error
+
+
 def _names(root: Path) -> Iterator[str]:
     """Paths of all files below a folder, sorted in each folder; hidden ones are left out."""
     for below, folders, files in walked(root):
@@ -112,8 +130,8 @@ def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
         if suffix in _UNREAD:
             what = suffix[1:].upper()
             left_out.append(LeftOut(name=_shown(name), why=f"{what} cannot be read: save as JPEG"))
-        # Its mask has one more suffix.
-        elif not is_possible_name(f"{name}.png"):
+        # Its mask has one more suffix; COLMAP's models may come from Windows.
+        elif "\\" in name or not is_possible_name(f"{name}.png"):
             left_out.append(LeftOut(name=_shown(name), why=_IMPOSSIBLE))
         else:
             usable.append(name)
@@ -203,7 +221,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
 
 
 def _most_pixels(header: PhotoHeader) -> int:
-    """How many pixels a photo may have: COLMAP decodes it whole, whoever looks at it reduced."""
+    """How many pixels a photo may have: COLMAP decodes it whole, though it is looked at reduced."""
     return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 

@@ -270,7 +270,7 @@ def test_transparent_pixels_do_not_count(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["a\tb.jpg", "a\nb.jpg", "a\x1b[2Jb.jpg", "d\te/1.jpg", "x" * 250 + ".jpg"]
+    "name", ["a\tb.jpg", "a\nb.jpg", "a\x1b[2Jb.jpg", "a\\b.jpg", "d\te/1.jpg", "x" * 250 + ".jpg"]
 )
 def test_names_that_no_scene_can_have_are_left_out_with_words(name, tmp_path):
     save(tmp_path / "1.jpg")
@@ -280,7 +280,7 @@ def test_names_that_no_scene_can_have_are_left_out_with_words(name, tmp_path):
     assert sorted(used) == ["1.jpg", "2.jpg"]
     ((shown, why),) = left_out.items()
     assert shown.isprintable()
-    assert "control characters, is too long or is not UTF-8: rename it" in why
+    assert "control characters or backslashes, is too long or is not UTF-8: rename it" in why
 
 
 def test_names_that_are_no_text_are_left_out_with_words(tmp_path):
@@ -292,6 +292,14 @@ def test_names_that_are_no_text_are_left_out_with_words(tmp_path):
     assert sorted(used) == ["1.jpg", "2.jpg"]
     assert all(shown.isprintable() for shown in left_out)
     assert len(left_out) == 2
+
+
+@pytest.mark.parametrize("what", ["photos", "masks"])
+def test_folders_whose_names_are_no_text_are_one_error(what, tmp_path):
+    bad = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    bad.mkdir()
+    with pytest.raises(UserError, match="a name that is no text"):
+        found(bad) if what == "photos" else found(tmp_path, masks=str(bad))
 
 
 @pytest.mark.parametrize(
