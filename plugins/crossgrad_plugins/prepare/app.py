@@ -61,7 +61,8 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     layout = Layout(scene)
     check_ours(layout, photos)
     _check_lens(settings.lens)
-    plan = _planned(photos, settings)
+    # A ready scene needs no photo any more.
+    plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
     if layout.is_ready:  # Nothing is written: others may read it, and the disk may be read-only.
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
@@ -117,12 +118,14 @@ def _check_lens(name: str) -> None:
         )
 
 
-def _planned(photos: Path, settings: Settings) -> Plan:
+def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
     """The photos and what their files say."""
     progress = Progress(_PAUSE)
-    used, left_out = find_photos(
-        photos, settings, lambda done, of: progress.tell(f"looking at photos: {done} of {of}")
-    )
+
+    def tell(done: int, of: int) -> None:
+        progress.tell(f"looking at photos: {done} of {of}")
+
+    used, left_out = find_photos(photos, settings, tell, fewest)
     root = str(photos.resolve())
     return Plan(photos=root, settings=settings, used=used, left_out=left_out)
 

@@ -47,7 +47,7 @@ Tell = Callable[[int, int], None]
 
 
 def find_photos(
-    root: Path, settings: Settings, tell: Tell
+    root: Path, settings: Settings, tell: Tell, fewest: int = 2
 ) -> tuple[tuple[Photo, ...], tuple[LeftOut, ...]]:
     """All photos below a folder, by name, and the files that cannot be used.
 
@@ -57,10 +57,11 @@ def find_photos(
         root: The folder.
         settings: Where masks are, and which photos share a calibration.
         tell: Told how many photos of how many are looked at.
+        fewest: Photos that there have to be: a pose needs a second one.
 
     Raises:
-        UserError: There is no such folder, fewer than two photos in it can be used, one of them is
-            too large to be decoded, or a mask does not fit or is damaged.
+        UserError: There is no such folder, fewer photos in it can be used, one of them is too large
+            to be decoded, or a mask does not fit or is damaged.
     """
     _check_folder(root)
     wanted = None if settings.masks is None else Path(settings.masks)
@@ -80,7 +81,7 @@ def find_photos(
             tell(done, len(names))
     used, doubles = _without_doubles(used)
     left_out += doubles
-    if len(used) < 2:  # noqa: PLR2004 - a pose needs a second photo
+    if len(used) < fewest:
         raise _too_few(root, used, left_out)
     return tuple(used), tuple(sorted(left_out, key=lambda each: each.name))
 

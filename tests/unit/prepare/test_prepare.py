@@ -273,23 +273,29 @@ def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
     assert content(copied) == before
 
 
-@pytest.mark.parametrize("lost", ["workshop", "part", "photos", "some photos", "everything"])
+@pytest.mark.parametrize(
+    "lost", ["workshop", "part", "photos", "some photos", "most photos", "all"]
+)
 def test_a_ready_scene_is_read_without_what_it_was_made_of(copied, photos, lost, tmp_path):
     place = shutil.copytree(photos, tmp_path / "photos")
-    if lost in {"workshop", "everything"}:
+    if lost in {"workshop", "all"}:
         shutil.rmtree(copied / "prepare")
     if lost == "part":
         (copied / "prepare" / "features.json").unlink()
-    if lost in {"photos", "everything"}:
+    if lost in {"photos", "all"}:
         shutil.rmtree(place)
-    if lost == "some photos":
+    if "some" in lost:
         next((place / "kite").glob("img*.jpg")).unlink()
+    if "most" in lost:
+        shutil.rmtree(place / "mast")
+        for path in (place / "kite").glob("img*.jpg"):
+            path.unlink()
     (copied / "run.lock").unlink()
     before = content(copied)
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
     assert len(read.views) == COUNT
     as_it_is = any("the scene is taken as it is" in note for note in read.notes)
-    assert as_it_is == (lost != "some photos")
+    assert as_it_is == (lost not in {"some photos", "most photos"})
     assert content(copied) == before and not (copied / "run.lock").exists()
 
 
