@@ -7,7 +7,6 @@ from pathlib import Path
 from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import pillow
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.photo_files import (
@@ -29,7 +28,8 @@ from crossgrad_core.scene.photo_notes import (
 from crossgrad_core.scene.photos import PhotoSource
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.reduction import choose_reduction
-from crossgrad_core.scene.wording import count, megapixels, name_some
+from crossgrad_core.scene.shapes import check_mask, is_scaled
+from crossgrad_core.scene.wording import count, name_some
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
             reduction=reduction,
         )
     for name, mask in masks.items():
-        _check_mask(mask, sources[name])
+        source = sources[name]
+        check_mask(mask, (source.width, source.height), may_turn=source.orientation != 1)
     notes = (
         *note_pairing(full.folder, full.paths, names),
         *note_links(raw.root, sources),
@@ -175,10 +176,11 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
     of the rotated photo only.
     """
     width, height = header.width, header.height
-    if _same_shape(width, height, calibration):
+    posed = calibration.width, calibration.height
+    if is_scaled((width, height), posed):
         return width, height, 1
     orientation = read_quarter_turn(path)
-    if orientation is not None and _same_shape(height, width, calibration):
+    if orientation is not None and is_scaled((height, width), posed):
         return height, width, orientation
     raise UserError(
         "a photo does not have the shape of its camera",
@@ -187,13 +189,6 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
         found=f"{width} x {height} pixels",
         todo="use the photos that the poses were estimated from",
     )
-
-
-def _same_shape(width: int, height: int, calibration: Calibration) -> bool:
-    """Whether a size is a scaled copy of the camera's, each side off by at most one pixel."""
-    least = max((width - 1) / calibration.width, (height - 1) / calibration.height)
-    most = min((width + 1) / calibration.width, (height + 1) / calibration.height)
-    return least <= most
 
 
 def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -216,27 +211,3 @@ def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> d
     masks = {name: path for name, path in pairs if path is not None}
     check_masks(folder, options.masks, len(masks), names)
     return masks
-
-
-def _check_mask(path: Path, source: PhotoSource) -> None:
-    header = read_header(path)
-    if header.width * header.height > pillow.MOST_PIXELS:
-        raise UserError(
-            "the mask is too large to be decoded at once",
-            where=path,
-            expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
-            found=f"{header.width} x {header.height} pixels",
-            todo="save it smaller: a mask of any size in the proportion of its photo will do",
-        )
-    photo = Calibration("PINHOLE", source.width, source.height, ())
-    sizes = [(header.width, header.height)]
-    if source.orientation != 1:
-        sizes.append((header.height, header.width))
-    if not any(_same_shape(width, height, photo) for width, height in sizes):
-        raise UserError(
-            "a mask does not have the shape of its photo",
-            where=path,
-            expected=f"{source.width} x {source.height} pixels, or in that proportion",
-            found=f"{header.width} x {header.height} pixels",
-            todo="make the mask from the photo as it is stored, in its own size",
-        )

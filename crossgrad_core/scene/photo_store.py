@@ -29,7 +29,7 @@ _LOG = logging.getLogger(__name__)
 #: The folder of all entries, where not below the user's cache folder.
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
-PIXELS_VERSION: Final = 1
+PIXELS_VERSION: Final = 2
 #: Bytes of a disk that are never taken.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4

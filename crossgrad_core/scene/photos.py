@@ -18,6 +18,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize, turn
 from crossgrad_core.scene.photo_store import Decoded, PhotoStore, Storable, made_by
+from crossgrad_core.scene.shapes import is_turned
 
 #: The smallest size that JPEG files can be decoded at: all of their data is read for it.
 SMALLEST = 8
@@ -141,7 +142,7 @@ class PhotoSource:
         if self.mask is None:
             return None
         mask = decode_mask(self.mask)
-        if mask.shape == (self.width, self.height):
+        if is_turned(mask.shape[::-1], (self.width, self.height)):
             mask = turn(mask, self.orientation)
         rows = (np.arange(self.height) * mask.shape[0]) // self.height
         columns = (np.arange(self.width) * mask.shape[1]) // self.width

@@ -128,21 +128,21 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
+    # What the input itself prescribes is in no list of ours.
+    places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:
         raise UserError(
             "views are listed for training and for testing",
-            where=root / TEST_LIST,
+            where=places[1],
             found=name_some(both),
             todo=f"leave each name in one of {TRAIN_LIST} and {TEST_LIST}",
         )
     train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
     if not train:
-        raise _matches_nothing(
-            "no listed view can be trained on", TRAIN_LIST, root, names, listed[0]
-        )
+        raise _matches_nothing("no listed view can be trained on", places[0], names, listed[0])
     if listed[1] and not test:
-        raise _matches_nothing("no listed view can be held out", TEST_LIST, root, names, listed[1])
+        raise _matches_nothing("no listed view can be held out", places[1], names, listed[1])
     notes = [f"split: {len(train)} train, {len(test)} test ({how})"]
     absent = sorted((listed[0] | listed[1]) - set(names))
     if absent:
@@ -156,14 +156,14 @@ def _split_by_lists(
 
 
 def _matches_nothing(
-    what: str, file: str, root: Path, names: Sequence[str], listed: frozenset[str]
+    what: str, place: Path, names: Sequence[str], listed: frozenset[str]
 ) -> UserError:
     return UserError(
         what,
-        where=root / file,
+        where=place,
         expected=f"names below the image folder, such as {min(names)}",
         found=name_some(sorted(listed)) if listed else "no name",
-        todo="mend the lists, or use --split every",
+        todo="mend the lists, add the photos that they name, or use --split every",
     )
 
 

@@ -19,7 +19,7 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.features import found_features
 from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_leftovers
-from crossgrad_plugins.prepare.photos import find_photos
+from crossgrad_plugins.prepare.photos import find_photos, has_photos
 from crossgrad_plugins.prepare.picture import draw
 from crossgrad_plugins.prepare.plan import Plan, Settings, agreed
 from crossgrad_plugins.prepare.report import Report, data_of, page_of, summary_lines
@@ -61,13 +61,37 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     layout = Layout(scene)
     check_ours(layout, photos)
     _check_lens(settings.lens)
-    plan = _planned(photos, settings)
+    # A ready scene needs no photo any more.
+    plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
+    if layout.is_ready:  # Nothing is written: others may read it, and the disk may be read-only.
+        return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
     with disk_errors(layout.work):
         layout.work.mkdir(parents=True, exist_ok=True)
     with locked(scene, "preparing"), way_on("the same command goes on where this one ended"):
         clear_leftovers(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))
+
+
+def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
+    """Makes a scene of photos, unless it is ready: then photos and workshop may be gone.
+
+    Returns:
+        What is said about it.
+
+    Raises:
+        UserError: As `prepared`.
+    """
+    layout, why = Layout(scene), ""
+    if layout.is_ready and not layout.is_whole:
+        why = f"{layout.work} is gone, which says what it was made of"
+    elif layout.is_ready and not has_photos(photos):
+        why = f"there are no photos in {photos} any more"
+    return (
+        [f"{why}: the scene is taken as it is"]
+        if why
+        else summary_lines(prepared(photos, scene, settings))
+    )
 
 
 def _check_lens(name: str) -> None:
@@ -94,12 +118,14 @@ def _check_lens(name: str) -> None:
         )
 
 
-def _planned(photos: Path, settings: Settings) -> Plan:
+def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
     """The photos and what their files say."""
     progress = Progress(_PAUSE)
-    used, left_out = find_photos(
-        photos, settings, lambda done, of: progress.tell(f"looking at photos: {done} of {of}")
-    )
+
+    def tell(done: int, of: int) -> None:
+        progress.tell(f"looking at photos: {done} of {of}")
+
+    used, left_out = find_photos(photos, settings, tell, fewest)
     root = str(photos.resolve())
     return Plan(photos=root, settings=settings, used=used, left_out=left_out)
 

@@ -75,8 +75,8 @@ def prepare(  # noqa: PLR0913, PLR0917 - one parameter per option of the command
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, and "
-            "files NAME_mask.png beside the photos.",
+            help="Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, "
+            "folders masks beside photos, and files NAME_mask.png.",
             rich_help_panel=_HOW,
         ),
     ] = None,
@@ -121,7 +121,7 @@ def prepare(  # noqa: PLR0913, PLR0917 - one parameter per option of the command
     wanted: dict[str, Any] = {
         **given, "lens": lens.upper(), "max_size": max_size, "max_features": max_features
     }  # fmt: skip
-    wanted["masks"] = None if masks is None else str(masks)
+    wanted["masks"] = None if masks is None else str(masks.absolute())
     prepare_scene(photos, scene, Settings(**wanted), threads)
 
 

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 #: Features are found in photos with their longest side reduced to so many pixels (COLMAP).
 LONGEST: Final = 3200
 #: Bytes that SIFT takes for a pixel of the photo, which it looks at at twice its size: measured
-#: 290 (docs/prepare.md). And the share of the free memory that all threads together may take.
-_BYTES_PER_PIXEL, _SHARE = 320, 0.6
+#: 290 (docs/prepare.md); those of a pixel of the file, which is decoded whole, in colours and grey;
+#: and the share of the free memory that all threads together may take.
+_BYTES_PER_PIXEL, _BYTES_DECODED, _SHARE = 320, 4, 0.6
 #: Photos of fewer pixels have few features, and are asked for fainter ones, and for those along
 #: edges: SIFT's threshold on contrast, and on the ratio of curvatures (COLMAP: 0.0067 and 10).
 _SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
@@ -97,11 +98,12 @@ def _find(
 
 def _threads(photos: Sequence[Photo], longest: int, threads: int) -> int:
     """How many photos are looked at at once, such that memory suffices."""
-    pixels = max(_pixels(photo, longest) for photo in photos)
+    need = max(
+        _BYTES_PER_PIXEL * _pixels(photo, longest) + _BYTES_DECODED * photo.width * photo.height
+        for photo in photos
+    )
     free = available_memory()
-    if free is None:
-        return threads
-    return max(1, min(threads, int(_SHARE * free / (_BYTES_PER_PIXEL * pixels))))
+    return threads if free is None else max(1, min(threads, int(_SHARE * free / need)))
 
 
 def _pixels(photo: Photo, longest: int) -> float:

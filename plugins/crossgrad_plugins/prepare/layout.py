@@ -92,6 +92,17 @@ class Layout:
         """The report as data; written last."""
         return self.scene / "report.json"
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether the scene is complete: nothing more will be written."""
+        return self.report.is_file() and self.model.is_dir() and self.images.is_dir()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether everything is there that tells what a ready scene was made of."""
+        files, folders = (self.plan, self.features, self.links), (self.models, self.placed)
+        return all(each.is_file() for each in files) and all(each.is_dir() for each in folders)
+
 
 def check_ours(layout: Layout, photos: Path) -> None:
     """Refuses a folder that `prepare` did not make, and one that lies where the photos are.
@@ -100,6 +111,9 @@ def check_ours(layout: Layout, photos: Path) -> None:
         UserError: What is in the way, and what to do.
     """
     scene = layout.scene
+    if layout.is_ready:
+        _check_whole(layout)
+        return
     check_folder(scene)
     inside = scene.resolve()
     if inside == photos.resolve() or photos.resolve() in inside.parents:
@@ -120,6 +134,18 @@ def check_ours(layout: Layout, photos: Path) -> None:
             expected="a new folder, an empty one, or one that prepare made",
             found=", ".join(sorted(path.name for path in scene.iterdir())[:5]),
             todo="choose another folder, or remove it",
+        )
+
+
+def _check_whole(layout: Layout) -> None:
+    if not layout.is_whole:
+        raise UserError(
+            "the scene is ready, but nothing tells any more which photos it was made of",
+            where=layout.work,
+            expected="what prepare left there",
+            found="a part of it" if layout.work.is_dir() else "no such folder",
+            todo=f"train on the scene as it is: crossgrad run {layout.scene}; or choose another "
+            "folder to prepare the photos anew",
         )
 
 

@@ -1,19 +1,24 @@
 """The photos of a folder: those that can be used, with what their files say, and the others."""
 
-import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path, PurePosixPath
+from threading import Lock
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from crossgrad_core.commands import UserError
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene import pillow
+from crossgrad_core.scene.headers import PhotoHeader, read_header
 from crossgrad_core.scene.photo_files import walked
 from crossgrad_core.scene.pillow import opened
+from crossgrad_core.scene.raw_checks import is_possible_name
+from crossgrad_core.scene.wording import megapixels, name_some
 from crossgrad_plugins.prepare.exif import camera_of, orientation_of, position_of
-from crossgrad_plugins.prepare.plan import LeftOut, Photo, Settings
+from crossgrad_plugins.prepare.masks import sorted_out, with_mask
+from crossgrad_plugins.prepare.plan import LeftOut, Photo, Settings, digest_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -24,19 +29,25 @@ _UNREAD: Final = frozenset(
     {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef",
      ".orf", ".psd", ".raf", ".rw2", ".webp"}
 )  # fmt: skip
-_MASKS: Final = "masks"
-_MASK_ENDS: Final = ("_mask", ".mask")
+_KNOWN: Final = _READ | _UNREAD
+_IMPOSSIBLE: Final = (
+    "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
+)
+_HALF: Final = 128
 _SMALLEST: Final = 64
+#: So many times the usual most pixels may be those of a JPEG file: phones have 200 megapixels.
+_REDUCIBLE: Final = 2
 #: Photos are looked at with their longest side at about so many pixels.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-_CHUNK: Final = 1 << 20
+#: Photos larger than a share of the most pixels are decoded one after the other.
+_LARGE: Final = Lock()
 
 Tell = Callable[[int, int], None]
 
 
 def find_photos(
-    root: Path, settings: Settings, tell: Tell
+    root: Path, settings: Settings, tell: Tell, fewest: int = 2
 ) -> tuple[tuple[Photo, ...], tuple[LeftOut, ...]]:
     """All photos below a folder, by name, and the files that cannot be used.
 
@@ -46,22 +57,31 @@ def find_photos(
         root: The folder.
         settings: Where masks are, and which photos share a calibration.
         tell: Told how many photos of how many are looked at.
+        fewest: Photos that there have to be: a pose needs a second one.
 
     Raises:
-        UserError: There is no such folder, or fewer than two photos in it can be used.
+        UserError: There is no such folder, fewer photos in it can be used, one of them is too large
+            to be decoded, or a mask does not fit or is damaged.
     """
     _check_folder(root)
-    names, left_out = _listed(root)
-    masks = _Masks(root, settings.masks)
+    wanted = None if settings.masks is None else Path(settings.masks)
+    for folder in filter(None, (root.resolve(), wanted)):
+        _check_text(folder)
+    files = [name for name in _names(root) if PurePosixPath(name).suffix.lower() in _KNOWN]
+    told = sorted_out(root, files, wanted)
+    names, left_out = _listed(told.photos)
+    left_out += told.left_out
     used: list[Photo] = []
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        looks = pool.map(lambda name: _looked_at(root, name, masks, settings.cameras), names)
+        looks = pool.map(
+            lambda name: _looked_at(root, name, told.masks.get(name), settings.cameras), names
+        )
         for done, found in enumerate(looks, 1):
             (used if isinstance(found, Photo) else left_out).append(found)  # type: ignore[arg-type]
             tell(done, len(names))
     used, doubles = _without_doubles(used)
     left_out += doubles
-    if len(used) < 2:  # noqa: PLR2004 - a pose needs a second photo
+    if len(used) < fewest:
         raise _too_few(root, used, left_out)
     return tuple(used), tuple(sorted(left_out, key=lambda each: each.name))
 
@@ -82,6 +102,19 @@ def _check_folder(root: Path) -> None:
         )
 
 
+def _check_text(folder: Path) -> None:
+    """Refuses a folder that cannot be written down in the plan."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        raise UserError(
+            "the folder has a name that is no text",
+            where=folder,
+            expected="a path in UTF-8",
+            todo="rename it",
+        ) from error
+
+
 def _names(root: Path) -> Iterator[str]:
     """Paths of all files below a folder, sorted in each folder; hidden ones are left out."""
     for below, folders, files in walked(root):
@@ -90,118 +123,120 @@ def _names(root: Path) -> Iterator[str]:
         yield from ((here / file).as_posix() for file in sorted(files) if file[0] != ".")
 
 
-def _listed(root: Path) -> tuple[list[str], list[LeftOut]]:
-    """Names of the photo files, and those that cannot be read here."""
-    names, left_out = [], []
-    for name in _names(root):
-        path = PurePosixPath(name)
-        if path.parts[0] == _MASKS or path.stem.lower().endswith(_MASK_ENDS):
-            continue
-        suffix = path.suffix.lower()
+def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
+    """Names of the photos, and of those that cannot be used by what they are called."""
+    usable, left_out = [], []
+    for name in names:
+        suffix = PurePosixPath(name).suffix.lower()
         if suffix in _UNREAD:
             what = suffix[1:].upper()
             left_out.append(LeftOut(name=_shown(name), why=f"{what} cannot be read: save as JPEG"))
-        elif suffix in _READ and not _is_text(name):
-            left_out.append(LeftOut(name=_shown(name), why="its name is not UTF-8: rename it"))
-        elif suffix in _READ:
-            names.append(name)
-    return sorted(names), left_out
-
-
-def _is_text(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return "\n" not in name
+        # Its mask has one more suffix; COLMAP's models may come from Windows.
+        elif "\\" in name or not is_possible_name(f"{name}.png"):
+            left_out.append(LeftOut(name=_shown(name), why=_IMPOSSIBLE))
+        else:
+            usable.append(name)
+    return sorted(usable), left_out
 
 
 def _shown(name: str) -> str:
-    return name.encode(errors="replace").decode()
+    return name_some([name])
 
 
-def _looked_at(root: Path, name: str, masks: "_Masks", cameras: str) -> Photo | LeftOut:
-    """The photo, or why it cannot be used."""
+def _looked_at(root: Path, name: str, mask: Path | None, cameras: str) -> Photo | LeftOut:
+    """The photo, or why it cannot be used.
+
+    Raises:
+        UserError: It is too large, or its mask is not one for it.
+    """
     path = root / name
     try:
         header = read_header(path)
-        if min(header.width, header.height) < _SMALLEST:
-            return LeftOut(name=name, why=f"too small: {header.width} x {header.height} pixels")
-        with opened(path, "the photo cannot be decoded") as image:
-            camera, position = camera_of(image), position_of(image)
-            orientation = orientation_of(image)
-            brightness, sharpness = _look(image)
-        folder = name.rpartition("/")[0]
-        size = f"{header.width} x {header.height}"
-        return Photo(
-            name=name,
-            folder=folder,
-            width=header.width,
-            height=header.height,
-            orientation=orientation,
-            camera=name if cameras == "photo" else f"{folder}: {size} {camera}".strip(),
-            position=position,
-            mask=masks.of(name),
-            brightness=brightness,
-            sharpness=sharpness,
-            bytes=path.stat().st_size,
-            sha256=_digest(path),
-        )
-    except UserError as error:
-        return LeftOut(
-            name=name, why=f"{error.what} ({error.found})" if error.found else error.what
-        )
-    except OSError as error:
-        return LeftOut(name=name, why=error.strerror or str(error))
+    except (UserError, OSError) as error:
+        return LeftOut(name=name, why=_reason(error))
+    pixels = header.width * header.height
+    if min(header.width, header.height) < _SMALLEST:
+        return LeftOut(name=name, why=f"too small: {header.width} x {header.height} pixels")
+    if pixels > _most_pixels(header):
+        raise _too_large(path, header)
+    with _LARGE if pixels > pillow.MOST_PIXELS // _AT_ONCE else nullcontext():
+        try:
+            photo = _read(root, name, header, cameras)
+        except (UserError, OSError) as error:
+            return LeftOut(name=name, why=_reason(error))
+        return photo if mask is None else with_mask(photo, mask)
 
 
-def _look(image: "Image") -> tuple[float, float]:
-    """Mean of the grey levels, and mean square of their Laplacian at a reduced size."""
+def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
+    """The photo without its mask.
+
+    Raises:
+        UserError: It cannot be decoded.
+        OSError: It cannot be read.
+    """
+    path = root / name
+    with opened(path, "the photo cannot be decoded") as image:
+        camera, position = camera_of(image), position_of(image)
+        orientation = orientation_of(image)
+        brightness, sharpness, transparent = _look(image, header)
+    folder = name.rpartition("/")[0]
+    size = f"{header.width} x {header.height}"
+    return Photo(
+        name=name,
+        folder=folder,
+        width=header.width,
+        height=header.height,
+        orientation=orientation,
+        camera=name if cameras == "photo" else f"{folder}: {size} {camera}".strip(),
+        position=position,
+        transparent=transparent,
+        brightness=brightness,
+        sharpness=sharpness,
+        bytes=path.stat().st_size,
+        sha256=digest_of(path),
+    )
+
+
+def _reason(error: UserError | OSError) -> str:
+    """Why a photo cannot be used."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return f"{error.what} ({error.found})" if error.found else error.what
+
+
+def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
+    """Mean of the grey levels, mean square of their Laplacian at a reduced size, transparency."""
     longest = max(image.size)
     image.draft("L", (image.width * _LOOKED_AT // longest, image.height * _LOOKED_AT // longest))
-    small = image.convert("RGB").convert("L")
+    # As the core does, which ignores transparency of photos with more than 8 bits.
+    transparent = False
+    if header.alpha and not image.mode.startswith(("I", "F")):
+        least, _ = image.convert("RGBA").getchannel("A").getextrema()
+        transparent = int(least) < _HALF  # type: ignore[arg-type]
+    small = (image if image.mode in {"L", "RGB"} else image.convert("RGB")).convert("L")
     small.thumbnail((_LOOKED_AT, _LOOKED_AT))
     grey = np.asarray(small, dtype=np.float64)
     inner = grey[1:-1, 1:-1]
     curve = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4.0 * inner
-    return round(float(grey.mean()), 2), round(float((curve**2).mean()), 2)
+    return round(float(grey.mean()), 2), round(float((curve**2).mean()), 2), transparent
 
 
-def _digest(path: Path) -> str:
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            found.update(chunk)
-    return found.hexdigest()
+def _most_pixels(header: PhotoHeader) -> int:
+    """How many pixels a photo may have: COLMAP decodes it whole, though it is looked at reduced."""
+    return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 
-class _Masks:
-    """The masks of photos.
-
-    Args:
-        root: Folder of the photos.
-        wanted: Folder of the masks; None for `masks/` below the photos, and files beside them.
-    """
-
-    def __init__(self, root: Path, wanted: str | None) -> None:
-        self._root = root
-        self._folder = root / _MASKS if wanted is None else Path(wanted)
-        self._beside = wanted is None
-        if wanted is not None and not self._folder.is_dir():
-            raise UserError(
-                "the mask folder is not there",
-                where=wanted,
-                todo="check the path, or leave --masks out",
-            )
-
-    def of(self, name: str) -> str | None:
-        """Path of the mask of a photo: `x.jpg.png`, `x.png`, `x_mask.png` or `x.jpg`."""
-        stem = str(PurePosixPath(name).with_suffix(""))
-        places = [self._folder / each for each in
-                  (f"{name}.png", f"{stem}.png", f"{stem}_mask.png", name)]  # fmt: skip
-        if self._beside:
-            places += [self._root / f"{stem}{end}.png" for end in _MASK_ENDS]
-        return next((str(path.absolute()) for path in places if path.is_file()), None)
+def _too_large(path: Path, header: PhotoHeader) -> UserError:
+    usual, most = megapixels(pillow.MOST_PIXELS), megapixels(_REDUCIBLE * pillow.MOST_PIXELS)
+    pixels = megapixels(header.width * header.height)
+    return UserError(
+        "the photo is too large to be decoded at once",
+        where=path,
+        expected=f"at most {usual}, or {most} as a JPEG file that is not progressive",
+        found=f"{header.width} x {header.height} pixels, {pixels}",
+        todo="save it smaller, such as at half its width and height, or take it out of the folder "
+        "(--max-size makes photos smaller only once they are decoded)",
+    )
 
 
 def _without_doubles(photos: Sequence[Photo]) -> tuple[list[Photo], list[LeftOut]]:

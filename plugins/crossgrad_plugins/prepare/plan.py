@@ -1,11 +1,14 @@
 """The plan: which photos are used, with which settings; what a second start has to agree with."""
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from crossgrad_core.commands import UserError, write_atomically
+from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.layout import Layout
 
 #: Version of the file; raised where an older reader could misread a newer one.
@@ -60,6 +63,8 @@ class Photo(_Fixed):
         camera: What photos of one calibration share.
         position: Where its GPS says it was taken.
         mask: Path of its mask; None where it has none.
+        mask_sha256: Digest of that file; None in plans of before it was kept.
+        transparent: Whether it has pixels with alpha below a half, which do not count.
         brightness: Mean of its grey levels, 0 to 255.
         sharpness: Mean square of the Laplacian of its grey levels at a reduced size.
         bytes: Size of the file.
@@ -73,7 +78,9 @@ class Photo(_Fixed):
     orientation: int
     camera: str
     position: Position | None
-    mask: str | None
+    mask: str | None = None
+    mask_sha256: str | None = None
+    transparent: bool = False
     brightness: float
     sharpness: float
     bytes: int
@@ -116,26 +123,36 @@ class Plan(_Fixed):
 
 
 def agreed(layout: Layout, plan: Plan) -> Plan:
-    """The plan of a scene: the one that it has, or this one, which is written down.
+    """The plan that is carried out: this one, which is written down where the scene has no such.
+
+    The same photos may lie in another folder than before, and their masks, too. A scene that is
+    ready needs none of them: some may be gone.
 
     Raises:
         UserError: The scene was begun with other photos or settings, or its plan is damaged.
     """
-    if not layout.plan.is_file():
+    known = read_plan(layout) if layout.plan.is_file() else None
+    if known is not None:
+        _check_same(layout, known, plan)
+    if known is not None and layout.is_ready:
+        return known
+    if known != plan:
         layout.work.mkdir(parents=True, exist_ok=True)
         write_atomically(layout.plan, plan.model_dump_json(indent=1).encode())
-        return plan
-    known = read_plan(layout)
-    differs = _difference(known, plan)
+    return plan
+
+
+def _check_same(layout: Layout, known: Plan, plan: Plan) -> None:
+    differs = _difference(known, plan, some=layout.is_ready)
     if differs:
         raise UserError(
             "the scene was begun otherwise",
             where=layout.scene,
-            expected="the same photos and settings",
+            expected="the same photos, masks and settings",
             found=differs,
-            todo="choose another folder for the scene, or remove this one",
+            todo="use those it was begun with, choose another folder for the scene, or remove this "
+            "one",
         )
-    return known
 
 
 def read_plan(layout: Layout) -> Plan:
@@ -164,18 +181,51 @@ def read_plan(layout: Layout) -> Plan:
     return plan
 
 
-def _difference(known: Plan, plan: Plan) -> str:
-    """What tells two plans apart, in words; empty where nothing does."""
+def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
+    """What tells two plans apart, in words; empty where nothing does.
+
+    Args:
+        known: The plan of the scene.
+        plan: The plan of now.
+        some: Whether some of the photos will do.
+    """
     was, now = known.settings.model_dump(), plan.settings.model_dump()
-    settings = [f"{key} was {was[key]}, now {now[key]}" for key in was if was[key] != now[key]]
-    before = {photo.name: photo.sha256 for photo in known.used}
-    after = {photo.name: photo.sha256 for photo in plan.used}
-    changed = sorted(name for name, _ in before.items() ^ after.items())
-    if changed:
-        settings.append(f"photos new, gone or changed: {len(set(changed))}, first {changed[0]}")
-    return "; ".join(settings)
+    # Where masks lie does not matter, but what is in them.
+    told = [f"{key} was {was[key]}, now {now[key]}" for key in was
+            if was[key] != now[key] and key != "masks"]  # fmt: skip
+    after = {photo.name: photo for photo in plan.used}
+    before = {photo.name: photo for photo in known.used if photo.name in after or not some}
+    sums = [{photo.name: photo.sha256 for photo in each.values()} for each in (before, after)]
+    told += _changes("photo", *sums)
+    both = [(before[name], after[name]) for name in before.keys() & after.keys()]
+    new = {photo.name: photo.mask_sha256 for _, photo in both if photo.mask}
+    # Plans of before digests were kept have none.
+    old = {each.name: each.mask_sha256 or photo.mask_sha256 for each, photo in both
+           if each.mask and (photo.mask or not some)}  # fmt: skip
+    return "; ".join([*told, *_changes("mask", old, new)])
 
 
-def place_of(photos: Path, photo: Photo) -> Path:
-    """The file of a photo."""
-    return photos / photo.name
+def _changes(
+    noun: str, before: Mapping[str, str | None], after: Mapping[str, str | None]
+) -> list[str]:
+    """What became of files by their names and digests, in words."""
+    kinds = {
+        "new": after.keys() - before.keys(),
+        "gone": before.keys() - after.keys(),
+        "changed": {name for name in before.keys() & after.keys() if before[name] != after[name]},
+    }
+    return [
+        f"{count(len(names), noun)} {what}: {name_some(sorted(names))}"
+        for what, names in kinds.items()
+        if names
+    ]
+
+
+def digest_of(path: Path) -> str:
+    """The digest of a file.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -104,6 +104,8 @@ def data_of(report: Report) -> dict[str, Any]:
         "bridges": [asdict(each) for each in report.bridges],
         "gps": None if report.result.georef is None else report.result.georef["residuals_m"],
         "gps_photos": len(plan.located),
+        "masked_photos": sum(photo.mask is not None for photo in plan.used),
+        "transparent_photos": sum(photo.transparent for photo in plan.used),
     }
 
 
@@ -136,6 +138,19 @@ def _in_short(report: Report) -> Iterator[str]:
         height = "" if row["height_m"] is None else f", {row['height_m']:.0f} m above ground"
         yield f"  {name or '(no folder)'}: {row['registered']} of {row['photos']}{height}"
     yield from _gps(report)
+    yield from _masks(report.plan)
+
+
+def _masks(plan: Plan) -> Iterator[str]:
+    masked = sum(photo.mask is not None for photo in plan.used)
+    transparent = sum(photo.transparent for photo in plan.used)
+    if masked:
+        yield f"masks: {masked} of {len(plan.used)} photos have one; black does not count"
+    if transparent:
+        yield (
+            f"transparency: {transparent} of {len(plan.used)} photos have it; pixels with alpha "
+            "below a half do not count, by masks in the scene"
+        )
 
 
 def _gps(report: Report) -> Iterator[str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from crossgrad_core.commands import UserError, disk_errors
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
+from crossgrad_plugins.prepare.masks import counting_pixels
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.waiting import quiet, waited
 
@@ -87,37 +88,26 @@ def _moved(here: Path, there: Path) -> None:
 
 
 def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -> None:
-    """Writes the masks of the photos that have one, undistorted as these are."""
+    """Writes the masks of the photos that have one or are transparent, undistorted as these are."""
     import pycolmap
 
-    masks = {photo.name: photo.mask for photo in plan.used if photo.mask is not None}
+    photos = {photo.name: photo for photo in plan.used}
     for number in model.reg_image_ids():
         image = model.image(number)
         place = layout.masks / f"{image.name}.png"
-        if image.name not in masks or place.is_file():
+        if place.is_file():
             continue
-        camera = model.camera(image.camera_id)
-        grey = read_mask(Path(masks[image.name]), camera.width, camera.height)
+        counting = counting_pixels(Path(plan.photos), photos[image.name])
+        if counting is None:
+            continue
         with quiet():
-            bitmap = pycolmap.Bitmap.from_array(grey)
-            bitmap, _ = pycolmap.undistort_image(_options(plan), bitmap, camera)
+            bitmap = pycolmap.Bitmap.from_array(counting)
+            bitmap, _ = pycolmap.undistort_image(
+                _options(plan), bitmap, model.camera(image.camera_id)
+            )
         kept = np.where(bitmap.to_array() >= _HALF, 255, 0).astype(np.uint8)
         scratch = place.with_name(f".{place.name}.tmp.png")
         with disk_errors(place):
             place.parent.mkdir(parents=True, exist_ok=True)
             pycolmap.Bitmap.from_array(kept).write(scratch)
             scratch.replace(place)
-
-
-def read_mask(path: Path, width: int, height: int) -> "np.typing.NDArray[np.uint8]":
-    """[H, W] a mask in the size of its photo, 255 where a pixel counts.
-
-    Raises:
-        UserError: It cannot be decoded.
-    """
-    from PIL import Image
-
-    from crossgrad_core.scene.decode import decode_mask
-
-    mask = Image.fromarray(decode_mask(path))
-    return np.asarray(mask.resize((width, height), Image.Resampling.NEAREST))

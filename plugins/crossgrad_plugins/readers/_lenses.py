@@ -7,6 +7,7 @@ from crossgrad_core.plugin import Pinhole, UserError
 from crossgrad_core.scene.calibration import Calibration
 
 _UNDISTORT = "undistort the photos with the program that posed them and export them as pinhole ones"
+_CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective ones first"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +40,14 @@ class Frame(Pinhole):
         return Calibration(model, self.width, self.height, params)
 
 
-def refuse_lens(kind: str, where: object) -> UserError:
+def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
     """The error for cameras that have no pinhole to be undistorted to, or none that is known."""
     return UserError(
         f"photos of {kind} cannot be undistorted",
         where=where,
         expected="a perspective camera, with Brown's distortion or a fisheye's",
         found=kind,
-        todo=f"{_UNDISTORT}; cut 360-degree photos into perspective ones first",
+        todo=todo,
     )
 
 

@@ -7,7 +7,7 @@ Sources: https://docs.nerf.studio/quickstart/data_conventions.html (fields, axes
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -31,6 +31,11 @@ _PERSPECTIVE: Final = frozenset(
     {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 )
 _FISHEYE: Final = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
+#: Fields that tell the same in two ways.
+_WAYS: Final = (
+    (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y")),
+    ((*_RADIAL, *_TANGENTIAL), ("distortion_params",)),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +55,19 @@ class Posed:
     mask: Path | None = None
 
 
-def photo_name(inside: Inside, fields: Fields, key: str, base: str) -> str:
-    """The photo that a frame names; a name without a suffix is that of a PNG file, as in NeRF's.
+def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
+    """The photo that a file names; a name without a suffix is that of a PNG file, as in NeRF's.
+
+    Args:
+        inside: The scene.
+        text: The name.
+        where: The field that has it.
+        base: Folder of the file below the scene.
 
     Raises:
-        UserError: There is no name, or it leads out of the scene.
+        UserError: It leads out of the scene.
     """
-    name = inside.name(fields.text(key), fields.where(key), base)
+    name = inside.name(text, where, base)
     bare = not PurePosixPath(name).suffix
     if not is_file(inside.scene / name) and (bare or is_file(inside.scene / f"{name}.png")):
         name += ".png"
@@ -78,7 +89,7 @@ def read_frame(
     Raises:
         UserError: A field is missing or not what it should be.
     """
-    photo = photo_name(inside, frame, "file_path", base)
+    photo = photo_name(inside, frame.text("file_path"), frame.where("file_path"), base)
     mask = None
     if "mask_path" in frame:
         name = inside.name(frame.text("mask_path"), frame.where("mask_path"), base)
@@ -101,12 +112,16 @@ def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
     """The lens of a frame; the photo's own size where the file does not tell it.
 
+    A frame's field comes before the file's of the same name. What a frame tells in one way, the
+    file's fields of the other way do not complete: they are of another lens.
+
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.
     """
+    shared = _completing(frame, whole)
 
     def holder(key: str) -> Fields:
-        return frame if key in frame else whole
+        return frame if key in frame else shared
 
     def number(key: str, default: float | None = None) -> float:
         return holder(key).number(key, default)
@@ -117,14 +132,34 @@ def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calib
     size = _size(inside, holder, photo)
     lens = _frame(size, holder, number)
     radial, tangential = _terms(holder, number)
-    model = holder("camera_model").text("camera_model", "PERSPECTIVE").upper()
-    if model in _FISHEYE or holder("is_fisheye").value.get("is_fisheye") is True:
+    own, named = _says_fisheye(frame), holder("camera_model")
+    if _says_fisheye(whole) if own is None else own:
         return lens.fisheye(radial)
-    if model not in _PERSPECTIVE:
-        raise refuse_lens(f"camera model {model}", holder("camera_model").where("camera_model"))
+    model = named.text("camera_model", "PERSPECTIVE").upper()
+    if model not in _PERSPECTIVE | _FISHEYE:
+        raise refuse_lens(f"camera model {model}", named.where("camera_model"))
     if radial[3]:
         raise refuse_term("k4", radial[3], holder("k4").where("k4"))
     return lens.brown(radial[:3], tangential)
+
+
+def _completing(frame: Fields, whole: Fields) -> Fields:
+    """The fields of a file that complete those of a frame."""
+    others = [other for both in _WAYS for way, other in (both, both[::-1])
+              if any(key in frame for key in way)]  # fmt: skip
+    own = _says_fisheye(frame)
+    if own is not None and own != bool(_says_fisheye(whole)):
+        others += _WAYS[1]  # Distortion of another kind of lens.
+    hidden = frozenset[str]().union(*others)
+    return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})
+
+
+def _says_fisheye(fields: Fields) -> bool | None:
+    """Whether a frame or a file says that its lens is a fisheye; None where it says nothing."""
+    if "camera_model" not in fields and "is_fisheye" not in fields:
+        return None
+    model = fields.text("camera_model", "PERSPECTIVE").upper()
+    return model in _FISHEYE or fields.value.get("is_fisheye") is True
 
 
 def _size(inside: Inside, holder: Callable[[str], Fields], photo: str) -> tuple[int, int]:
@@ -142,9 +177,11 @@ def _frame(
     """Focal lengths in pixels, or from angles of view; the principal point, or the middle."""
     width, height = size
     across = _focal(holder, "fl_x", "camera_angle_x", width)
-    if across is None:
-        holder("fl_x").wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
     down = _focal(holder, "fl_y", "camera_angle_y", height)
+    if across is None:
+        # Where the other one is told, this one is missing.
+        other = "camera_angle_y" if "camera_angle_y" in holder("camera_angle_y") else "fl_y"
+        holder(other).wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
     return Frame(
         *(width, height, across, across if down is None else down),
         *(number("cx", width / 2.0), number("cy", height / 2.0)),

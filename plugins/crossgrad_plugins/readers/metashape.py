@@ -39,6 +39,13 @@ from crossgrad_plugins.readers._sniff import head_of
 from crossgrad_plugins.readers._xml import read_xml
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+#: The compensation of a rolling shutter, and what is told where there is none.
+_ROLLING: Final = "rolling_shutter"
+_OFF: Final = frozenset({"false", "0", "no", "off", "none", "disabled"})
+_GLOBAL: Final = (
+    "set its rolling shutter compensation to Disabled (Tools > Camera Calibration), optimize the "
+    "cameras, and export them again"
+)
 #: Coordinate systems whose chunk transform leads to geocentric coordinates.
 _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
 
@@ -244,6 +251,9 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     fields = Fields(dict(element.attrib), file, place)
     if kind not in {"frame", "fisheye"}:
         raise refuse_lens(f"sensor type {kind}", fields.where("type"))
+    if _is_rolling(element):
+        what = f"a camera with a rolling shutter ({element.get('label') or 'without a label'})"
+        raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
     # An adjusted calibration comes behind the initial one.
     calibrations = element.findall("calibration")
     adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
@@ -254,6 +264,14 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     size = {key: _parsed(resolution.get(key)) for key in ("width", "height")}
     values = {each.tag: _parsed(each.text) for each in chosen}
     return _lens(Fields({**values, **size}, file, f"{place}.calibration"), kind)
+
+
+def _is_rolling(element: Element) -> bool:
+    """Whether the rolling shutter of a sensor is compensated: its poses are those of a moment."""
+    told = [each.get("value") for each in element.iterfind("property")
+            if each.get("name") == _ROLLING]  # fmt: skip
+    told += [each.get("value", each.text) for each in element.iterfind(_ROLLING)]
+    return any(word.lower() not in _OFF for text in told for word in (text or "").split())
 
 
 def _parsed(text: str | None) -> object:

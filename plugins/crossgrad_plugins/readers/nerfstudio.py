@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Reader, Scene, SceneOptions
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
-from crossgrad_core.scene.wording import count
+from crossgrad_core.scene.split import has_lists
+from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.georeference.frames import Frame3D, rotation_of
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
@@ -19,9 +20,16 @@ from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with, holds
-from crossgrad_plugins.readers._transforms import raw_views, read_frame, transform_of
+from crossgrad_plugins.readers._transforms import (
+    photo_name,
+    raw_views,
+    read_frame,
+    transform_of,
+)
 
 _FILE = "transforms.json"
+#: The views that are trained on, and the held-out ones: those of the first list that has any.
+_TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"
 
 
 class NerfstudioReader(Reader):
@@ -61,7 +69,9 @@ class NerfstudioReader(Reader):
         if "fisheye_crop_radius" in whole:
             notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
         raw = raw_scene(inside, images, views, points, *notes)
-        raw = replace(raw, split=_split(inside, whole, base, images))
+        if options.split == "auto" and not has_lists(path):
+            names = [view.name for view in views]
+            raw = replace(raw, split=_split(inside, whole, base, images, names))
         return by_gps(build_scene(raw, options), raw)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
@@ -88,22 +98,40 @@ def _applied(whole: Fields) -> Frame3D:
 
 
 def _split(
-    inside: Inside, whole: Fields, base: str, images: str
+    inside: Inside, whole: Fields, base: str, images: str, posed: Sequence[str]
 ) -> tuple[frozenset[str], frozenset[str]] | None:
-    """The names of training and held-out views below the photo folder; None without lists."""
-    train, test, validation = (
-        _listed(inside, whole, f"{part}_filenames", base, images)
-        for part in ("train", "test", "val")
-    )
-    if train is None:
+    """The names of training and held-out views below the photo folder; None without lists.
+
+    Raises:
+        UserError: A list names no photo of any frame, or a name is in two lists.
+    """
+    if _TRAIN not in whole:
         return None
-    return frozenset(train), frozenset(test or validation or ())
+    lists = {key: _listed(inside, whole, key, base, images)
+             for key in (_TRAIN, *_HELD_OUT) if key in whole}  # fmt: skip
+    held_out = next((key for key in _HELD_OUT if lists.get(key)), None)
+    for key in filter(None, (_TRAIN, held_out)):
+        if not lists[key] & set(posed):
+            raise UserError(
+                "no name of a list is that of a frame's photo",
+                where=whole.where(key),
+                expected=f"names as the frames' file_path has them, such as {min(posed)}",
+                found=name_some(whole.texts(key)) or "no name",
+                todo="mend the list, or use --split every",
+            )
+    test = lists[held_out] if held_out else frozenset[str]()
+    both = sorted(lists[_TRAIN] & test)
+    if both:
+        raise UserError(
+            "views are listed for training and for testing",
+            where=f"{whole.where(_TRAIN)} and {held_out}",
+            found=name_some(both),
+            todo="leave each name in one of both lists, or use --split every",
+        )
+    return lists[_TRAIN], test
 
 
-def _listed(
-    inside: Inside, whole: Fields, key: str, base: str, images: str
-) -> Sequence[str] | None:
-    if key not in whole:
-        return None
-    names = [inside.name(text, whole.where(key), base) for text in whole.texts(key)]
-    return names if images == "." else [name.removeprefix(f"{images}/") for name in names]
+def _listed(inside: Inside, whole: Fields, key: str, base: str, images: str) -> frozenset[str]:
+    names = [photo_name(inside, text, whole.where(key), base) for text in whole.texts(key)]
+    start = "" if images == "." else f"{images}/"
+    return frozenset(name.removeprefix(start) for name in names)

@@ -14,7 +14,8 @@ class PhotosAloneReader(Reader):
     """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
 
     The prepared scene stays in a folder beside the photos, where `crossgrad prepare` finds it
-    again, and so does a run that is resumed. By itself no folder is read this way.
+    again, and so does a run that is resumed; once it is ready, photos and `prepare/` in it may be
+    gone. By itself no folder is read this way.
     """
 
     scene: Path | None = Field(
@@ -27,9 +28,8 @@ class PhotosAloneReader(Reader):
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        from crossgrad_plugins.prepare.app import prepared
+        from crossgrad_plugins.prepare.app import made_or_ready
         from crossgrad_plugins.prepare.plan import Settings
-        from crossgrad_plugins.prepare.report import summary_lines
 
         photos = path.resolve()
         if not photos.name and self.scene is None:
@@ -39,7 +39,7 @@ class PhotosAloneReader(Reader):
                 todo="name its folder with --set reader.scene=FOLDER",
             )
         place = self.scene or photos.with_name(f"{photos.name}-scene")
-        report = prepared(photos, place, Settings())
+        told = made_or_ready(photos, place, Settings())
         scene = ColmapReader().read(place, options)
-        lines = (f"the photos were prepared into {place}", *summary_lines(report))
+        lines = (f"the photos were prepared into {place}", *told)
         return replace(scene, notes=(*(f"prepare: {line}" for line in lines), *scene.notes))

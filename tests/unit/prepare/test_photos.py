@@ -1,15 +1,21 @@
 """Photos of a folder: names, EXIF, masks, and files that only look like photos."""
 
+import os
 import shutil
 from fractions import Fraction
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene import pillow
+from crossgrad_plugins.prepare import photos
 from crossgrad_plugins.prepare.exif import camera_of, position_of
+from crossgrad_plugins.prepare.masks import counting_pixels
 from crossgrad_plugins.prepare.photos import find_photos
 from crossgrad_plugins.prepare.plan import Settings
 
@@ -111,6 +117,219 @@ def test_a_folder_of_masks_that_is_named_has_to_be_there(tmp_path):
     save(tmp_path / "1.jpg")
     with pytest.raises(UserError, match="mask folder"):
         found(tmp_path, masks=str(tmp_path / "gone"))
+
+
+def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_told(tmp_path):
+    """Most files of `a/masks` are named after photos; `b/masks` holds photos of carnival masks."""
+    shot = ("a/1.jpg", "a/2.jpg", "b/1.jpg", "b/masks/7.jpg", "b/masks/8.jpg", "c/3.jpg")
+    drawn = ("c/masks/3.png", "a/masks/1.jpg.png", "a/masks/2.png", "a/masks/gone.png")
+    for name in (*shot, *drawn):
+        save(tmp_path / name)
+    used, left_out = found(tmp_path)
+    assert sorted(used) == sorted(shot)
+    assert left_out == {
+        "a/masks/": "masks, but 1 file of no photo: a/masks/gone.png",
+        "c/masks/": "masks of the photos beside it",
+    }
+    masked = {name: photo.mask for name, photo in used.items() if photo.mask}
+    assert masked == {
+        "a/1.jpg": str(tmp_path / "a/masks/1.jpg.png"),
+        "a/2.jpg": str(tmp_path / "a/masks/2.png"),
+        "c/3.jpg": str(tmp_path / "c/masks/3.png"),
+    }
+
+
+def test_masks_of_no_photo_are_told(tmp_path):
+    for name in (
+        "1.jpg",
+        "2.jpg",
+        "masks/1.png",
+        "masks/IMG_9.jpg",
+        "death_mask.jpg",
+        "2.mask.png",
+    ):
+        save(tmp_path / name)
+    used, left_out = found(tmp_path)
+    assert sorted(used) == ["1.jpg", "2.jpg"]
+    assert left_out == {
+        "masks/": "masks, but 1 file of no photo: masks/IMG_9.jpg",
+        "death_mask.jpg": "named as a mask, but of no photo: rename it if it is one",
+    }
+    assert used["2.jpg"].mask == str(tmp_path / "2.mask.png")
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_mask_folder_within_the_photos_that_is_named_holds_no_photos(linked, tmp_path):
+    folder = tmp_path / "photos"
+    for name in ("1.jpg", "2.jpg", "sky/1.jpg", "sky/deep/9.png"):
+        save(folder / name)
+    named = folder / "sky"
+    if linked:
+        named = tmp_path / "link"
+        named.symlink_to(folder / "sky")
+    used, left_out = found(folder, masks=str(named))
+    assert sorted(used) == ["1.jpg", "2.jpg"]
+    assert used["1.jpg"].mask == str(named / "1.jpg") and used["2.jpg"].mask is None
+    assert left_out == {"sky/": "the folder of masks (--masks), not of photos"}
+
+
+def test_the_photos_own_folder_may_be_that_of_the_masks(tmp_path):
+    """No photo is its own mask."""
+    for name in ("1.jpg", "1.png", "2.png", "2.png.png", "3.png"):
+        save(tmp_path / name)
+    used, _ = found(tmp_path, masks=str(tmp_path))
+    assert sorted(used) == ["1.jpg", "2.png", "3.png"]
+    assert used["1.jpg"].mask == str(tmp_path / "1.png")
+    assert used["2.png"].mask == str(tmp_path / "2.png.png")
+    assert used["3.png"].mask is None
+
+
+@pytest.mark.parametrize("files", [(), ("other.png", "1.txt")])
+def test_a_mask_folder_that_fits_no_photo_is_refused(files, tmp_path):
+    save(tmp_path / "photos" / "a" / "1.jpg")
+    save(tmp_path / "photos" / "a" / "2.jpg")
+    (tmp_path / "sky").mkdir()
+    for name in files:
+        save(tmp_path / "sky" / name, format="PNG")
+    with pytest.raises(UserError, match="no photo has a mask") as caught:
+        found(tmp_path / "photos", masks=str(tmp_path / "sky"))
+    assert "a/1.jpg.png, a/1.png, a/1_mask.png, a/1.jpg" in caught.value.expected
+    assert caught.value.found == ("other.png" if files else "no image")
+
+
+def mask_of(folder, photo, mask, turn=1):
+    """The pixels that count of a photo, with its stored size, its mask and its orientation."""
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    save(folder / "photos" / "1.jpg", size=photo, exif=exif)
+    save(folder / "photos" / "2.jpg", size=photo)
+    (folder / "photos" / "masks").mkdir()
+    mask.save(folder / "photos" / "masks" / "1.png")
+    used, _ = found(folder / "photos")
+    return counting_pixels(folder / "photos", used["1.jpg"])
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("part", [1, 2])
+def test_masks_of_the_photo_as_it_is_shown_are_turned_as_it_is_stored(turn, part, tmp_path):
+    """By Pillow, which turns photos by their EXIF headers; those of the stored photo stay."""
+    stored = np.zeros((80, 120), np.uint8)
+    stored[:20, :40] = 255
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    Image.fromarray(stored).save(tmp_path / "mask.png", exif=exif)
+    with Image.open(tmp_path / "mask.png") as image:
+        shown = ImageOps.exif_transpose(image).reduce(part) if turn > 4 else image.reduce(part)
+    kept = mask_of(tmp_path, (120, 80), shown, turn)
+    assert np.array_equal(kept, stored)
+
+
+@pytest.mark.parametrize(
+    ("size", "turn"), [((80, 120), 1), ((80, 120), 3), ((120, 90), 6), ((50, 50), 8)]
+)
+def test_masks_that_do_not_fit_are_one_error_at_once(size, turn, tmp_path):
+    with pytest.raises(UserError, match="shape of its photo") as caught:
+        mask_of(tmp_path, (120, 80), Image.new("L", size), turn)
+    assert caught.value.where.endswith("masks/1.png")
+
+
+def test_damaged_masks_are_found_at_once(tmp_path):
+    for name in ("1.jpg", "2.jpg", "masks/1.png", "masks/2.png"):
+        save(tmp_path / name)
+    whole = (tmp_path / "masks" / "2.png").read_bytes()
+    broken = bytearray(whole)
+    broken[len(whole) // 2] ^= 255
+    for content in (whole[:-30], b"", bytes(broken)):
+        (tmp_path / "masks" / "2.png").write_bytes(content)
+        with pytest.raises(UserError) as caught:
+            found(tmp_path)
+        assert caught.value.where.endswith("masks/2.png")
+
+
+def test_transparent_pixels_do_not_count(tmp_path):
+    """Only where alpha is below a half somewhere; with a mask both tell."""
+    pixels = np.random.default_rng(0).integers(0, 256, (80, 100, 4), dtype=np.uint8)
+    pixels[..., 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "opaque.png")
+    pixels[:30, :, 3], pixels[30:, :, 3] = 127, 128
+    Image.fromarray(pixels).save(tmp_path / "half.png")
+    mask = np.full((80, 100), 255, np.uint8)
+    mask[:, :50] = 0
+    Image.fromarray(mask).save(tmp_path / "half_mask.png")
+    palette = np.arange(8000, dtype=np.uint8).reshape(80, 100) % 2
+    Image.fromarray(palette).convert("P").save(tmp_path / "palette.png", transparency=1)
+    used, _ = found(tmp_path)
+    assert {name: photo.transparent for name, photo in used.items()} == {
+        "half.png": True, "opaque.png": False, "palette.png": True
+    }  # fmt: skip
+    kept = {name: counting_pixels(tmp_path, photo) for name, photo in used.items()}
+    assert kept["opaque.png"] is None
+    assert np.array_equal(kept["palette.png"], 255 * (1 - palette))
+    assert kept["half.png"][30:, 50:].min() == 255
+    assert not kept["half.png"][:30].any() and not kept["half.png"][:, :50].any()
+
+
+@pytest.mark.parametrize(
+    "name", ["a\tb.jpg", "a\nb.jpg", "a\x1b[2Jb.jpg", "a\\b.jpg", "d\te/1.jpg", "x" * 250 + ".jpg"]
+)
+def test_names_that_no_scene_can_have_are_left_out_with_words(name, tmp_path):
+    save(tmp_path / "1.jpg")
+    save(tmp_path / "2.jpg")
+    save(tmp_path / name)
+    used, left_out = found(tmp_path)
+    assert sorted(used) == ["1.jpg", "2.jpg"]
+    ((shown, why),) = left_out.items()
+    assert shown.isprintable()
+    assert "control characters or backslashes, is too long or is not UTF-8: rename it" in why
+
+
+def test_names_that_are_no_text_are_left_out_with_words(tmp_path):
+    for name in (b"1.jpg", b"2.jpg", b"\xff.jpg", b"\xfe_mask.png"):
+        path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+        with path.open("wb") as file:
+            Image.effect_noise((90, 70), 20).save(file, "PNG")
+    used, left_out = found(tmp_path)
+    assert sorted(used) == ["1.jpg", "2.jpg"]
+    assert all(shown.isprintable() for shown in left_out)
+    assert len(left_out) == 2
+
+
+@pytest.mark.parametrize("what", ["photos", "masks"])
+def test_folders_whose_names_are_no_text_are_one_error(what, tmp_path):
+    bad = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    bad.mkdir()
+    with pytest.raises(UserError, match="a name that is no text"):
+        found(bad) if what == "photos" else found(tmp_path, masks=str(bad))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "most"),
+    [
+        ("3.png", {}, 6299),
+        ("3.jpg", {}, 3149),
+        ("3.jpg", {"progressive": True}, 6299),
+        ("3.tif", {}, 6299),
+    ],
+)
+def test_a_photo_that_is_too_large_is_one_error_that_names_it(
+    name, options, most, tmp_path, monkeypatch
+):
+    """JPEG files that can be decoded reduced may have twice as many pixels."""
+    for number in (1, 2):
+        save(tmp_path / f"{number}.jpg", size=(64, 64))
+    save(tmp_path / name, **options)
+    monkeypatch.setattr(pillow, "MOST_PIXELS", most + 1)
+    assert len(found(tmp_path)[0]) == 3
+    monkeypatch.setattr(pillow, "MOST_PIXELS", most)
+    read, decoded = photos._read, []
+    monkeypatch.setattr(
+        photos, "_read", lambda root, name, *more: decoded.append(name) or read(root, name, *more)
+    )
+    with pytest.raises(UserError, match="too large to be decoded at once") as caught:
+        found(tmp_path)
+    assert caught.value.where == str(tmp_path / name)
+    assert "90 x 70 pixels" in caught.value.found and "save it smaller" in caught.value.todo
+    assert name not in decoded
 
 
 def test_one_of_two_same_files_is_used(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,10 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_plugins.prepare import mapping, matching
+from crossgrad_plugins.prepare import mapping, matching, undistortion
 from crossgrad_plugins.prepare.app import prepared
 from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.photos import find_photos
 from crossgrad_plugins.prepare.plan import Plan, Position, Settings
 from crossgrad_plugins.prepare.report import data_of, summary_lines
@@ -229,6 +231,119 @@ def test_another_plan_is_refused(report, photos, scene):
         prepared(photos, scene, Settings(max_size=200))
     assert "max_size was None, now 200" in caught.value.found
     assert content(scene) == before
+
+
+@pytest.fixture
+def copied(report, scene, tmp_path):
+    """A copy of the scene."""
+    return shutil.copytree(scene, tmp_path / "photos-scene")
+
+
+def unfinish(scene):
+    """Takes back the last stages, and says that the photos were elsewhere before."""
+    (scene / "report.json").unlink()
+    for folder in ("sparse", "images", "masks"):
+        shutil.rmtree(scene / folder)
+    plan = json.loads((scene / "prepare" / "plan.json").read_text())
+    for each in plan["used"]:
+        each["mask"] = each["mask"] and "/gone/mask.png"
+    (scene / "prepare" / "plan.json").write_text(json.dumps(plan | {"photos": "/gone"}))
+
+
+def test_it_goes_on_where_the_photos_were_moved(copied, scene, photos, tmp_path):
+    moved = shutil.copytree(photos, tmp_path / "moved")
+    unfinish(copied)
+    found = prepared(moved, copied, Settings())
+    assert found.plan.photos == str(moved)
+    names = {path.relative_to(copied) for path in copied.rglob("*.*")}
+    assert names >= {path.relative_to(scene) for path in scene.rglob("*.*")} - {Path("run.lock")}
+
+
+def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
+    moved = shutil.copytree(photos, tmp_path / "moved")
+    unfinish(copied)
+    (gone, changed, *_) = sorted((moved / "kite").glob("img*.jpg"))
+    gone.unlink()
+    with changed.open("ab") as file:
+        file.write(b"more")
+    before = content(copied)
+    with pytest.raises(UserError, match="begun otherwise") as caught:
+        prepared(moved, copied, Settings())
+    assert f"1 photo gone: kite/{gone.name}; 1 photo changed: " in caught.value.found
+    assert content(copied) == before
+
+
+@pytest.mark.parametrize(
+    "lost", ["workshop", "part", "photos", "some photos", "most photos", "all"]
+)
+def test_a_ready_scene_is_read_without_what_it_was_made_of(copied, photos, lost, tmp_path):
+    place = shutil.copytree(photos, tmp_path / "photos")
+    if lost in {"workshop", "all"}:
+        shutil.rmtree(copied / "prepare")
+    if lost == "part":
+        (copied / "prepare" / "features.json").unlink()
+    if lost in {"photos", "all"}:
+        shutil.rmtree(place)
+    if "some" in lost:
+        next((place / "kite").glob("img*.jpg")).unlink()
+    if "most" in lost:
+        shutil.rmtree(place / "mast")
+        for path in (place / "kite").glob("img*.jpg"):
+            path.unlink()
+    (copied / "run.lock").unlink()
+    before = content(copied)
+    read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
+    assert len(read.views) == COUNT
+    as_it_is = any("the scene is taken as it is" in note for note in read.notes)
+    assert as_it_is == (lost not in {"some photos", "most photos"})
+    assert content(copied) == before and not (copied / "run.lock").exists()
+
+
+def test_new_photos_of_a_ready_scene_are_not_left_out_silently(copied, photos, tmp_path):
+    place = shutil.copytree(photos, tmp_path / "photos")
+    Image.effect_noise((400, 298), 20).save(place / "kite" / "new.png")
+    with pytest.raises(UserError, match="begun otherwise") as caught:
+        read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
+    assert caught.value.found == "1 photo new: kite/new.png"
+
+
+def test_a_ready_scene_without_its_workshop_is_not_prepared_again(copied, photos, capsys):
+    shutil.rmtree(copied / "prepare")
+    before = content(copied)
+    assert ended("prepare", photos, copied) == 2
+    told = capsys.readouterr().err
+    assert "the scene is ready" in told and f"crossgrad run {copied}" in told
+    assert content(copied) == before
+
+
+def test_transparent_photos_get_a_mask(report, tmp_path):
+    """Undistorted as they are; what is not transparent gets none."""
+    model = pycolmap.Reconstruction(bundled_scene() / "sparse" / "0")
+    names = sorted(image.name for image in model.images.values())
+    one = next(iter(model.cameras.values()))
+    known = report.plan.used[0].model_copy(update={"width": one.width, "height": one.height})
+    used = [
+        known.model_copy(update={"name": name, "mask": None, "transparent": name == names[0]})
+        for name in names
+    ]
+    alpha = np.full((one.height, one.width), 255, np.uint8)
+    alpha[: one.height // 2] = 100
+    photo = Image.new("RGB", (one.width, one.height), "green")
+    photo.putalpha(Image.fromarray(alpha))
+    photo.save(tmp_path / names[0], format="PNG")
+    layout = Layout(tmp_path / "scene")
+    plan = Plan(photos=str(tmp_path), settings=Settings(), used=used, left_out=())
+    undistortion._write_masks(layout, plan, model)
+    (mask,) = layout.masks.iterdir()
+    assert mask.name == f"{names[0]}.png"
+    with Image.open(mask) as image:
+        rows = (np.asarray(image) > 0).mean(axis=1)
+    assert rows[: len(rows) // 3].max() == 0.0 and rows[-len(rows) // 3 :].mean() > 0.95
+    first, *others = report.plan.used
+    shown = (first.model_copy(update={"transparent": True}), *others)
+    told = summary_lines(replace(report, plan=report.plan.model_copy(update={"used": shown})))
+    assert any(line.startswith(f"transparency: 1 of {COUNT + 1} photos") for line in told)
+    assert any(line.startswith(f"masks: 1 of {COUNT + 1} photos") for line in told)
 
 
 def test_a_run_prepares_photos_where_it_is_told_to(report, photos, capsys):

@@ -122,3 +122,43 @@ def test_labels_find_photos_without_suffix_and_in_other_folders(old, new, path):
 def test_a_disabled_camera_is_left_out(path):
     edit(path, 'label="0002.png"', 'label="0002.png" enabled="false"')
     assert len(read(path).views) == 2
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        '<property name="rolling_shutter" value="true"/>'
+        '<property name="rolling_shutter_flags" value="63"/>',
+        '<property name="rolling_shutter" value="1"/>',
+        "<rolling_shutter>true</rolling_shutter>",
+    ],
+)
+def test_a_rolling_shutter_is_refused_with_the_way_out(told, path):
+    """Its poses are those of one row of each photo, the others have other ones."""
+    edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
+    with pytest.raises(metashape.UserError, match="rolling shutter") as caught:
+        read(path)
+    assert caught.value.where.endswith("sensors.sensor[0].rolling_shutter")
+    assert "compensation to Disabled" in caught.value.todo
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        '<property name="rolling_shutter" value="false"/>'
+        '<property name="rolling_shutter_flags" value="63"/>',
+        '<property name="rolling_shutter_flags" value="3"/>',
+        '<property name="rolling_shutter" value="Disabled"/>',
+        "<rolling_shutter/>",
+    ],
+)
+def test_a_rolling_shutter_that_is_not_compensated_is_read(told, path):
+    before = [view.camera.world_to_camera.tolist() for view in read(path).views]
+    edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
+    assert [view.camera.world_to_camera.tolist() for view in read(path).views] == before
+
+
+def test_a_rolling_shutter_of_no_photo_is_nobody_s(path):
+    other = '<sensor id="77" type="frame"><property name="rolling_shutter" value="true"/></sensor>'
+    edit(path, r"</sensors>", f"{other}</sensors>")
+    assert len(read(path).views) == 3

@@ -10,6 +10,10 @@ import torch
 from PIL import Image
 
 from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.errors import UserError
+from crossgrad_plugins.readers._inside import Inside
+from crossgrad_plugins.readers._json import Fields
+from crossgrad_plugins.readers._transforms import read_lens
 from crossgrad_plugins.readers.nerfstudio import NerfstudioReader
 
 LENS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 11.0, "cy": 9.0, "w": 24, "h": 16}
@@ -47,6 +51,63 @@ def test_cameras_look_along_minus_z_with_y_up(tmp_path):
 def test_a_lens_is_that_of_the_frame_then_that_of_all(tmp_path):
     camera = read(write(tmp_path, {"fl_x": 40.0}, **LENS)).views[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40.0, 31.0, 11.0, 9.0)
+
+
+@pytest.mark.parametrize(
+    ("own", "shared", "focal"),
+    [
+        # The other way of the file is of another lens; 24 pixels at a right angle are 12 pixels.
+        ({"camera_angle_x": math.pi / 2}, {"fl_x": 30.0, "fl_y": 31.0}, (12.0, 12.0)),
+        ({"fl_x": 40.0}, {"camera_angle_x": 1.0, "camera_angle_y": 1.0}, (40.0, 40.0)),
+        (
+            {"camera_angle_x": math.pi / 2},
+            {"camera_angle_x": 1.0, "camera_angle_y": math.pi / 2, "fl_x": 30.0},
+            (12.0, 8.0),
+        ),
+        ({"fl_x": 40.0, "camera_angle_x": 1.0}, {"fl_y": 31.0}, (40.0, 40.0)),
+        # Without one of its own, a frame has that of the file, lengths first.
+        ({}, {"fl_x": 30.0, "camera_angle_x": 1.0}, (30.0, 30.0)),
+        # The same way completes it.
+        ({"fl_y": 41.0}, {"fl_x": 30.0, "fl_y": 31.0}, (30.0, 41.0)),
+    ],
+)
+def test_a_focal_length_of_a_frame_is_not_completed_in_another_way(own, shared, focal, tmp_path):
+    camera = read(write(tmp_path, own, **{"w": 24, "h": 16, **shared})).views[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx(focal)
+
+
+def test_half_a_focal_length_of_a_frame_is_an_error_of_the_frame(tmp_path):
+    with pytest.raises(UserError, match="a field of the scene") as caught:
+        read(write(tmp_path, {"fl_y": 40.0}, camera_angle_x=1.0))
+    assert caught.value.where.endswith("transforms.json: frames[0].fl_x")
+
+
+@pytest.mark.parametrize(
+    ("own", "shared", "model", "terms"),
+    [
+        ({"k1": 0.1}, {"distortion_params": [0.5] * 6}, "OPENCV", (0.1, 0, 0, 0)),
+        ({"distortion_params": [0.1] + [0] * 5}, {"k1": 0.5}, "OPENCV", (0.1, 0, 0, 0)),
+        ({"k1": 0.1}, {"k1": 0.5, "k2": 0.2}, "OPENCV", (0.1, 0.2, 0, 0)),
+        ({"k1": 0.0}, {"distortion_params": [0.5] * 6}, "PINHOLE", ()),
+        ({}, {"k2": 0.1}, "OPENCV", (0, 0.1, 0, 0)),
+        # The kind of lens, and the terms that belong to it.
+        ({"camera_model": "OPENCV"}, {"is_fisheye": True, "k1": 0.5}, "PINHOLE", ()),
+        ({"is_fisheye": False, "k1": 0.1}, {"camera_model": "FISHEYE"}, "OPENCV", (0.1, 0, 0, 0)),
+        ({"is_fisheye": True}, {"camera_model": "OPENCV", "k1": 0.5}, "OPENCV_FISHEYE", (0,) * 4),
+        ({"camera_model": "PINHOLE"}, {"k1": 0.1}, "OPENCV", (0.1, 0, 0, 0)),
+        ({"is_fisheye": True}, {"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
+    ],
+)
+def test_distortion_of_a_frame_is_not_completed_in_another_way(own, shared, model, terms, tmp_path):
+    frame, whole = (Fields(each, tmp_path / "transforms.json") for each in (own, LENS | shared))
+    lens = read_lens(Inside(tmp_path), frame, whole, "a.png")
+    assert (lens.model, lens.params[4:]) == (model, terms)
+
+
+def test_a_360_degree_camera_is_refused_whatever_a_frame_says_of_fisheyes(tmp_path):
+    path = write(tmp_path, {"is_fisheye": False}, camera_model="EQUIRECTANGULAR", **LENS)
+    with pytest.raises(UserError, match="cannot be undistorted"):
+        read(path)
 
 
 def test_what_a_file_leaves_out_comes_from_the_photo(tmp_path):
@@ -104,6 +165,51 @@ def test_lists_of_the_file_are_the_split(lists, held_out, tmp_path):
     scene = read(write(tmp_path, **LENS, **names), split="auto")
     assert [view.name for view in scene.test_views] == held_out
     assert len(scene.train) == len(lists["train"])
+
+
+def test_lists_may_leave_out_suffixes_as_frames_may(tmp_path):
+    names = {"train_filenames": ["images/a", "images/b.png"], "test_filenames": ["images/c"]}
+    scene = read(write(tmp_path, **LENS, **names), split="auto")
+    assert [view.name for view in scene.train_views] == ["a.png", "b.png"]
+    assert [view.name for view in scene.test_views] == ["c.png"]
+
+
+@pytest.mark.parametrize(
+    ("lists", "what", "where"),
+    [
+        ({"train": ["images/z.png"]}, "no name of a list", "transforms.json: train_filenames"),
+        ({"train": []}, "no name of a list", "transforms.json: train_filenames"),
+        (
+            {"train": ["images/a.png"], "val": ["images/d"]},
+            "no name of a list",
+            "transforms.json: val_filenames",
+        ),
+        (
+            {"train": ["images/a.png"], "test": ["images/a"]},
+            "for training and for testing",
+            "transforms.json: train_filenames and test_filenames",
+        ),
+    ],
+)
+def test_lists_that_cannot_be_name_their_file_and_field(lists, what, where, tmp_path):
+    path = write(tmp_path, **LENS, **{f"{part}_filenames": names for part, names in lists.items()})
+    with pytest.raises(UserError, match=what) as caught:
+        read(path, split="auto")
+    assert caught.value.where.endswith(where)
+    assert "--split every" in caught.value.todo
+    assert len(read(path, split="every").views) == 3
+    (path / "train_list.txt").write_text("a.png\nb.png\n")
+    assert len(read(path, split="auto").train) == 2
+
+
+def test_photos_of_all_training_views_that_are_missing_are_no_fault_of_a_list_of_ours(tmp_path):
+    names = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
+    path = write(tmp_path, **LENS, **names)
+    (path / "images" / "a.png").unlink()
+    with pytest.raises(UserError, match="no listed view can be trained on") as caught:
+        read(path, split="auto")
+    assert caught.value.where == str(path)
+    assert "add the photos" in caught.value.todo
 
 
 def test_an_applied_transform_is_undone(tmp_path):

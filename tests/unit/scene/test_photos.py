@@ -10,6 +10,7 @@ from PIL import Image
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
+from crossgrad_core.scene.shapes import is_turned
 
 RNG = np.random.default_rng(0)
 RGB = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -95,6 +96,35 @@ def test_a_photo_and_its_mask_are_turned_upright(source, tmp_path):
     upright_mask[7, 34] = 255
     _, keep = replace(turned, mask=save_mask(tmp_path, upright_mask)).decode()
     assert keep.nonzero().tolist() == [[7, 34]]
+
+
+def test_a_mask_of_the_stored_photo_is_turned_in_any_size(source, tmp_path):
+    mask = np.zeros((20, 30), dtype=np.uint8)
+    mask[:, :15] = 255  # The left half, which comes to lie above.
+    turned = replace(
+        source, width=40, height=60, orientation=6, target=(40, 60), mask=save_mask(tmp_path, mask)
+    )
+    _, keep = turned.decode()
+    assert keep[:30].all() and not keep[30:].any()
+
+
+@pytest.mark.parametrize(
+    ("mask", "turned"),
+    [
+        ((60, 40), False),
+        ((40, 60), True),
+        ((30, 20), False),
+        ((20, 30), True),
+        ((21, 30), True),
+        ((40, 40), None),
+        ((50, 50), None),
+    ],
+)
+def test_masks_in_the_proportion_of_the_photo_or_of_the_turned_one(mask, turned):
+    assert is_turned(mask, (60, 40)) is turned
+    assert is_turned((50, 50), (50, 50)) is False
+    # Exact sizes tell first.
+    assert is_turned((100, 101), (101, 100)) is True
 
 
 def test_masks_are_undistorted_with_the_photo(source, tmp_path):

@@ -175,7 +175,7 @@ SCENE = Target(
         _colmap_folder: ("check_scene_folder", "_check_not_within_sparse", "_similar_folder"),
         build: (),
         photo_files: ("find_mask", "find_mask_folder", "check_masks", "find_photo_folders"),
-        choose_photos: ("_check_mask", "_find_masks", "_prefer_reduced"),
+        choose_photos: ("_find_masks", "_prefer_reduced"),
     },
     words=(
         b"0000.png",
