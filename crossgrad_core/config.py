@@ -231,6 +231,14 @@ class RunConfig(BaseModel):
         description="Evaluate and export the average of the parameters of the last share of the "
         "steps. Default: 0.",
     )
+    dropout: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
+        None,
+        ge=0,
+        le=0.9,
+        description="Share of the Gaussians that each training view is drawn without. Default: "
+        f"{defaults.DROPOUT} where a point lies in at most {defaults.FEW_PHOTOS} training photos, "
+        "as most do; else, and with --preset inria, 0.",
+    )
     device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
         "cpu", description="Where tensors live. Default: cpu."
     )

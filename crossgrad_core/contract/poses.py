@@ -36,7 +36,8 @@ def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int6
     """
     depths = _in_front(camera, points[seen])[:, 2]
     if len(depths) < _FEWEST_SEEN:
-        inside = _in_image(camera, points[:: max(1, len(points) // _MOST_TESTED)])[:, 2]
+        tested = points[:: max(1, len(points) // _MOST_TESTED)]
+        inside = camera.local(tested[is_in_image(camera, tested)])[:, 2]
         depths = inside if len(inside) else depths
     if not len(depths):
         return float("nan")
@@ -48,8 +49,10 @@ def _in_front(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64
     return local[local[:, 2] > 0.0]
 
 
-def _in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    local = _in_front(camera, points)
-    x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    return local[(x >= 0.0) & (x < camera.width) & (y >= 0.0) & (y < camera.height)]
+def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[P] whether a camera has points [P, 3] of the local frame in its image, seen or hidden."""
+    local = camera.local(points)
+    front = local[:, 2] > 0.0
+    depth = np.where(front, local[:, 2], 1.0)
+    x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
+    return np.asarray(front & (x >= 0.0) & (x < camera.width) & (y >= 0.0) & (y < camera.height))

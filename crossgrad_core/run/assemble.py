@@ -46,6 +46,7 @@ from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_views import operator_of, usual_views
 from crossgrad_core.training.adam.coefficients import MOST_VIEWS
+from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.rngs import make_streams
@@ -175,7 +176,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     answers = manager.hook.crossgrad_objections(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
-    config = _with_steps(config, selection.views)
+    config = with_dropout(_with_steps(config, selection.views), scene, notes)
     counting = counting_of(
         config,
         selection.views,

@@ -8,11 +8,11 @@ import numpy as np
 
 STREAMS = (
     "create", "grouping", "sampler", "operator", "densifier", "after_step", "regularize",
-    "background", "resolution", "density",
+    "background", "resolution", "density", "dropout",
 )  # fmt: skip
 
 #: Those that came after 0.1, whose checkpoints lack them: they start anew.
-_LATER = frozenset({"resolution", "density"})
+_LATER = frozenset({"resolution", "density", "dropout"})
 
 
 def make_streams(seed: int, rewinds: int = 0) -> dict[str, np.random.Generator]:

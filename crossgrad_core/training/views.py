@@ -29,6 +29,7 @@ from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.manager import call_seam
+from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import Leaves, leaves_of
@@ -234,7 +235,7 @@ def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: floa
     target = target_at(setup, state, draw.views[slot], scale)
     background = background_of(setup, state)
     state.laps.lap("photos")
-    gaussians = _seen(setup, state, target.camera)
+    gaussians = dropped(setup, state, _seen(setup, state, target.camera))
     state.laps.lap("decode")
     return _Prepared(slot, target, background, gaussians)
 

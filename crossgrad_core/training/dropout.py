@@ -1,0 +1,64 @@
+"""Gaussians left out of training views at random, so that few photos are not learnt by heart.
+
+Source: DropGaussian (Park et al. 2025), whose share grows with the steps; that it stays, and where
+it is used, is ours (docs/few-photos.md).
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.poses import is_in_image
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.defaults import DROPOUT, FEW_PHOTOS
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+#: The random stream of what is left out.
+STREAM: Final = "dropout"
+#: Points that are looked at, spread over all.
+_POINTS: Final = 1000
+
+
+def with_dropout(config: RunConfig, scene: Scene, notes: list[str]) -> RunConfig:
+    """The configuration with the share that each training view is drawn without.
+
+    Args:
+        config: The configuration.
+        scene: Its scene.
+        notes: Gets a line where that was decided here and is not 0.
+    """
+    if config.dropout is not None:
+        return config
+    photos = 0.0 if config.preset == "inria" else photos_per_point(scene)
+    few = 0.0 < photos <= FEW_PHOTOS
+    if few:
+        notes.append(
+            f"dropout: a point lies in {photos:g} of {len(scene.train)} training photos (median), "
+            f"each of which is drawn without {DROPOUT:.0%} of the Gaussians (--dropout 0: with all)"
+        )
+    return config.model_copy(update={"dropout": DROPOUT if few else 0.0})
+
+
+def photos_per_point(scene: Scene) -> float:
+    """In how many training photos an SfM point lies, seen or hidden: the median; 0 without any."""
+    points = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
+    counts = np.zeros(len(points), np.int64)
+    for view in scene.train_views:
+        counts += is_in_image(view.camera, points)
+    shown = counts[counts > 0]
+    return float(np.median(shown)) if len(shown) else 0.0
+
+
+def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
+    """What a training view is drawn from: the others are as much more opaque for it."""
+    share = setup.config.dropout
+    if not share:
+        return gaussians
+    kept = state.rngs[STREAM].random(len(gaussians), dtype=np.float32) >= share
+    factors = torch.from_numpy(kept / np.float32(1.0 - share)).to(gaussians.opacities.device)
+    return replace(gaussians, opacities=(gaussians.opacities * factors).clamp(max=1.0))

@@ -1,0 +1,120 @@
+"""Gaussians that training views are drawn without."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.contexts import Draw
+from crossgrad_core.defaults import DROPOUT, FEW_PHOTOS
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.migration import migrated
+from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.training.dropout import dropped, photos_per_point
+from crossgrad_core.training.on_request import OnRequest
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.step import take_step
+from crossgrad_core.training.views import render_views
+
+
+def setup_of(scene=None, **given):
+    config = RunConfig.model_validate({"steps": 12, "rasterizer": {"name": "torch"}, **given})
+    return assemble(config, scene or sample_scene(), "colmap")
+
+
+def decoded(setup, state):
+    camera = setup.train_views[0].camera
+    return setup.backbone.decode(state.parameters, camera, setup.phase(1, training=True))
+
+
+def with_photos(count):
+    """The scene with so many training photos, all of which show its points."""
+    scene = sample_scene()
+    return replace(scene, train=tuple(scene.train[0] for _ in range(count)))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
+def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
+    setup = setup_of(dropout=share)
+    state = first_state(setup)
+    whole = decoded(setup, state)
+    raised, shares = (whole.opacities / (1.0 - share)).clamp(max=1.0), []
+    for _ in range(200):
+        part = dropped(setup, state, whole)
+        left_out = part.opacities == 0.0
+        torch.testing.assert_close(part.opacities[~left_out], raised[~left_out])
+        shares.append(left_out.float().mean().item())
+        assert part.means is whole.means
+    error = 4.0 * np.sqrt(share * (1.0 - share) / (200 * len(whole)))
+    assert np.mean(shares) == pytest.approx(share, abs=error)
+
+
+def test_no_share_is_no_change_and_no_draw():
+    setup = setup_of(dropout=0.0)
+    state = first_state(setup)
+    whole, before = decoded(setup, state), state.rngs["dropout"].bit_generator.state
+    assert dropped(setup, state, whole) is whole
+    assert state.rngs["dropout"].bit_generator.state == before
+
+
+def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
+    setup = setup_of(dropout=0.5)
+    state = first_state(setup)
+    rendered, _ = render_views(setup, state, Draw((0,)), (1.0,))
+    left_out = rendered.records[0].gaussians.opacities == 0.0
+    assert 0 < int(left_out.sum()) < len(left_out)
+    part = dropped(setup, state, decoded(setup, state))
+    (gradient,) = torch.autograd.grad(part.opacities.sum(), [state.parameters["opacities"]])
+    assert torch.equal(gradient == 0.0, part.opacities == 0.0)
+    asked = OnRequest(setup, state, counted=False)(0)
+    assert torch.equal(asked.gaussians.opacities, decoded(setup, state).opacities)
+
+
+@pytest.mark.parametrize(
+    ("photos", "given", "share"),
+    [
+        (FEW_PHOTOS, {}, DROPOUT),
+        (FEW_PHOTOS + 1, {}, 0.0),
+        (FEW_PHOTOS, {"preset": "inria"}, 0.0),
+        (FEW_PHOTOS, {"dropout": 0.0}, 0.0),
+        (FEW_PHOTOS + 1, {"dropout": 0.2}, 0.2),
+        (1, {"preset": "inria", "dropout": 0.2}, 0.2),
+    ],
+)
+def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share):
+    setup = setup_of(with_photos(photos), **given)
+    assert resolved(setup).dropout == share
+    noted = [note for note in setup.notes if note.startswith("dropout")]
+    assert len(noted) == (share > 0.0 and "dropout" not in given)
+
+
+def test_a_run_goes_on_with_the_same_bits():
+    setup = setup_of(dropout=0.3)
+    whole = first_state(setup)
+    for _ in range(5):
+        take_step(setup, whole)
+    part = from_checkpoint(setup, to_checkpoint(whole))
+    for _ in range(5):
+        take_step(setup, whole)
+        take_step(setup, part)
+    assert all(torch.equal(part.parameters[n], t) for n, t in whole.parameters.items())
+
+
+def test_photos_of_a_point_are_those_in_whose_image_it_lies():
+    points = [(0.0, 5.0, 0.0), (0.1, 5.0, 0.0), (0.0, 5.0, 0.1), (0.0, -5.0, 0.0), (90.0, 1.0, 0.0)]
+    ahead = [posed_view((0, 0, 0), f"{i}.png") for i in range(3)]
+    behind = [posed_view((0, 0, 0), "b.png", forward=(0, -1, 0))]
+    scene = posed_scene([*ahead, *behind], points)
+    # Three points lie in three photos, one in one, and one in none, which does not count.
+    assert photos_per_point(scene) == 3.0
+    assert photos_per_point(posed_scene(ahead)) == 0.0
+
+
+def test_runs_of_before_go_on_without(tmp_path):
+    assert migrated({"revisions": []}, tmp_path)["dropout"] == 0.0
+    assert "dropout" not in migrated({}, tmp_path)
