@@ -1,7 +1,7 @@
 """Evaluation, renders and exports of a run that was trained."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -208,18 +208,18 @@ def render(
         on: The other capture, whose views are drawn instead; see `evaluated_on`.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, the split is empty, or it is training and no
-            other folder is named; see also `elsewhere`.
+        UserError: It is no run, it has no checkpoint, the split is empty, the named folder holds a
+            picture of that name, or it is training and none is named; see also `elsewhere`.
     """
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
         setup, state = how.open(folder)
         scene, draw = setup.scene, renderer(setup, state)
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+        own = folder_of(folder, state.step)
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
-            own = folder_of(folder, state.step) / f"on_{ending(there.name)}"
-            views, out = there.views, out or own
+            views, own = there.views, own / f"on_{ending(there.name)}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -227,8 +227,9 @@ def render(
                 todo="choose another --split: train, test or all",
             )
         writer = PanelWriter.of(folder, state.step, views, len(views))
+        writer = replace(writer, folder=out or own)
         if out is not None:
-            writer = replace(writer, folder=out)
+            _check_all_new(out / f"{file}.png" for file in writer.files.values())
         measured(views, draw, setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
@@ -252,7 +253,8 @@ def fly(
 
     Raises:
         UserError: See `flight`; or it is no run, it has no checkpoint, it is training and no other
-            folder is named, the named one holds a film, or there are frames for a path from a file.
+            folder is named, the named one holds a film or such frames, or there are frames for a
+            path from a file.
     """
     if frames is not None and path != LADDER:
         raise UserError(
@@ -262,10 +264,11 @@ def fly(
         )
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
-        for film in () if out is None else film_files(out):
-            _check_new(film)
+        _check_all_new(() if out is None else film_files(out))
         setup, state = how.open(folder)
         along = flight(setup.scene, path, frames or FRAMES)
+        if out is not None:
+            _check_all_new(out / f"{number:05d}.png" for number in range(len(along.cameras)))
         draw = camera_renderer(setup, state)
         out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
         with torch.no_grad():
@@ -337,8 +340,7 @@ def exported(
         find("exporters", file_format)
     with _writing(folder, out, "exporting"):
         if out is not None:
-            _check_new(out)
-            _check_new(georef_of(out))
+            _check_all_new((out, georef_of(out)))
             check_file(out)
         setup, state = how.open(folder)
         exporter = _exporter(setup, file_format)
@@ -351,7 +353,7 @@ def exported(
             path = out or folder / _own_name(folder, name, state.step)
         else:
             path = out or folder / name
-            _check_new(path)
+            _check_all_new((path,))
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
 
 
@@ -409,8 +411,8 @@ def _flat(setup: Setup, camera: str) -> str:
     return flat_names([view.name for view in setup.scene.views]).get(camera, "view")
 
 
-def _check_new(path: Path) -> None:
-    if path.exists():
+def _check_all_new(paths: Iterable[Path]) -> None:
+    if path := next((each for each in paths if each.exists()), None):
         raise UserError("the file exists", where=path, todo="choose another --out, or remove it")
 
 

@@ -116,6 +116,21 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
 
+def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp_path):
+    for name, draw in (
+        ("street__0001", lambda out: afterwards.render(finished, split="all", out=out)),
+        ("00001", lambda out: afterwards.fly(finished, "ladder", frames=2, out=out)),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / f"{name}.png").write_bytes(b"a photo of mine")
+        with pytest.raises(UserError, match="the file exists"):
+            draw(folder)
+        assert content(folder) == {f"{name}.png": b"a photo of mine"}
+    for _ in range(2):  # The run's own are drawn anew.
+        afterwards.render(finished, split="test", out=None)
+
+
 def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
     for look in (afterwards.evaluate, export):
         with pytest.raises(UserError, match="not the folder of a run"):
