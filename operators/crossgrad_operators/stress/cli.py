@@ -110,6 +110,8 @@ def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
     if csv is not None:
         check_file(csv)
+        if csv.exists():
+            raise UserError("the file exists", where=csv, todo="choose another --csv, or remove it")
     names = operators or installed()
     dtypes = (precision or Precision.BOTH).dtypes
     if search is not None:
