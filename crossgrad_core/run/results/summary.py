@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.metrics_csv import Row
@@ -121,6 +122,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "notes": list(summary.notes),
         "plan": None if summary.plan is None else dict(summary.plan),
         "definitions": _definitions(summary.result),
+        "falling": [each.name for each in _figures(summary.result) if each.falls],
         "environment": dict(summary.environment),
         "config": dict(summary.config),
     }
@@ -136,9 +138,12 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     }
 
 
+def _figures(result: EvaluationResult | None) -> tuple[Figure, ...]:
+    return () if result is None else result.figures
+
+
 def _definitions(result: EvaluationResult | None) -> dict[str, str]:
-    figures = () if result is None else result.figures
-    stated = {figure.name: figure.definition for figure in figures if figure.definition}
+    stated = {each.name: each.definition for each in _figures(result) if each.definition}
     return {**stated, "renders": RENDERS}
 
 

@@ -49,7 +49,11 @@ def quantities_of(
                          f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
         else:
             kept.append(key)
-    return tuple(Quantity.of(key, margin if key == name else None) for key in kept), notes
+    falling = {str(key) for run in runs for key in run.summary.get("falling") or ()}
+    found = (
+        Quantity.of(key, margin if key == name else None, falls=key in falling) for key in kept
+    )
+    return tuple(found), notes
 
 
 def _check_definition(runs: Sequence[Run], key: str) -> None:
