@@ -11,7 +11,7 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app
+from crossgrad_core.run import afterwards, app, opening
 from crossgrad_core.run.results.lock import locked
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
@@ -136,6 +136,15 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
         with pytest.raises(UserError, match="not the folder of a run"):
             look(tmp_path)
     assert content(tmp_path) == {}
+
+
+def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(finished, monkeypatch):
+    asked = []
+    monkeypatch.setattr(opening, "configure_threads", asked.append)
+    afterwards.evaluate(finished)
+    afterwards.evaluate(finished, afterwards.How(threads=2))
+    assert app.run({}, resume=finished, verbosity=-1) == 0
+    assert asked == [None, 2, 1]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")
