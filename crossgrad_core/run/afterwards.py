@@ -286,19 +286,7 @@ def export(
     coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Writes the trained scene to a file that viewers open, and prints what is in it.
-
-    Args:
-        folder: The run's folder.
-        file_format: See `exported`.
-        out: See `exported`.
-        camera: See `exported`.
-        coordinates: See `exported`.
-        how: How the run is opened.
-
-    Raises:
-        UserError: See `exported`.
-    """
+    """As `exported`; prints what is in the file."""
     path, content = exported(
         folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )

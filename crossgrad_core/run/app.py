@@ -47,6 +47,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
@@ -112,8 +113,8 @@ def run(
     Raises:
         UserError: The input is bad; nothing was written.
     """
+    way = Way(verbosity, _print_results, check)
     if resume is not None:
-        way = Way(verbosity, _print_results, check)
         return resumed(resume, settings, way, accept_scene=accept_scene).exit_code
     if accept_scene:
         raise UserError(
@@ -121,7 +122,6 @@ def run(
             where="--accept-scene",
             todo="leave it out, or name the run with --resume",
         )
-    way = Way(verbosity, _print_results, check)
     if dry_run:
         _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0
@@ -213,7 +213,15 @@ def with_defaults(config: RunConfig) -> RunConfig:
 
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
-    steps, note, share = steps_for(setup, seconds)
+    try:
+        steps, note, share = steps_for(setup, seconds)
+    except NonFiniteError as error:
+        raise UserError(
+            "training fails in the steps that are tried out to plan its length",
+            where="--seconds",
+            found=str(error),
+            todo="look at the settings, such as --rate-factor, and at the photos of these views",
+        ) from error
     update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
     config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
