@@ -37,6 +37,7 @@ from crossgrad_core.run.results.panel_names import ending, flat_names
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.scene_file import ACCEPTED
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
@@ -173,7 +174,7 @@ def evaluated_file(
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
-    """Evaluates the held-out views of a run again and renews per_view.csv.
+    """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
 
     The folder of a run that is training, and one that may not be written to, is only read.
 
@@ -186,7 +187,9 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         draw, points = renderer(setup, state), setup.scene.points
         result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
         if writes:
-            write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
+            name = _own_name(folder, PER_VIEW, state.step)
+            other = name.replace(".", "_accepted.")
+            write_per_view(folder, result, other if _is_changed(setup) else name)
         return result, totals(setup, state)
 
 
@@ -216,7 +219,7 @@ def render(
         setup, state = how.open(folder)
         scene, draw = setup.scene, renderer(setup, state)
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
-        own = folder_of(folder, state.step)
+        own = folder_of(folder, state.step) / ("accepted" if _is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
             views, own = there.views, own / f"on_{ending(there.name)}"
@@ -331,9 +334,15 @@ def exported(
             _check_all_new((out, georef_of(out)))
             check_file(out)
         setup, state = how.open(folder)
-        exporter = _exporter(setup, file_format)
-        if camera is not None:
-            _check_bakes(setup)
+        exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
+        if file_format not in {None, setup.selection.names["exporter"]}:
+            exporter = build(Exporter, str(file_format), {})
+        if camera is not None and setup.backbone.plain:
+            raise UserError(
+                f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+                where="--camera",
+                todo="leave it out: the file is the same for every view",
+            )
         words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
         words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]
         name = f"{'_'.join(words)}.{exporter.suffix}"
@@ -343,13 +352,6 @@ def exported(
             path = out or folder / name
             _check_all_new((path,))
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
-
-
-def _exporter(setup: Setup, name: str | None) -> Exporter:
-    """The exporter of that name, with the run's own options where it is the run's."""
-    if name is None or name == setup.selection.names["exporter"]:
-        return setup.selection.exporter
-    return build(Exporter, name, {})
 
 
 @contextmanager
@@ -382,6 +384,11 @@ def _writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
         ) from error
 
 
+def _is_changed(setup: Setup) -> bool:
+    """Whether the scene is not that of the run: what summary.json describes is left alone."""
+    return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
+
+
 def _own_name(folder: Path, name: str, step: int) -> str:
     """A file name for results of a step, other than that of a file which describes another one.
 
@@ -402,12 +409,3 @@ def _flat(setup: Setup, camera: str) -> str:
 def _check_all_new(paths: Iterable[Path]) -> None:
     if path := next((each for each in paths if each.exists()), None):
         raise UserError("the file exists", where=path, todo="choose another --out, or remove it")
-
-
-def _check_bakes(setup: Setup) -> None:
-    if setup.backbone.plain:
-        raise UserError(
-            f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
-            where="--camera",
-            todo="leave it out: the file is the same for every view",
-        )
