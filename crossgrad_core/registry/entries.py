@@ -146,10 +146,9 @@ def resolve_entry(entry: Entry) -> object:
 def failed_plugin(error: Exception) -> UserError | None:
     """What to say of an exception that came out of another package's code; None of our own."""
     for entry in (entry for slot in OFFERED for entry in offers(slot)):
-        package = f"{entry.distribution} {entry.version}"
         if entry.distribution != "crossgrad" and (place := raised_at(error, entry.package)):
             return UserError(
-                f"a plugin of {package} failed",
+                f"a plugin of {entry.distribution} {entry.version} failed",
                 where=place,
                 found=in_one_line(error),
                 todo=f"repair or uninstall {entry.distribution}, or choose other components",

@@ -190,7 +190,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
             name = _own_name(folder, PER_VIEW, state.step)
             other = name.replace(".", "_accepted.")
             write_per_view(folder, result, other if _is_changed(setup) else name)
-        return result, totals(setup, state)
+        return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
 
 
 def render(

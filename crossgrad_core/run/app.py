@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.assemble import DEFAULT_STEPS
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
@@ -19,6 +20,7 @@ from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
 from crossgrad_core.run.opening import continued, parsed, set_up
 from crossgrad_core.run.planning import seconds_of
+from crossgrad_core.run.reason import reason_of
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
@@ -47,7 +49,6 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
-from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
@@ -152,11 +153,12 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     setup, load_seconds = _checked(settings, way)
     config = setup.config
     check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
-    compile_seconds = warm_up(setup)
     length: Length = Forecast(Planned(config.revisions))
-    if config.seconds is not None:
-        setup = _within(setup, config.seconds)
-        length = Timed(config.seconds, config.clock)
+    with _tried_out():
+        compile_seconds = warm_up(setup)
+        if config.seconds is not None:
+            setup = _within(setup, config.seconds)
+            length = Timed(config.seconds, config.clock)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
     setup = replace(setup, notes=(*setup.notes, *told_of_start(state)))
@@ -211,17 +213,24 @@ def with_defaults(config: RunConfig) -> RunConfig:
     return config
 
 
+@contextmanager
+def _tried_out() -> Iterator[None]:
+    """Words an error in steps that load kernels or plan a length, before anything is written."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, UserError) or failed_plugin(error):
+            raise
+        raise UserError(
+            "a step that was tried out before the training failed",
+            found=reason_of(error),
+            todo="look at settings, such as --rate-factor and --loss, and at the photos",
+        ) from error
+
+
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
-    try:
-        steps, note, share = steps_for(setup, seconds)
-    except NonFiniteError as error:
-        raise UserError(
-            "training fails in the steps that are tried out to plan its length",
-            where="--seconds",
-            found=str(error),
-            todo="look at the settings, such as --rate-factor, and at the photos of these views",
-        ) from error
+    steps, note, share = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
     config = setup.config.model_copy(update=update)
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
@@ -316,7 +325,8 @@ def resumed(
             )
         if step < total:
             state.clock.load += _decoded(setup, way)
-            state.clock.compile += warm_up(setup, state)
+            with _tried_out():
+                state.clock.compile += warm_up(setup, state)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))

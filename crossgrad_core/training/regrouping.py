@@ -30,11 +30,7 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
 
 
 def labels_of(rule: Rule, scene: Scene, name: str) -> tuple[str, ...]:
-    """The labels of the training views by the rule of the grouping of that name.
-
-    Raises:
-        UserError: They are more or fewer than there are views.
-    """
+    """The labels of the training views by the rule of the grouping of that name, one for each."""
     labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
     if len(labels) == len(views):
         return labels

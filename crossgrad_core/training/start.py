@@ -1,7 +1,6 @@
 """The first state of a run, and compiling what it needs."""
 
 import logging
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from time import perf_counter
@@ -19,7 +18,6 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training import photo_parameters
 from crossgrad_core.training.compile_ahead import compiling_beside
-from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
@@ -168,11 +166,10 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
             if step < schedule.total:
                 state = first_state(setup) if reached is None else deepcopy(reached)
                 state.step = step
-                with suppress(NonFiniteError):  # The run itself says so.
+                timed_step(setup, state)
+                if setup.by_rows and step == steps[0] and step + 1 < schedule.total:
+                    # Rows are behind from the second step on.
                     timed_step(setup, state)
-                    if setup.by_rows and step == steps[0] and step + 1 < schedule.total:
-                        # Rows are behind from the second step on.
-                        timed_step(setup, state)
     seconds = perf_counter() - start
     _LOG.debug("loaded kernels in %.1f s", seconds)
     return seconds

@@ -138,6 +138,12 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
     assert content(tmp_path) == {}
 
 
+def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsys):
+    afterwards.evaluate(finished)
+    said = capsys.readouterr().out
+    assert "3 steps" in said and "memory" not in said
+
+
 def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(finished, monkeypatch):
     asked = []
     monkeypatch.setattr(opening, "configure_threads", asked.append)

@@ -109,6 +109,7 @@ def summarised_step(folder: Path, status: Status | None = None) -> int | None:
 
 
 def _as_data(summary: Summary) -> dict[str, Any]:
+    figures = () if summary.result is None else summary.result.figures
     return {
         "status": summary.status,
         "error": summary.error,
@@ -121,8 +122,8 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
         "plan": None if summary.plan is None else dict(summary.plan),
-        "definitions": _definitions(summary.result),
-        "falling": [each.name for each in _figures(summary.result) if each.falls],
+        "definitions": _definitions(figures),
+        "falling": [each.name for each in figures if each.falls],
         "environment": dict(summary.environment),
         "config": dict(summary.config),
     }
@@ -138,12 +139,8 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     }
 
 
-def _figures(result: EvaluationResult | None) -> tuple[Figure, ...]:
-    return () if result is None else result.figures
-
-
-def _definitions(result: EvaluationResult | None) -> dict[str, str]:
-    stated = {each.name: each.definition for each in _figures(result) if each.definition}
+def _definitions(figures: Sequence[Figure]) -> dict[str, str]:
+    stated = {each.name: each.definition for each in figures if each.definition}
     return {**stated, "renders": RENDERS}
 
 
