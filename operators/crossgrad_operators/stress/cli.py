@@ -148,6 +148,13 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     from crossgrad_operators.stress.suite import run_suite
 
     chosen = [each for each in cases(large=elements) if (case or "") in each.name]
+    if not chosen:
+        raise UserError(
+            "no case has this in its name",
+            where=f"--case {case}",
+            expected=f"a part of {', '.join(each.name for each in cases(large=elements))}",
+            todo="leave it out to run all of them",
+        )
     return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
 
 

@@ -78,6 +78,15 @@ def test_a_run_says_of_which_figures_less_is_better(tmp_path):
     assert [each.favours for each in found.ends] == ["views=2"]
 
 
+def test_runs_without_held_out_photos_are_refused_for_that(tmp_path):
+    path = RunFolder().write(tmp_path / "run") / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["overall"] = {"views": 0, "psnr": None, "ssim": None}
+    path.write_text(json.dumps(summary))
+    with pytest.raises(UserError, match="none of them held a photo out"):
+        compared(read_runs([tmp_path], skip_broken=False), Options())
+
+
 def test_figures_of_other_metrics_are_left_out_with_a_note(tmp_path):
     found = comparison(tmp_path, RunFolder(), RunFolder(seed=1, definitions={"ssim": "other"}))
     assert [quantity.name for quantity in found.quantities] == ["psnr"]

@@ -118,6 +118,11 @@ def test_no_table_is_overwritten(tmp_path, capsys):
     assert "the file exists" in capsys.readouterr().err and table.read_text() == "mine"
 
 
+def test_a_case_that_there_is_not_is_refused(capsys):
+    assert ended("stress", "symmetric", "--case", "nosuch", "--elements", "1000") == 2
+    assert "no case has this in its name" in capsys.readouterr().err
+
+
 def test_the_command_tells_by_its_exit_status(monkeypatch):
     from crossgrad_core.cli.main import app
     from crossgrad_operators.stress import suite
