@@ -129,7 +129,7 @@ class RunConfig(BaseModel):
         "Default: the sampler's, or the fewest that give the operator something to do.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING)] = Field(
-        None, ge=1, description="Optimizer steps; every schedule stretches with them."
+        None, ge=1, description="Optimizer steps; schedules stretch with them. Default: 30000."
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None, ge=1, description="Length of the run in views: as many steps as draw them."
@@ -264,11 +264,11 @@ class RunConfig(BaseModel):
         "split, else, and where --max-gaussians is a number, free.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
-        None, ge=1, description="Steps between evaluations."
+        None, ge=1, description="Steps between evaluations. Default: a tenth of the run."
     )
     eval_from: int = Field(0, ge=0, description="no evaluation before this step")
     save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
-        None, ge=1, description="Steps between checkpoints."
+        None, ge=1, description="Steps between checkpoints. Default: a fifth of the run."
     )
     stop_after: Annotated[int | None, Flag("STEP", RESULTS)] = Field(
         None, ge=1, description="Stops after this step with a checkpoint; --resume continues."

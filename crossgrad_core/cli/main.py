@@ -12,6 +12,7 @@ from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.startup import finish
 from crossgrad_core.system.version import VERSION
@@ -69,9 +70,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         # Not `app()`, which would replace `sys.excepthook`.
         get_command(app)(args=arguments, prog_name="crossgrad")
-    except UserError as error:
+    except Exception as error:
+        told = error if isinstance(error, UserError) else failed_plugin(error)
+        if told is None:  # Our own mistakes keep their traceback.
+            raise
         finish()
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {told}", err=True)
         sys.exit(BAD_INPUT)
     finally:
         finish()

@@ -14,6 +14,7 @@ class Figure:
         per_regime: Whether metrics.csv has a column of it for every regime.
         definition: How it is computed, for summary.json; empty where the name says it all.
         undefined: Why a view that has pixels to compare may have none.
+        falls: Whether less of it is better.
     """
 
     name: str
@@ -22,6 +23,7 @@ class Figure:
     per_regime: bool = False
     definition: str = ""
     undefined: str = "not defined for these views"
+    falls: bool = False
 
     def column(self, regime: str) -> str:
         """Its column in metrics.csv for one regime."""

@@ -61,7 +61,9 @@ def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = Non
 
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
-    values = {metric.figure.name: metric.measure(compared) for metric in metrics}
+    found = {metric.figure.name: metric.measure(compared) for metric in metrics}
+    # Of a tensor, say, files would hold the text.
+    values = {name: None if value is None else float(value) for name, value in found.items()}
     view, mask = compared.view, compared.mask
     masked = mask is not None and not bool(mask.any())
     return ViewMetrics(view.name, view.regime, values, masked)

@@ -42,9 +42,7 @@ def configure_threads(n: int | None = None) -> int:
             where="threads",
             expected=f"1 to {most}",
             found=str(n),
-            todo=f"set NUMBA_NUM_THREADS={n} before the start to allow more"
-            if n > most
-            else "leave --threads out to use all cores",
+            todo=f"say --threads {most}, or set NUMBA_NUM_THREADS={n} before the start",
         )
     _prefer_openmp()
     keep_freed_memory()

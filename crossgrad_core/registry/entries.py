@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
 from inspect import isabstract
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
@@ -27,23 +27,6 @@ if TYPE_CHECKING:
 
     #: The base class of a slot.
     C = TypeVar("C", bound=Component)
-
-_BASES: Final[dict[str, str]] = {
-    "backbones": "crossgrad_core.contract.backbone:Backbone",
-    "samplers": "crossgrad_core.contract.sampler:Sampler",
-    "groupings": "crossgrad_core.contract.grouping:Grouping",
-    "operators": "crossgrad_core.contract.operator:Operator",
-    "densifiers": "crossgrad_core.contract.densifier:Densifier",
-    "rasterizers": "crossgrad_core.contract.rasterizer:Rasterizer",
-    "losses": "crossgrad_core.contract.loss:Loss",
-    "exposures": "crossgrad_core.contract.exposure:Exposure",
-    "starts": "crossgrad_core.contract.start:Start",
-    "resolutions": "crossgrad_core.contract.resolution:Resolution",
-    "readers": "crossgrad_core.contract.reader:Reader",
-    "exporters": "crossgrad_core.contract.exporter:Exporter",
-    "metrics": "crossgrad_core.contract.metric:Metric",
-    "observers": "crossgrad_core.contract.observer:Observer",
-}
 
 
 @dataclass(frozen=True)
@@ -146,7 +129,7 @@ def resolve_entry(entry: Entry) -> object:
         return _resolve(entry.value)
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         place = raised_at(error, entry.package)
         others = COMMANDS if entry.slot == COMMANDS else "runs"
         raise UserError(
@@ -158,6 +141,19 @@ def resolve_entry(entry: Entry) -> object:
                 f"repair or uninstall {entry.distribution}; other {others} are not affected",
             ),
         ) from error
+
+
+def failed_plugin(error: Exception) -> UserError | None:
+    """What to say of an exception that came out of another package's code; None of our own."""
+    for entry in (entry for slot in OFFERED for entry in offers(slot)):
+        if entry.distribution != "crossgrad" and (place := raised_at(error, entry.package)):
+            return UserError(
+                f"a plugin of {entry.distribution} {entry.version} failed",
+                where=place,
+                found=in_one_line(error),
+                todo=f"repair or uninstall {entry.distribution}, or choose other components",
+            )
+    return None
 
 
 @overload
@@ -253,7 +249,8 @@ def _resolve(value: str) -> object:
 
 
 def _checked(entry: Entry, found: object) -> "type[Component]":
-    base = cast("type[Component]", _resolve(_BASES[entry.slot]))
+    word = singular(entry.slot)
+    base = cast("type[Component]", _resolve(f"crossgrad_core.contract.{word}:{word.capitalize()}"))
     if not (isinstance(found, type) and issubclass(found, base)):
         raise _wrong_kind(entry, base, f"{found!r}")
     if change := change_of(entry.slot, found):

@@ -1,7 +1,7 @@
 """Evaluation, renders and exports of a run that was trained."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,6 +37,7 @@ from crossgrad_core.run.results.panel_names import ending, flat_names
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.scene_file import ACCEPTED
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
@@ -173,7 +174,7 @@ def evaluated_file(
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
-    """Evaluates the held-out views of a run again and renews per_view.csv.
+    """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
 
     The folder of a run that is training, and one that may not be written to, is only read.
 
@@ -186,8 +187,10 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         draw, points = renderer(setup, state), setup.scene.points
         result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
         if writes:
-            write_per_view(folder, result, _own_name(folder, PER_VIEW, state.step))
-        return result, totals(setup, state)
+            name = _own_name(folder, PER_VIEW, state.step)
+            other = name.replace(".", "_accepted.")
+            write_per_view(folder, result, other if _is_changed(setup) else name)
+        return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
 
 
 def render(
@@ -208,18 +211,18 @@ def render(
         on: The other capture, whose views are drawn instead; see `evaluated_on`.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, the split is empty, or it is training and no
-            other folder is named; see also `elsewhere`.
+        UserError: It is no run, it has no checkpoint, the split is empty, the named folder holds a
+            picture of that name, or it is training and none is named; see also `elsewhere`.
     """
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
         setup, state = how.open(folder)
         scene, draw = setup.scene, renderer(setup, state)
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+        own = folder_of(folder, state.step) / ("accepted" if _is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
-            own = folder_of(folder, state.step) / f"on_{ending(there.name)}"
-            views, out = there.views, out or own
+            views, own = there.views, own / f"on_{ending(there.name)}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -227,8 +230,9 @@ def render(
                 todo="choose another --split: train, test or all",
             )
         writer = PanelWriter.of(folder, state.step, views, len(views))
+        writer = replace(writer, folder=out or own)
         if out is not None:
-            writer = replace(writer, folder=out)
+            _check_all_new(out / f"{file}.png" for file in writer.files.values())
         measured(views, draw, setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
@@ -252,7 +256,8 @@ def fly(
 
     Raises:
         UserError: See `flight`; or it is no run, it has no checkpoint, it is training and no other
-            folder is named, the named one holds a film, or there are frames for a path from a file.
+            folder is named, the named one holds a film or such frames, or there are frames for a
+            path from a file.
     """
     if frames is not None and path != LADDER:
         raise UserError(
@@ -262,10 +267,11 @@ def fly(
         )
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
-        for film in () if out is None else film_files(out):
-            _check_new(film)
+        _check_all_new(() if out is None else film_files(out))
         setup, state = how.open(folder)
         along = flight(setup.scene, path, frames or FRAMES)
+        if out is not None:
+            _check_all_new(out / f"{number:05d}.png" for number in range(len(along.cameras)))
         draw = camera_renderer(setup, state)
         out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
         with torch.no_grad():
@@ -283,19 +289,7 @@ def export(
     coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Writes the trained scene to a file that viewers open, and prints what is in it.
-
-    Args:
-        folder: The run's folder.
-        file_format: See `exported`.
-        out: See `exported`.
-        camera: See `exported`.
-        coordinates: See `exported`.
-        how: How the run is opened.
-
-    Raises:
-        UserError: See `exported`.
-    """
+    """As `exported`; prints what is in the file."""
     path, content = exported(
         folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )
@@ -337,13 +331,18 @@ def exported(
         find("exporters", file_format)
     with _writing(folder, out, "exporting"):
         if out is not None:
-            _check_new(out)
-            _check_new(georef_of(out))
+            _check_all_new((out, georef_of(out)))
             check_file(out)
         setup, state = how.open(folder)
-        exporter = _exporter(setup, file_format)
-        if camera is not None:
-            _check_bakes(setup)
+        exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
+        if file_format not in {None, setup.selection.names["exporter"]}:
+            exporter = build(Exporter, str(file_format), {})
+        if camera is not None and setup.backbone.plain:
+            raise UserError(
+                f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+                where="--camera",
+                todo="leave it out: the file is the same for every view",
+            )
         words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
         words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]
         name = f"{'_'.join(words)}.{exporter.suffix}"
@@ -351,15 +350,8 @@ def exported(
             path = out or folder / _own_name(folder, name, state.step)
         else:
             path = out or folder / name
-            _check_new(path)
+            _check_all_new((path,))
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
-
-
-def _exporter(setup: Setup, name: str | None) -> Exporter:
-    """The exporter of that name, with the run's own options where it is the run's."""
-    if name is None or name == setup.selection.names["exporter"]:
-        return setup.selection.exporter
-    return build(Exporter, name, {})
 
 
 @contextmanager
@@ -392,6 +384,11 @@ def _writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
         ) from error
 
 
+def _is_changed(setup: Setup) -> bool:
+    """Whether the scene is not that of the run: what summary.json describes is left alone."""
+    return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
+
+
 def _own_name(folder: Path, name: str, step: int) -> str:
     """A file name for results of a step, other than that of a file which describes another one.
 
@@ -409,15 +406,6 @@ def _flat(setup: Setup, camera: str) -> str:
     return flat_names([view.name for view in setup.scene.views]).get(camera, "view")
 
 
-def _check_new(path: Path) -> None:
-    if path.exists():
+def _check_all_new(paths: Iterable[Path]) -> None:
+    if path := next((each for each in paths if each.exists()), None):
         raise UserError("the file exists", where=path, todo="choose another --out, or remove it")
-
-
-def _check_bakes(setup: Setup) -> None:
-    if setup.backbone.plain:
-        raise UserError(
-            f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
-            where="--camera",
-            todo="leave it out: the file is the same for every view",
-        )

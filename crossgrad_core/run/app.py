@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.assemble import DEFAULT_STEPS
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
@@ -19,6 +20,7 @@ from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
 from crossgrad_core.run.opening import continued, parsed, set_up
 from crossgrad_core.run.planning import seconds_of
+from crossgrad_core.run.reason import reason_of
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
@@ -112,8 +114,8 @@ def run(
     Raises:
         UserError: The input is bad; nothing was written.
     """
+    way = Way(verbosity, _print_results, check)
     if resume is not None:
-        way = Way(verbosity, _print_results, check)
         return resumed(resume, settings, way, accept_scene=accept_scene).exit_code
     if accept_scene:
         raise UserError(
@@ -121,7 +123,6 @@ def run(
             where="--accept-scene",
             todo="leave it out, or name the run with --resume",
         )
-    way = Way(verbosity, _print_results, check)
     if dry_run:
         _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0
@@ -152,11 +153,12 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     setup, load_seconds = _checked(settings, way)
     config = setup.config
     check_folder(config.out or RUNS, expected_bytes(len(setup.scene.points), 2))
-    compile_seconds = warm_up(setup)
     length: Length = Forecast(Planned(config.revisions))
-    if config.seconds is not None:
-        setup = _within(setup, config.seconds)
-        length = Timed(config.seconds, config.clock)
+    with _tried_out():
+        compile_seconds = warm_up(setup)
+        if config.seconds is not None:
+            setup = _within(setup, config.seconds)
+            length = Timed(config.seconds, config.clock)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
     setup = replace(setup, notes=(*setup.notes, *told_of_start(state)))
@@ -209,6 +211,21 @@ def with_defaults(config: RunConfig) -> RunConfig:
     elif not given:
         config = config.model_copy(update={"steps": DEFAULT_STEPS})
     return config
+
+
+@contextmanager
+def _tried_out() -> Iterator[None]:
+    """Words an error in steps that load kernels or plan a length, before anything is written."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, UserError) or failed_plugin(error):
+            raise
+        raise UserError(
+            "a step that was tried out before the training failed",
+            found=reason_of(error),
+            todo="look at settings, such as --rate-factor and --loss, and at the photos",
+        ) from error
 
 
 def _within(setup: Setup, seconds: float) -> Setup:
@@ -308,7 +325,8 @@ def resumed(
             )
         if step < total:
             state.clock.load += _decoded(setup, way)
-            state.clock.compile += warm_up(setup, state)
+            with _tried_out():
+                state.clock.compile += warm_up(setup, state)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))

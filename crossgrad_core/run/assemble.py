@@ -39,7 +39,7 @@ from crossgrad_core.defaults import (
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.registry.entries import build, entries, find, load
 from crossgrad_core.registry.manager import make_manager
-from crossgrad_core.registry.slots import LISTS
+from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
@@ -49,23 +49,19 @@ from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates
+from crossgrad_core.training.regrouping import labels_of
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on as at_the_end
-from crossgrad_core.wording import listed, plural
+from crossgrad_core.wording import in_one_line, listed, singular
 
 _LOG = logging.getLogger(__name__)
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
 #: Length of a run that asks for neither steps nor seconds (3DGS).
 DEFAULT_STEPS = 30_000
-#: Settings that name one component.
-SINGLE = (
-    *("backbone", "sampler", "grouping", "densifier", "rasterizer", "loss"),
-    *("exposure", "start", "resolution", "exporter", "reader"),
-)
 
 
 def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
@@ -77,7 +73,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     _LOG.info("reading scene %s", path)
     name = config.reader.name
     if name == AUTO:
-        able = [each for each in entries("readers") if build(Reader, each, {}).accepts(path)]
+        able = [each for each in entries("readers") if _accepts(each, path)]
         if len(able) > 1:
             raise UserError(
                 "the scene can be read in several ways",
@@ -90,6 +86,15 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     return build(Reader, name, config.reader.options).read(path, config.reading), name
 
 
+def _accepts(name: str, path: Path) -> bool:
+    """Whether a reader takes the folder; one that fails does not keep the others from it."""
+    try:
+        return build(Reader, name, {}).accepts(path)
+    except Exception as error:
+        _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
+        return False
+
+
 def check_names(config: RunConfig) -> None:
     """Looks up every component and the device, before a large scene is read for nothing.
 
@@ -99,7 +104,8 @@ def check_names(config: RunConfig) -> None:
     choose_device(config.device)
     named = [("operators", link) for link in config.operators]
     named += [(slot, choice) for slot in LISTS for choice in getattr(config, slot)]
-    named += [(plural(slot), getattr(config, slot)) for slot in SINGLE]
+    single = (slot for slot in GROUPS if slot not in {"operators", *LISTS})
+    named += [(slot, getattr(config, singular(slot))) for slot in single]
     for slot, choice in named:
         if choice is not None and choice.name != AUTO:
             find(slot, choice.name)
@@ -416,7 +422,7 @@ def _groups(
         return None
     rng = make_streams(config.seed)["grouping"]
     rule = grouping.fit(scene, rng)
-    labels = rule.labels(scene.train_views)
+    labels = labels_of(rule, scene, selection.names["grouping"])
     notes += rule.notes
     notes += mode_note(selection.names["grouping"], grouping, scene)
     counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
@@ -438,7 +444,8 @@ def reasons_against(
     config: RunConfig, selection: Selection, answers: Iterable[list[str]]
 ) -> tuple[str, ...]:
     """Why the selection cannot work: what its components object, and what the core does."""
-    reasons = objections_to(selection) + [reason for answer in answers for reason in answer]
+    given = [[answer] if isinstance(answer, str) else answer for answer in answers]
+    reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
         reasons.append(
             f"--backward joint makes one gradient of all views, but operator "

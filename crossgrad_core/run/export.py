@@ -60,15 +60,8 @@ class Exported:
 
     def as_data(self) -> dict[str, Json]:
         """For summary.json."""
-        return {
-            "gaussians": self.gaussians,
-            "baked_for": self.baked_for,
-            "views": self.views,
-            "psnr": self.psnr,
-            "live_psnr": self.live_psnr,
-            "background": self.background,
-            "loss": self.loss,
-        }
+        told = {name: value for name, value in vars(self).items() if name != "notes"}
+        return {**told, "loss": self.loss}
 
 
 def export_scene(

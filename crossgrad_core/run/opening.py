@@ -111,7 +111,7 @@ def opened(
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
-    return _from(folder, settings, -1, check)
+    return _from(folder, {"threads": None, **settings}, -1, check)
 
 
 def continued(

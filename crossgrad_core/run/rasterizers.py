@@ -7,7 +7,7 @@ from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries, load
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import in_one_line, listed
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,12 @@ def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:
     for name in entries("rasterizers"):
         try:
             rasterizer = load(Rasterizer, name)
-        except UserError as error:
-            notes.append(f"rasterizer {name} left out: {error.what}")
+            speed = rasterizer.speed(wanted.device)
+        except Exception as error:
+            why = getattr(error, "what", in_one_line(error))
+            notes.append(f"rasterizer {name} left out: {why}")
             continue
-        if (speed := rasterizer.speed(wanted.device)) > 0.0:
+        if speed > 0.0:
             running[name] = speed
             if lacks := wanted.lacking(rasterizer):
                 notes.append(f"rasterizer {name} left out: this run needs {listed(lacks)}")

@@ -32,7 +32,7 @@ LENGTHS: Final = tuple(
 )
 #: Settings that hold settings.
 GROUPS_OF_SETTINGS: Final = ("reading",)
-_FILE: Final = ("the configuration file", "repair it; the config.yaml of a run is an example")
+_FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
 #: Options of the command line -> their setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}
 

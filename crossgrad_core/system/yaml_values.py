@@ -124,9 +124,8 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
         with open_file(path) as file:
             settings = read_yaml(file.read(MOST_BYTES + 1).decode("utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"{what} cannot be read", where=path, found=str(error), todo=todo
-        ) from error
+        found = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"{what} cannot be read", where=path, found=found, todo=todo) from error
     except yaml.YAMLError as error:
         found = described(error)
         raise UserError(f"{what} is not valid YAML", where=path, found=found, todo=todo) from error

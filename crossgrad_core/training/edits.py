@@ -22,6 +22,8 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     """
     if edit.is_empty:
         return False
+    if unknown := edit.values.keys() - state.tensors.keys():
+        raise ValueError(f"an edit gives values of tensors that there are not: {sorted(unknown)}")
     _apply(setup, state, edit)
     if edit.source is None:
         return False

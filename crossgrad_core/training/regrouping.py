@@ -1,8 +1,10 @@
 """New groups of the training views in the middle of a run."""
 
 from crossgrad_core.contract import sampler
-from crossgrad_core.contract.grouping import Regrouping
+from crossgrad_core.contract.grouping import Regrouping, Rule
+from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.errors import UserError
 from crossgrad_core.training.model import model_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -21,10 +23,22 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
     if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
         return
     rule = grouping.refit(model_of(setup, state), state.rngs[STATE])
-    labels = rule.labels(setup.train_views)
+    labels = labels_of(rule, setup.scene, setup.selection.names["grouping"])
     state.commit({STATE: PluginState({_LABELS: list(labels)}), sampler.STATE: EMPTY_STATE})
     for note in rule.notes:
         setup.hook.crossgrad_message(text=f"step {state.step}: {note}")
+
+
+def labels_of(rule: Rule, scene: Scene, name: str) -> tuple[str, ...]:
+    """The labels of the training views by the rule of the grouping of that name, one for each."""
+    labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
+    if len(labels) == len(views):
+        return labels
+    raise UserError(
+        f"grouping {name} does not label each view",
+        found=f"{len(labels)} labels of {len(views)} training views",
+        todo="choose another --grouping, or repair the plugin",
+    )
 
 
 def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:

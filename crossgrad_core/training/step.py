@@ -106,14 +106,17 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     context = sample_context(setup, state, state.step)
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
     state.commit(answer.states)
-    counts = setup.sampler.counts(context.views_per_step)
-    if len(answer.draw.views) in counts:
-        return answer.draw
+    counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
+    views = answer.draw.views
+    known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
+    if known and len(views) in counts:
+        # NumPy's integers do not go into a checkpoint.
+        return replace(answer.draw, views=tuple(map(int, views)))
     raise UserError(
-        "the sampler draws another number of views than it says",
+        "the sampler draws other views, or another number of them, than it says",
         where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
-        expected=f"{listed(map(str, sorted(counts)))} views",
-        found=f"{len(answer.draw.views)} views",
+        expected=f"{listed(map(str, sorted(counts)))} views, positions from 0 to {photos - 1}",
+        found=f"{len(views)} views: {views}",
         todo="choose another --sampler, or let the plugin's `counts` name every number",
     )
 

@@ -11,7 +11,7 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app
+from crossgrad_core.run import afterwards, app, opening
 from crossgrad_core.run.results.lock import locked
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
@@ -116,11 +116,41 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
 
+def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp_path):
+    for name, draw in (
+        ("street__0001", lambda out: afterwards.render(finished, split="all", out=out)),
+        ("00001", lambda out: afterwards.fly(finished, "ladder", frames=2, out=out)),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / f"{name}.png").write_bytes(b"a photo of mine")
+        with pytest.raises(UserError, match="the file exists"):
+            draw(folder)
+        assert content(folder) == {f"{name}.png": b"a photo of mine"}
+    for _ in range(2):  # The run's own are drawn anew.
+        afterwards.render(finished, split="test", out=None)
+
+
 def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
     for look in (afterwards.evaluate, export):
         with pytest.raises(UserError, match="not the folder of a run"):
             look(tmp_path)
     assert content(tmp_path) == {}
+
+
+def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsys):
+    afterwards.evaluate(finished)
+    said = capsys.readouterr().out
+    assert "3 steps" in said and "memory" not in said
+
+
+def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(finished, monkeypatch):
+    asked = []
+    monkeypatch.setattr(opening, "configure_threads", asked.append)
+    afterwards.evaluate(finished)
+    afterwards.evaluate(finished, afterwards.How(threads=2))
+    assert app.run({}, resume=finished, verbosity=-1) == 0
+    assert asked == [None, 2, 1]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")

@@ -1,9 +1,11 @@
 """Diagnostics of whole runs: the command, and the observer that changes no bit."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 import torch
+from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli.main import main
@@ -153,6 +155,31 @@ def test_bad_requests_are_refused(scene, tmp_path):
         diagnose(scene, None, {}, QUICK, tmp_path / "b")
     with pytest.raises(UserError, match="not the folder of a run"):
         diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")
+
+
+@pytest.mark.parametrize("name", sorted(FILES - {"diagnostics.csv"}))
+def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
+    mine = tmp_path / name
+    mine.write_text("mine")
+    for options, out in ((QUICK, tmp_path), (replace(QUICK, signature=mine), tmp_path / "out")):
+        with pytest.raises(UserError, match="the file exists"):
+            diagnose(scene, None, {"threads": 1}, options, out)
+        assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--run", "RUN", "--seconds", "60"),
+        ("--run", "RUN", "--probes", "4"),
+        ("--run", "RUN", "--max-size", "60"),
+        ("--accept-scene",),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert ended("diagnose", *arguments) == 2
+    assert f"{arguments[-2 if len(arguments) > 1 else 0]} does nothing" in capsys.readouterr().err
 
 
 def failing_from(monkeypatch, first):

@@ -117,6 +117,7 @@ def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
         (("--split", "train", "--path", "ladder"), "--split", "--path"),
         (("--split", "test", "--on", "scene"), "--split", "--on"),
         (("--frames", "9"), "--frames", "--path ladder"),
+        (("--frames", "100001", "--path", "ladder"), "--frames", "100000"),
         (("--frames", "9", "--on", "scene"), "--frames", "--path ladder"),
         (("--frames", "9", "--path", "tour.json"), "--frames", "ladder"),
     ],

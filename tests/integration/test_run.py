@@ -99,6 +99,7 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=23, **settings) == 0
     assert json.loads((tmp_path / "parts/summary.json").read_text())["status"] == "stopped"
+    assert read_config(tmp_path / "parts") == read_config(tmp_path / "whole")  # What repeats it.
     assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
     whole, parts = load(latest(tmp_path / "whole")), load(latest(tmp_path / "parts"))
     assert same(whole.parameters, parts.parameters)

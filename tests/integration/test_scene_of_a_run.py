@@ -106,12 +106,18 @@ def test_where_parameters_would_be_misplaced_nothing_helps(root, change):
 @pytest.mark.parametrize("change", ["a photo", "held out"])
 def test_what_only_looks_takes_it_where_the_user_says_so(root, change, capsys):
     spoilt(root / "scene", change)
+    run = root / "run"
+    before = {path: path.read_bytes() for path in run.rglob("*.*") if path.is_file()}
     for name, look in looks(root).items():
         if name != "diagnose":  # It needs more views than these.
             look(How(accept_scene=True))
+    afterwards.render(run, split="test", out=None, how=How(accept_scene=True))
     assert capsys.readouterr().out.count("overall") >= 1
     views = 1 if change == "held out" else 2
-    assert len((root / "run" / "per_view.csv").read_text().splitlines()) == 1 + views
+    assert len((run / "per_view_accepted.csv").read_text().splitlines()) == 1 + views
+    assert len(list(run.glob("renders/*/accepted/*.png"))) == views
+    # What summary.json describes is of the run's own photos.
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):

@@ -15,6 +15,7 @@ FILE = "config.yaml"
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
     """Writes what repeats the run, with its first notes; one that follows the clock renews it."""
+    config = config.model_copy(update={"stop_after": None})  # It is about one start alone.
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, f"{as_yaml(config)}{noted}".encode())
 

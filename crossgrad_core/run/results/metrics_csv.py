@@ -21,7 +21,6 @@ Row: TypeAlias = dict[str, int | float | None]
 
 _FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
-_MILLISECONDS = 3
 #: Columns that tables of earlier versions lack.
 _LATER = frozenset({"cpu_seconds"})
 _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
@@ -37,11 +36,9 @@ def columns_for(regimes: Sequence[str], figures: Sequence[Figure]) -> tuple[str,
 def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
     """The row of one evaluation."""
     row: Row = dict(asdict(totals))
-    row["train_seconds"] = round(totals.train_seconds, _MILLISECONDS)
-    cpu = totals.cpu_seconds
-    row["cpu_seconds"] = None if cpu is None else round(cpu, _MILLISECONDS)
-    peak = totals.peak_memory_mib
-    row["peak_memory_mib"] = None if peak is None else round(peak, 1)
+    for name, digits in (("train_seconds", 3), ("cpu_seconds", 3), ("peak_memory_mib", 1)):
+        if (value := row[name]) is not None:
+            row[name] = round(value, digits)
     row |= result.overall.values
     for regime, means in result.regimes.items():
         row |= {each.column(regime): means[each.name] for each in result.figures}

@@ -3,6 +3,7 @@
 import json
 import logging
 from pathlib import Path
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -21,6 +22,8 @@ _WAYS_OUT = {
     Weight.PLACE: "put it back as it was, or start a new run: the parameters of this one would be "
     "in the wrong place, or views that it was trained on would be measured",
 }
+#: How the note on an accepted scene begins.
+ACCEPTED: Final = "the scene is not the one that the run was trained on, accepted: "
 _LOG = logging.getLogger(__name__)
 
 
@@ -76,7 +79,7 @@ def check_scene(
     text = "; ".join(each.text for each in found)
     heaviest = max(each.weight for each in found)
     if heaviest <= tolerated and accept:
-        return (f"the scene is not the one that the run was trained on, accepted: {text}",)
+        return (f"{ACCEPTED}{text}",)
     raise UserError(
         "the scene is not the one that the run was trained on",
         where=folder / FILE,

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.metrics_csv import Row
@@ -108,6 +109,7 @@ def summarised_step(folder: Path, status: Status | None = None) -> int | None:
 
 
 def _as_data(summary: Summary) -> dict[str, Any]:
+    figures = () if summary.result is None else summary.result.figures
     return {
         "status": summary.status,
         "error": summary.error,
@@ -120,7 +122,8 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
         "plan": None if summary.plan is None else dict(summary.plan),
-        "definitions": _definitions(summary.result),
+        "definitions": _definitions(figures),
+        "falling": [each.name for each in figures if each.falls],
         "environment": dict(summary.environment),
         "config": dict(summary.config),
     }
@@ -136,9 +139,8 @@ def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     }
 
 
-def _definitions(result: EvaluationResult | None) -> dict[str, str]:
-    figures = () if result is None else result.figures
-    stated = {figure.name: figure.definition for figure in figures if figure.definition}
+def _definitions(figures: Sequence[Figure]) -> dict[str, str]:
+    stated = {each.name: each.definition for each in figures if each.definition}
     return {**stated, "renders": RENDERS}
 
 

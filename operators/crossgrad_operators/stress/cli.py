@@ -110,6 +110,8 @@ def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
     if csv is not None:
         check_file(csv)
+        if csv.exists():
+            raise UserError("the file exists", where=csv, todo="choose another --csv, or remove it")
     names = operators or installed()
     dtypes = (precision or Precision.BOTH).dtypes
     if search is not None:
@@ -146,6 +148,13 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     from crossgrad_operators.stress.suite import run_suite
 
     chosen = [each for each in cases(large=elements) if (case or "") in each.name]
+    if not chosen:
+        raise UserError(
+            "no case has this in its name",
+            where=f"--case {case}",
+            expected=f"a part of {', '.join(each.name for each in cases(large=elements))}",
+            todo="leave it out to run all of them",
+        )
     return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
 
 

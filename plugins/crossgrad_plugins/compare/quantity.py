@@ -41,13 +41,19 @@ class Quantity:
     falls: bool = False
 
     @classmethod
-    def of(cls, name: str, margin: float | None = None) -> "Quantity":
-        """The figure of that name, with its usual margin unless another one is given."""
+    def of(cls, name: str, margin: float | None = None, *, falls: bool = False) -> "Quantity":
+        """The figure of that name, with its usual margin unless another one is given.
+
+        Args:
+            name: Its name.
+            margin: What counts as no difference.
+            falls: Whether less of it is better; of LPIPS it always is.
+        """
         start = next((start for start in _KINDS if name.startswith(start)), "")
         kind = _KINDS.get(start, _OTHER)
         label = " ".join([start.upper(), *name[len(start) :].strip("_").split("_")]).strip()
         wanted = kind.margin if margin is None else margin
-        return cls(name, label, kind.unit, kind.decimals, wanted, falls=start == "lpips")
+        return cls(name, label, kind.unit, kind.decimals, wanted, falls=falls or start == "lpips")
 
     @property
     def with_unit(self) -> str:

@@ -16,7 +16,7 @@ from crossgrad_core.commands import (
     open_run,
 )
 from crossgrad_plugins.diagnostics.command import Options, diagnose_run, diagnose_scene
-from crossgrad_plugins.diagnostics.report import PICTURE, PROBES, Report
+from crossgrad_plugins.diagnostics.report import FILES, PICTURE, PROBES, Report
 
 
 def diagnose(
@@ -54,6 +54,7 @@ def diagnose(
     check_folder(out or run or Path("runs"))
     if options.signature is not None:
         check_file(options.signature)
+        _check_new(options.signature)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     if run is not None:
         setup, state = open_run(run, settings, accept_scene=accept_scene)
@@ -81,6 +82,16 @@ def _check_free(out: Path | None) -> None:
             "the folder holds a report already",
             where=out,
             todo="choose another --out, or remove it",
+        )
+    if out is not None:
+        for name in FILES:
+            _check_new(out / name)
+
+
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise UserError(
+            "the file exists", where=path, todo="choose another place, or remove the file"
         )
 
 

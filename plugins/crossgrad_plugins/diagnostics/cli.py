@@ -1,11 +1,12 @@
 """`crossgrad diagnose`: regimes, bimodality, gradient conflict, variance split."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from crossgrad_core.commands import announce
+from crossgrad_core.commands import UserError, announce
 
 _PROBE = "Probe"
 _MODEL = "Model"
@@ -38,14 +39,14 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         ),
     ] = False,
     seconds: Annotated[
-        float,
+        float | None,
         typer.Option(
             min=1.0,
             metavar="S",
-            help="Training seconds of the vanilla run.",
+            help="Training seconds of the vanilla run. Default: 60.",
             rich_help_panel=_MODEL,
         ),
-    ] = 60.0,
+    ] = None,
     max_size: Annotated[
         int | None,
         typer.Option(
@@ -81,14 +82,14 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         ),
     ] = 12,
     probes: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=1,
             metavar="N",
-            help="Probes during the vanilla run; the last one is at its end.",
+            help="Probes during the vanilla run; the last one is at its end. Default: 4.",
             rich_help_panel=_PROBE,
         ),
-    ] = 4,
+    ] = None,
     signature: Annotated[
         Path | None,
         typer.Option(
@@ -119,6 +120,9 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
     parameters, and writes CSV files and a picture. The variance is split into the part within
     groups of views and the part between them.
     """
+    vanilla = {"--seconds": seconds, "--max-size": max_size, "--probes": probes}
+    idle = {"--accept-scene": accept_scene or None} if run is None else vanilla
+    _refuse_idle([name for name, value in idle.items() if value is not None], run)
     announce()
     from crossgrad_core.commands import ComponentChoice
     from crossgrad_plugins.diagnostics import app
@@ -127,10 +131,13 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
     options = Options(
         grouping=None if grouping is None else ComponentChoice(name=grouping),
         per_group=views,
-        probes=probes,
-        seconds=seconds,
         seed=seed,
         signature=signature,
+    )
+    options = replace(
+        options,
+        probes=options.probes if probes is None else probes,
+        seconds=options.seconds if seconds is None else seconds,
     )
     given = {
         "device": device,
@@ -139,3 +146,10 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
     }
     settings = {name: value for name, value in given.items() if value is not None}
     raise typer.Exit(app.diagnose(scene, run, settings, options, out, accept_scene))
+
+
+def _refuse_idle(idle: list[str], run: Path | None) -> None:
+    """Refuses options that do nothing for what is diagnosed."""
+    if idle:
+        why = "without --run" if run is None else "with --run: a run is probed once, as it is"
+        raise UserError(f"{' and '.join(idle)} does nothing {why}", todo="leave it out")

@@ -21,6 +21,8 @@ GROUPINGS = "groupings.csv"
 PICTURE = "diagnostics.png"
 EXPOSURE = "exposure.csv"
 EXPOSURE_PICTURE = "exposure.png"
+#: All files of a report.
+FILES = (PROBES, CAMERAS, GROUPINGS, PICTURE, EXPOSURE, EXPOSURE_PICTURE)
 
 
 @dataclass(frozen=True)

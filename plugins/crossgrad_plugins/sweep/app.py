@@ -12,6 +12,7 @@ from crossgrad_core.commands import (
     check_folder,
     exit_code,
     finish,
+    listed,
     locked,
     write_mapping,
     writer_of,
@@ -19,7 +20,7 @@ from crossgrad_core.commands import (
 from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.engines import Work, engine
 from crossgrad_plugins.sweep.estimate import estimated
-from crossgrad_plugins.sweep.grid import Grid, read_grid, with_scenes
+from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, with_scenes
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.machine import Machine, divided
 from crossgrad_plugins.sweep.plan import planned
@@ -212,8 +213,16 @@ class Sweep:
 def _grid(request: Request) -> Grid:
     """The grid with what the user named instead of parts of it."""
     grid = read_grid(request.path)
+    check_assignments(request.assignments)
     if request.scenes:
         grid = with_scenes(grid, request.scenes)
+    if len(set(request.seeds)) < len(request.seeds):
+        raise UserError(
+            "a seed stands there twice",
+            where="--seed",
+            found=listed(map(str, request.seeds)),
+            todo="name each of them once",
+        )
     return grid.model_copy(update={"seeds": tuple(request.seeds)}) if request.seeds else grid
 
 

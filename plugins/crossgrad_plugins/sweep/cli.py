@@ -116,7 +116,13 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
     Every run is one of `crossgrad run` in a folder of its own; its name is a hash of its
     configuration, scene and seed, so that what is finished is never repeated.
     """
-    looks_only = list_runs or dry_run or best is not None
+    looks = {"--dry-run": dry_run, "--list": list_runs, "--best": best is not None}
+    asked = [name for name, given in looks.items() if given]
+    if len(asked) > 1:
+        raise UserError(
+            f"{' and '.join(asked)} do not go together", todo="leave all but one of them out"
+        )
+    looks_only = bool(asked)
     announce(quiet=looks_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
     from crossgrad_plugins.sweep.engines import ENGINES

@@ -24,6 +24,8 @@ _RESERVED = {
     "stop_after": "a sweep runs its runs to their ends",
     "threads": "say --threads, for all runs alike",
 }
+#: Settings that options of the sweep are for.
+_OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
 _SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
 _WITH_DISTRIBUTION = frozenset({"min", "max", "distribution", "mu", "sigma", "q", "probabilities"})
 
@@ -86,11 +88,18 @@ class Metric(_Part):
 
     Attributes:
         name: A figure of the held-out views, as in summary.json.
-        goal: Whether more of it is better.
+        goal: Whether more of it is better; by default so, but of LPIPS less.
     """
 
     name: str = "psnr"
     goal: Literal["maximize", "minimize"] = "maximize"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_goal(cls, given: object) -> object:
+        if isinstance(given, Mapping) and str(given.get("name")).startswith("lpips"):
+            return {"goal": "minimize", **given}
+        return given
 
 
 class Grid(_Part):
@@ -130,6 +139,18 @@ class Grid(_Part):
         if twice := sorted(found.keys() & given.keys()):
             raise ValueError(f"{listed(twice)} must be said once, on top or among the parameters")
         return {**given, **{n: _values(p) for n, p in found.items()}, "parameters": parameters}
+
+
+def check_assignments(assignments: Iterable[str]) -> None:
+    """Refuses what `--set` cannot set for all runs of a sweep.
+
+    Raises:
+        UserError: The sweep decides about a setting, or an option of its own is for it.
+    """
+    for name in (each.partition("=")[0].strip() for each in assignments):
+        instead = f"say {_OPTIONS[name]}" if name in _OPTIONS else _RESERVED.get(name)
+        if instead is not None:
+            raise UserError(f"{name} is not for --set", where=f"--set {name}", todo=instead)
 
 
 class Choice(_Part):

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, stdev
 
-from crossgrad_core.commands import read_rows, write_table
+from crossgrad_core.commands import UserError, listed, read_rows, write_table
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
@@ -88,10 +88,20 @@ def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
 
 
 def _read_plan(layout: Layout) -> list[list[str]]:
-    """The rows of runs.csv; none where there is no such table, or one with other columns."""
+    """The rows of runs.csv; none where there is no such table.
+
+    Raises:
+        UserError: It is another one, which would be overwritten, or cannot be read.
+    """
     if not layout.plan.is_file():
         return []
     header, *rows = read_rows(layout.plan, "the table of runs", "remove it") or [[]]
     if tuple(header) != _COLUMNS:
-        return []
+        raise UserError(
+            "the table of runs is none that a sweep wrote",
+            where=layout.plan,
+            expected=f"the columns {listed(_COLUMNS)}",
+            found=listed(header),
+            todo="choose another --out, or remove the file",
+        )
     return [row for row in rows if len(row) == len(_COLUMNS)]

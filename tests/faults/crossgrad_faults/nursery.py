@@ -76,23 +76,34 @@ def answer(job: Mapping[str, Any]) -> dict[str, Any]:
         os.close(read)
         run(job, write)
     os.close(write)
-    status = attended(child, start, [(at, number) for at, number in job["signals"]])
+    signals = [(at, number) for at, number in job["signals"]]
+    status = attended(child, start, signals, Path(job["output"]))
     with os.fdopen(read) as pipe:
         events = pipe.read()
     code = os.waitstatus_to_exitcode(status)
     return {"code": code, "seconds": time.monotonic() - start, "events": int(events or 0)}
 
 
-def attended(child: int, start: float, signals: list[tuple[float, int]]) -> int:
-    """Sends the signals in time and returns the wait status of the child."""
+def attended(child: int, start: float, signals: list[tuple[float, int]], output: Path) -> int:
+    """Sends the signals in time and returns the wait status of the child.
+
+    What a command answers is sent once it has said its first line: only then are its handlers
+    surely there, however busy the machine is.
+    """
     for at, number in signals:
-        while time.monotonic() - start < at:
+        answered = number != signal.SIGKILL
+        while time.monotonic() - start < at or (answered and not has_spoken(output)):
             pid, status = os.waitpid(child, os.WNOHANG)
             if pid:
                 return status
             time.sleep(0.002)
         os.kill(child, number)
     return os.waitpid(child, 0)[1]
+
+
+def has_spoken(output: Path) -> bool:
+    """Whether a command line has said anything."""
+    return output.exists() and output.stat().st_size > 0
 
 
 def run(job: Mapping[str, Any], report: int) -> None:

@@ -1,5 +1,6 @@
 """What does not compare is refused, with the reason and the way out."""
 
+import json
 from html import unescape
 from pathlib import Path
 
@@ -63,6 +64,26 @@ def test_another_training_split_is_refused(tmp_path):
     scene = (first / "scene.json").read_text().replace('"trained": true', '"trained": false', 1)
     (second / "scene.json").write_text(scene)
     with pytest.raises(UserError, match="trained on different photos"):
+        compared(read_runs([tmp_path], skip_broken=False), Options())
+
+
+def test_a_run_says_of_which_figures_less_is_better(tmp_path):
+    for name, views, error in (("worse", 1, 9.0), ("better", 2, 4.0)):
+        path = RunFolder(views_per_step=views).write(tmp_path / name) / "summary.json"
+        summary = json.loads(path.read_text()) | {"falling": ["mae"]}
+        summary["overall"] |= {"mae": error}
+        path.write_text(json.dumps(summary))
+    found = compared(read_runs([tmp_path], skip_broken=False), Options(metric="mae"))
+    assert found.ranking == ("views=2", "views=1")
+    assert [each.favours for each in found.ends] == ["views=2"]
+
+
+def test_runs_without_held_out_photos_are_refused_for_that(tmp_path):
+    path = RunFolder().write(tmp_path / "run") / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["overall"] = {"views": 0, "psnr": None, "ssim": None}
+    path.write_text(json.dumps(summary))
+    with pytest.raises(UserError, match="none of them held a photo out"):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 

@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from support.commands import ended
 from typer.testing import CliRunner
 
 from crossgrad_core.errors import UserError
@@ -108,6 +109,18 @@ def test_the_table_shows_errors_times_and_failures(tmp_path):
     rows = (tmp_path / "table.csv").read_text().splitlines()
     assert len(rows) == 1 + len(cells)
     assert any(row.startswith("anchors,K = 3,refused") for row in rows)
+
+
+def test_no_table_is_overwritten(tmp_path, capsys):
+    table = tmp_path / "table.csv"
+    table.write_text("mine")
+    assert ended("stress", "symmetric", "--case", "plain", "--csv", table) == 2
+    assert "the file exists" in capsys.readouterr().err and table.read_text() == "mine"
+
+
+def test_a_case_that_there_is_not_is_refused(capsys):
+    assert ended("stress", "symmetric", "--case", "nosuch", "--elements", "1000") == 2
+    assert "no case has this in its name" in capsys.readouterr().err
 
 
 def test_the_command_tells_by_its_exit_status(monkeypatch):

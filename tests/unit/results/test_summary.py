@@ -69,6 +69,7 @@ def test_says_all_that_is_needed(tmp_path: Path, summary: Summary):
     assert found["primitives"] == 111_785
     assert found["backward_passes"] == 1400
     assert "11 x 11" in found["definitions"]["ssim"]
+    assert found["falling"] == ["lpips"]
     assert found["config"]["scene"] == "scenes/boruszyn"
 
 

@@ -1,6 +1,7 @@
 """The grid file: what it means, and everything that can be wrong with it at once."""
 
 import pytest
+from support.commands import ended
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.grid import choices, read_grid, with_scenes
@@ -118,6 +119,40 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path):
     text = "base: {out: x, threads: 1}\nseeds: [1, 1]\narms: [{name: a}, {name: a}]"
     with pytest.raises(UserError, match="4 things are wrong"):
         read_grid(written(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("metric", "goal"),
+    [
+        ("{}", "maximize"),
+        ("{name: ssim}", "maximize"),
+        ("{name: lpips_vgg}", "minimize"),
+        ("{name: lpips, goal: maximize}", "maximize"),
+    ],
+)
+def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
+    assert read_grid(written(tmp_path, f"metric: {metric}")).metric.goal == goal
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--set", "seed=7"), "say --seed"),
+        (("--set", "scene=there"), "say --scene"),
+        (("--set", "stop_after=2"), "to their ends"),
+        (("--set", " threads =2"), "say --threads"),
+        (("--set", "out=there"), "--set out"),
+        (("--seed", "3", "--seed", "3"), "a seed stands there twice"),
+        (("--list", "--best", "best.yaml"), "--list and --best do not go together"),
+        (("--dry-run", "--list"), "--dry-run and --list do not go together"),
+    ],
+    ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
+)
+def test_what_would_be_passed_over_is_refused(tmp_path, capsys, options, words):
+    path = written(tmp_path, "base: {steps: 3}")
+    shown = () if "--list" in options else ("--dry-run",)
+    assert ended("sweep", path, "--out", tmp_path / "out", *shown, *options) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_an_empty_grid_is_one_run_of_the_bundled_scene(tmp_path):

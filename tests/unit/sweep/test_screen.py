@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep import screen as screens
 from crossgrad_plugins.sweep.estimate import duration, estimated
 from crossgrad_plugins.sweep.grid import Metric
@@ -130,6 +131,14 @@ def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
         'id2,city,"arm, k=1",2',
         "id0,city,arm,0",
     ]
+
+
+def test_another_table_in_its_place_is_kept(tmp_path):
+    layout = Layout(tmp_path)
+    layout.plan.write_text("arm,scene\nmine,city\n")
+    with pytest.raises(UserError, match="none that a sweep wrote"):
+        write_plan(layout, JOBS[:2])
+    assert layout.plan.read_text() == "arm,scene\nmine,city\n"
 
 
 def test_rows_of_earlier_grids_are_told_from_those_of_the_newest(tmp_path):

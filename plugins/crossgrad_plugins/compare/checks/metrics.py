@@ -27,11 +27,17 @@ def quantities_of(
     """
     offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
     measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
+    if not measured:
+        raise UserError(
+            "no run has a figure: none of them held a photo out",
+            where=runs[0].name,
+            todo="repeat the runs without --split none, and with more photos where there are few",
+        )
     if name not in measured:
         raise UserError(
             "no run has this figure",
             where="--metric",
-            expected=f"one of {', '.join(measured)}" if measured else "a figure of held-out views",
+            expected=f"one of {', '.join(measured)}",
             found=name,
             todo="choose another one, or repeat the runs with it: crossgrad run --metrics NAME",
         )
@@ -49,7 +55,11 @@ def quantities_of(
                          f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
         else:
             kept.append(key)
-    return tuple(Quantity.of(key, margin if key == name else None) for key in kept), notes
+    falling = {str(key) for run in runs for key in run.summary.get("falling") or ()}
+    found = (
+        Quantity.of(key, margin if key == name else None, falls=key in falling) for key in kept
+    )
+    return tuple(found), notes
 
 
 def _check_definition(runs: Sequence[Run], key: str) -> None:

@@ -29,6 +29,7 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
         definition=f"LPIPS 0.1 with {net.name}, {scaling}; masked pixels are black in both images",
         undefined=f"LPIPS needs the pretrained {net.name}, which no Python package ships: "
         f"--set metrics.{entry}.trunk=FILE names it, for example {net.published} of torchvision",
+        falls=True,
     )
 
 
