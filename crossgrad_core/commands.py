@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from crossgrad_core.run.settings import layered, merged
     from crossgrad_core.run.usual_views import view_plan_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
+    from crossgrad_core.training.dropout import photos_per_point, usual_dropout
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.frozen import view_gradients
     from crossgrad_core.training.model import model_of
@@ -107,6 +108,7 @@ __all__ = [
     "open_run",
     "panels_of",
     "parse_number",
+    "photos_per_point",
     "plural",
     "read_panel",
     "read_results",
@@ -122,6 +124,7 @@ __all__ = [
     "take_steps",
     "tell",
     "usual_budget",
+    "usual_dropout",
     "view_gradients",
     "view_plan_of",
     "way_on",
@@ -154,10 +157,12 @@ _LATE: Final = {
     "model_of": "training.model",
     "open_run": "run.opening:opened",
     "panels_of": "run.results.panel_layout",
+    "photos_per_point": "training.dropout",
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
     "usual_budget": "training.room",
+    "usual_dropout": "training.dropout",
     "view_plan_of": "run.usual_views",
     "view_gradients": "training.frozen",
 }

@@ -35,13 +35,18 @@ def with_dropout(config: RunConfig, scene: Scene, notes: list[str]) -> RunConfig
     if config.dropout is not None:
         return config
     photos = 0.0 if config.preset == "inria" else photos_per_point(scene)
-    few = 0.0 < photos <= FEW_PHOTOS
-    if few:
+    share = usual_dropout(photos)
+    if share:
         notes.append(
             f"dropout: a point lies in {photos:g} of {len(scene.train)} training photos (median), "
-            f"each of which is drawn without {DROPOUT:.0%} of the Gaussians (--dropout 0: with all)"
+            f"each of which is drawn without {share:.0%} of the Gaussians (--dropout 0: with all)"
         )
-    return config.model_copy(update={"dropout": DROPOUT if few else 0.0})
+    return config.model_copy(update={"dropout": share})
+
+
+def usual_dropout(photos: float) -> float:
+    """The share where a point lies in so many training photos; 0: not known."""
+    return DROPOUT if 0.0 < photos <= FEW_PHOTOS else 0.0
 
 
 def photos_per_point(scene: Scene) -> float:

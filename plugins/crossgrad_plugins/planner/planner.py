@@ -15,7 +15,7 @@ from crossgrad_plugins.planner.evidence import Evidence
 PARTS: Final[tuple[Callable[[Evidence], Decision], ...]] = (
     *(groups.modes, groups.pairs, groups.views_per_step, groups.operator),
     *(looks.exposure, looks.degree, looks.scale_filter),
-    *(sizes.resolution, sizes.count, sizes.length, sizes.densifier),
+    *(sizes.resolution, sizes.count, sizes.length, sizes.densifier, sizes.dropout),
     *(reading.start, reading.undistortion, reading.masks, reading.background),
 )
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Final
 
-from crossgrad_core.commands import counting_of, usual_budget
+from crossgrad_core.commands import counting_of, photos_per_point, usual_budget, usual_dropout
 from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
-from crossgrad_plugins.planner.decision import Decision, given
+from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.groups import views_of_steps
 
@@ -13,6 +13,7 @@ from crossgrad_plugins.planner.groups import views_of_steps
 _OF_PIXELS: Final = 0.6
 #: Photos whose spectra are looked at, at most, spread over all.
 _PHOTOS: Final = 8
+_FEW: Final = "docs/few-photos.md"
 #: A budget of more primitives is none.
 _NO_BOUND: Final = 2**31
 
@@ -123,6 +124,23 @@ def _steps(evidence: Evidence) -> int | None:
     if config.max_views is not None:
         return views_of_steps(evidence).steps_of(config.max_views)
     return config.steps
+
+
+def dropout(evidence: Evidence) -> Decision:
+    """Whether training views are drawn without a share of the Gaussians."""
+    part, config = "dropout", evidence.config
+    if evidence.is_given("dropout", "preset"):
+        return given(part, config.dropout or "none", "--dropout SHARE")
+    rule = "some where a point lies in at most 5 photos; where more show it, it costs quality"
+    photos = photos_per_point(evidence.scene)
+    share = usual_dropout(photos)
+    choice = f"{share:g}" if share else "none"
+    plain = Decision(part, choice, "default", "", rule, _FEW, "--dropout SHARE")
+    if not photos:
+        return plain.found("no SfM points tell how many photos show the same")
+    shown = f"a point lies in {photos:g} of {len(evidence.scene.train_views)} photos (median)"
+    saved = NOTHING if share else "a random number for each Gaussian of a view"
+    return plain.found(shown, decided=True, saved=saved, figures={"photos_of_a_point": photos})
 
 
 def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:

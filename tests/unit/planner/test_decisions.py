@@ -42,8 +42,8 @@ TABLE = Path(__file__).with_name("cameras.csv")
 PAIRS_BY_HEIGHT = {"sampler": "near-far", "grouping": "altitude", "grouping.cut": "otsu"}
 PARTS_OF_THE_TABLE = [
     *("modes", "pairs of views", "views per step", "operator", "exposure", "SH degree"),
-    *("scale filter", "resolution", "primitives", "length", "densifier", "start"),
-    *("undistortion", "masks", "background"),
+    *("scale filter", "resolution", "primitives", "length", "densifier", "dropout"),
+    *("start", "undistortion", "masks", "background"),
 ]
 
 
@@ -415,6 +415,14 @@ def test_a_run_too_short_for_edits_has_no_density_control(steps, choice):
     assert plan_for(orbit(), steps=steps).of_part("densifier").choice == choice
     assert not plan_for(orbit(), steps=steps, densify_from=10).of_part("densifier").settings
     assert plan_for(orbit(), seconds=5.0).of_part("densifier").basis == "default"
+
+
+@pytest.mark.parametrize(("photos", "choice"), [(4, "0.3"), (5, "0.3"), (6, "none"), (40, "none")])
+def test_dropout_where_few_photos_show_a_point(photos, choice):
+    found = plan_for(orbit(photos)).of_part("dropout")
+    assert (found.choice, found.basis, found.settings) == (choice, "decided", {})
+    assert found.figures == {"photos_of_a_point": photos}
+    assert plan_for(orbit(photos), dropout=0.2).of_part("dropout").basis == "given"
 
 
 @pytest.mark.parametrize("backbone", ["scaffold", "mip"])
