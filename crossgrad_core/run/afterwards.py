@@ -337,6 +337,13 @@ def exported(
         exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
+        if out is not None and out.suffix.lower() not in {"", f".{exporter.suffix}"}:
+            raise UserError(
+                "the file is named as one of another format",
+                where=f"--out {out}",
+                expected=f"a name that ends in .{exporter.suffix}",
+                todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
+            )
         if camera is not None and setup.backbone.plain:
             raise UserError(
                 f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",

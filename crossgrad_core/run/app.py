@@ -323,6 +323,15 @@ def resumed(
                 found=f"all {total} steps done",
                 todo="start a new run; --init point_cloud.ply starts from its Gaussians",
             )
+        stop = setup.config.stop_after
+        if stop is not None and stop <= step:
+            raise UserError(
+                "the run is past the step at which it is to stop",
+                where="--stop-after",
+                expected=f"a step from {step + 1} to {total}",
+                found=str(stop),
+                todo="name a later step, or leave it out to train to the end",
+            )
         if step < total:
             state.clock.load += _decoded(setup, way)
             with _tried_out():

@@ -72,6 +72,14 @@ def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys
         export(finished, camera="nobody")
 
 
+def test_a_file_of_another_format_than_its_name_says_is_refused(finished, tmp_path):
+    with pytest.raises(UserError, match=r"a name that ends in \.ply"):
+        export(finished, out=tmp_path / "scene.splat")
+    assert not (tmp_path / "scene.splat").exists()
+    export(finished, out=tmp_path / "scene.PLY")
+    assert read_ply(tmp_path / "scene.PLY").means.shape[1] == 3
+
+
 def test_the_same_export_writes_the_same_file(finished):
     before = content(finished)
     export(finished)
