@@ -236,8 +236,8 @@ class RunConfig(BaseModel):
         ge=0,
         le=0.9,
         description="Share of the Gaussians that each training view is drawn without. Default: "
-        f"{defaults.DROPOUT} where a point lies in at most {defaults.FEW_PHOTOS} training photos, "
-        "as most do; else, and with --preset inria, 0.",
+        "0.3 where a point lies in at most 5 training photos (median); else, and with --preset "
+        "inria, 0.",
     )
     device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
         "cpu", description="Where tensors live. Default: cpu."

@@ -10,10 +10,6 @@ BACKBONE: Final = "vanilla"
 SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
-#: Share of the Gaussians that a training view is drawn without, where at most so many training
-#: photos show a point.
-DROPOUT: Final = 0.3
-FEW_PHOTOS: Final = 5
 EXPOSURE: Final = "none"
 START: Final = "filled"
 #: The start of published runs, and of those that begin with points of their own: it adds nothing.

@@ -14,10 +14,12 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.defaults import DROPOUT, FEW_PHOTOS
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
+#: The share of runs that name none, where at most so many training photos show a point.
+DROPOUT: Final = 0.3
+FEW_PHOTOS: Final = 5
 #: The random stream of what is left out.
 STREAM: Final = "dropout"
 #: Points that are looked at, spread over all.

@@ -64,7 +64,7 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     rows += [
         (run, scene, label, seed)
-        for run, scene, label, seed in _read_plan(layout)
+        for run, scene, label, seed in _read_plan(layout, writes=True)
         if (run, scene, label, seed) not in rows and layout.run(run).is_dir()
     ]
     write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])
@@ -87,16 +87,16 @@ def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
     )
 
 
-def _read_plan(layout: Layout) -> list[list[str]]:
-    """The rows of runs.csv; none where there is no such table.
+def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
+    """The rows of runs.csv; none where there is no such table, or one with other columns.
 
     Raises:
-        UserError: It is another one, which would be overwritten, or cannot be read.
+        UserError: It cannot be read; or it `writes`, which another table is not to be lost by.
     """
     if not layout.plan.is_file():
         return []
     header, *rows = read_rows(layout.plan, "the table of runs", "remove it") or [[]]
-    if tuple(header) != _COLUMNS:
+    if writes and tuple(header) != _COLUMNS:
         raise UserError(
             "the table of runs is none that a sweep wrote",
             where=layout.plan,
@@ -104,4 +104,4 @@ def _read_plan(layout: Layout) -> list[list[str]]:
             found=listed(header),
             todo="choose another --out, or remove the file",
         )
-    return [row for row in rows if len(row) == len(_COLUMNS)]
+    return [row for row in rows if len(row) == len(_COLUMNS)] if tuple(header) == _COLUMNS else []

@@ -160,7 +160,12 @@ def parameters_after(path, reader):
     from crossgrad_core.training.start import first_state
 
     config = RunConfig(
-        scene=path, steps=STEPS, threads=1, start={"name": "sfm"}, reader={"name": reader}
+        scene=path,
+        steps=STEPS,
+        threads=1,
+        start={"name": "sfm"},
+        reader={"name": reader},
+        dropout=0.0,
     )
     setup = assemble(config, *read_scene(config, path))
     state = first_state(setup)

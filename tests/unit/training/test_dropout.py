@@ -8,14 +8,13 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import Draw
-from crossgrad_core.defaults import DROPOUT, FEW_PHOTOS
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.dropout import dropped, photos_per_point
+from crossgrad_core.training.dropout import DROPOUT, FEW_PHOTOS, dropped, photos_per_point
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
