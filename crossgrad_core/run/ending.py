@@ -176,9 +176,12 @@ class Course:
 
 
 def last_words(course: Course) -> list[str]:
-    """What the user is told of a run that did not finish: why, what is kept, how to go on."""
+    """What the user is told of a run that came to nothing or did not finish, and how to go on."""
     ending, folder = course.ending, course.session.folder
     lines = []
+    if not course.state.primitives(course.setup):
+        name = course.setup.selection.names["densifier"]
+        lines.append(f"no primitive is left, densifier {name} removed them all: choose another one")
     if ending.error is not None:
         lines += f"training failed: {ending.error}".splitlines()
     if ending.traced:

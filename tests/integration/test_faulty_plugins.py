@@ -72,6 +72,10 @@ class Typo(Densifier):
     def densify(self, context, state):
         return Edit(values={"mean": Rows(context.parameters["means"])}), state
 
+class Emptying(Densifier):
+    def densify(self, context, state):
+        return Edit(source=torch.zeros(0, dtype=torch.int64)), state
+
 class Picky(Reader):
     def accepts(self, path):
         raise ValueError("what is this")
@@ -94,7 +98,7 @@ PLUGINS = {
     "observers": {"words": "Words", "objecting": "Objecting"},
     "resolutions": {"unfit": "Unfit"},
     "losses": {"infinite": "Infinite", "vector": "Vector"},
-    "densifiers": {"typo": "Typo"},
+    "densifiers": {"typo": "Typo", "emptying": "Emptying"},
 }
 
 
@@ -131,6 +135,16 @@ def test_views_may_be_numbers_of_numpy(scene, tmp_path, monkeypatch):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--sampler", "numpy", "--stop-after", "2") == 0
     assert ended("run", "--resume", tmp_path / "run", "-q") == 0
+
+
+def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, capsys):
+    installed(monkeypatch, tmp_path / "site", PLUGINS)
+    assert run(scene, tmp_path / "run", "--densifier", "emptying") == 0
+    words = "no primitive is left, densifier emptying removed them all"
+    assert words in capsys.readouterr().err
+    assert words in (tmp_path / "run" / "log.txt").read_text()
+    assert run(scene, tmp_path / "usual") == 0
+    assert "no primitive" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
