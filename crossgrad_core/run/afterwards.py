@@ -47,6 +47,8 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
 _LOG = logging.getLogger(__name__)
+#: Files of Gaussians by the names that programs give them: none holds what another one's says.
+_OF_FORMATS = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
 
 
 class Opens(Protocol):
@@ -337,7 +339,7 @@ def exported(
         exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
-        if out is not None and out.suffix.lower() not in {"", f".{exporter.suffix}"}:
+        if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
             raise UserError(
                 "the file is named as one of another format",
                 where=f"--out {out}",

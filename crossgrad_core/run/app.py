@@ -49,6 +49,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
@@ -218,7 +219,8 @@ def _tried_out() -> Iterator[None]:
     """Words an error in steps that load kernels or plan a length, before anything is written."""
     try:
         yield
-    except Exception as error:
+    # What numbers can cause; other errors would be our own mistakes, and keep their traceback.
+    except (TrainingFailedError, NonFiniteError, RuntimeError, ValueError, MemoryError) as error:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
         raise UserError(

@@ -181,7 +181,7 @@ def last_words(course: Course) -> list[str]:
     lines = []
     if not course.state.primitives(course.setup):
         name = course.setup.selection.names["densifier"]
-        lines.append(f"no primitive is left, densifier {name} removed them all: choose another one")
+        lines.append(f"no primitive is left: look at densifier {name} and at the photos")
     if ending.error is not None:
         lines += f"training failed: {ending.error}".splitlines()
     if ending.traced:

@@ -68,4 +68,6 @@ def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
         return gaussians
     kept = state.rngs[STREAM].random(len(gaussians), dtype=np.float32) >= share
     factors = torch.from_numpy(kept / np.float32(1.0 - share)).to(gaussians.opacities.device)
-    return replace(gaussians, opacities=(gaussians.opacities * factors).clamp(max=1.0))
+    raised = gaussians.opacities * factors
+    # Cut off at 1, but not its gradient: what is nearly opaque could never fade.
+    return replace(gaussians, opacities=raised - (raised.detach() - 1.0).clamp(min=0.0))

@@ -76,6 +76,7 @@ def test_a_file_of_another_format_than_its_name_says_is_refused(finished, tmp_pa
     with pytest.raises(UserError, match=r"a name that ends in \.ply"):
         export(finished, out=tmp_path / "scene.splat")
     assert not (tmp_path / "scene.splat").exists()
+    export(finished, out=tmp_path / "scene.v1.2")
     export(finished, out=tmp_path / "scene.PLY")
     assert read_ply(tmp_path / "scene.PLY").means.shape[1] == 3
 

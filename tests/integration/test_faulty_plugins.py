@@ -140,7 +140,7 @@ def test_views_may_be_numbers_of_numpy(scene, tmp_path, monkeypatch):
 def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, capsys):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--densifier", "emptying") == 0
-    words = "no primitive is left, densifier emptying removed them all"
+    words = "no primitive is left: look at densifier emptying"
     assert words in capsys.readouterr().err
     assert words in (tmp_path / "run" / "log.txt").read_text()
     assert run(scene, tmp_path / "usual") == 0

@@ -32,7 +32,7 @@ def modes(evidence: Evidence) -> Decision:
     found = evidence.modes
     rule = (
         f"two: distances or heights that Otsu's cut separates better than the best of {ONE_OF} "
-        f"evenly spread samples, each side {LEAST_SHARE:.0%} of {FEWEST} views or more, "
+        f"evenly spread samples, at least {FEWEST} views, {LEAST_SHARE:.0%} of them on each side, "
         f"far / near >= {LEAST_RATIO}; "
         f"one distance: range (95th / 5th percentile) < {LEAST_RATIO}"
     )
@@ -57,7 +57,10 @@ def pairs(evidence: Evidence) -> Decision:
     part, usual = "pairs of views", config.sampler.name
     if evidence.is_given("sampler", "grouping"):
         return given(part, usual, "--sampler NAME")
-    rule = f"two modes, and sigma_b^2 / sigma_w^2 >= {LEAST_RHO} with its whole interval"
+    rule = (
+        f"two modes, {EVEN:.0%} of the views or more in each, and sigma_b^2 / sigma_w^2 >= "
+        f"{LEAST_RHO} with its whole interval"
+    )
     plain = Decision(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
     if found.one:
         return plain.found(f"one mode: {_figures(found)}", decided=True, saved="groups of views")
@@ -84,8 +87,8 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     cut = evidence.modes.cut
     if cut.share < EVEN:
         return plain.found(
-            f"{shown}; but the smaller mode has {cut.share:.0%} of the views, and pairs would "
-            f"train them {0.5 / cut.share:.1f} times as often: another objective",
+            f"{shown}; but the smaller mode has {cut.share:.0%} of the views, and pairs would draw "
+            f"each of these {0.5 / cut.share:.1f} times as often: another objective",
             figures={**figures, "smaller_share": cut.share},
         )
     grouping = cut.grouping
@@ -134,10 +137,10 @@ def views_per_step(evidence: Evidence) -> Decision:
     rule = "1, unless pairs are drawn: a second view of a step costs what a further step does"
     usual = str(max(evidence.view_plan.counts))
     plain = Decision(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
-    if evidence.is_given("sampler", "operator", "batch_rule", "density_views", "backward"):
-        return plain.found("as suits what you set of sampler, operator and steps")
     if "sampler" in pairs(evidence).settings:
         return replace(plain, choice="2").found("a step has a near and a far view", decided=True)
+    if evidence.is_given("sampler", "operator", "batch_rule", "density_views", "backward"):
+        return plain.found("as suits what you set of sampler, operator and steps")
     probe, figures = evidence.probe, {}
     # docs/results/two-views.md and docs/results/paper.md.
     shown = "at equal seconds two views ended 0.22 and 0.07 dB below one over our scenes"
@@ -158,8 +161,10 @@ def operator(evidence: Evidence) -> Decision:
     source = "paper; half of random directions conflict"
     plain = Decision(part, usual, "default", "", rule, source, "--operator NAME")
     apart = "gradients of each view kept apart"
-    if evidence.modes.one:
-        return plain.found("one mode: no near and far to conflict", decided=True, saved=apart)
+    joint = evidence.config.backward == "joint"
+    if joint or evidence.modes.one:
+        why = "--backward joint: one gradient of all" if joint else "one mode"
+        return plain.found(f"{why}: no near and far to conflict", decided=True, saved=apart)
     probe = evidence.probe
     if probe is None:
         return plain.found(f"conflict of near and far gradients is {_NOT_KNOWN}")
@@ -185,7 +190,7 @@ def _figures(found: Modes) -> str:
     shown = "undefined" if isnan(found.bimodality) else f"{found.bimodality:.2f}"
     cut = found.cut
     return (
-        f"{cut.quantity} cut in two separates {cut.separability:.0%} of its variance, even samples "
-        f"{cut.usual:.0%}; far / near {cut.ratio:.1f}, smaller side {cut.share:.0%}; "
-        f"bimodality of distances {shown}"
+        f"{cut.quantity} cut in two separates {cut.separability:.0%} of its variance, the best of "
+        f"{ONE_OF} even samples {cut.usual:.0%}; far / near {cut.ratio:.1f}, smaller side "
+        f"{cut.share:.0%}; bimodality of distances {shown}"
     )

@@ -121,7 +121,7 @@ class Modes:
         if len(values) < 2:  # noqa: PLR2004 - two sides
             return Cut(quantity, 0.0, 1.0, 0.0, 1.0)
         upper = values > otsu_threshold(values)
-        share = float(min(upper.mean(), 1.0 - upper.mean()))
+        share = min(int(upper.sum()), int((~upper).sum())) / len(values)
         ratio = 1.0
         if share > 0.0:
             ratio = _exp(abs(np.median(self.logs[upper]) - np.median(self.logs[~upper])))

@@ -129,9 +129,9 @@ def _steps(evidence: Evidence) -> int | None:
 def dropout(evidence: Evidence) -> Decision:
     """Whether training views are drawn without a share of the Gaussians."""
     part, config = "dropout", evidence.config
-    if evidence.is_given("dropout", "preset"):
+    if evidence.is_given("dropout") or config.preset == "inria":
         return given(part, config.dropout or "none", "--dropout SHARE")
-    rule = "some where a point lies in at most 5 photos; where more show it, it costs quality"
+    rule = "some where a point lies in at most 5 photos; where more show it, SSIM falls"
     photos = photos_per_point(evidence.scene)
     share = usual_dropout(photos)
     choice = f"{share:g}" if share else "none"

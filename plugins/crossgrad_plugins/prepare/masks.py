@@ -192,13 +192,16 @@ def _tell_folders(
 def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
     """Files among the photos that are named as masks, and are none."""
     stems = {str(PurePosixPath(name).with_suffix("")) for name in photos}
-    masks = {f"{stem}{end}.png" for stem in stems for end in _ENDS}
+    masks = {f"{stem}{end}" for stem in stems for end in _ENDS}
     for name in beside:
-        if name not in masks:
-            yield LeftOut(
-                name=name_some([name]),
-                why="named as a mask, but of no photo: rename it if it is one",
-            )
+        path = PurePosixPath(name)
+        if str(path.with_suffix("")) not in masks:
+            why = "named as a mask, but of no photo: rename it if it is one"
+        elif path.suffix != ".png":
+            why = "a mask beside its photo has to be a PNG file"
+        else:
+            continue
+        yield LeftOut(name=name_some([name]), why=why)
 
 
 def with_mask(photo: Photo, mask: Path) -> Photo:

@@ -207,6 +207,14 @@ def test_pairs_bring_two_views():
     assert (found.choice, found.basis, found.settings) == ("2", "decided", {})
 
 
+@pytest.mark.parametrize("name", ["backward", "batch_rule", "density_views"])
+def test_the_views_of_pairs_are_told_whatever_else_was_set(name):
+    value = {"backward": "joint", "batch_rule": "sqrt", "density_views": "one"}[name]
+    assert (
+        groups.views_per_step(evidence_of("city_hybrid", PAIRS_PAY, **{name: value})).choice == "2"
+    )
+
+
 def test_views_are_counted_as_the_run_will_have_them():
     assert groups.views_of_steps(evidence_of("city_hybrid")).counts == (1,)
     asked = evidence_of("city_hybrid", operator={"name": "pcgrad"})
@@ -237,6 +245,8 @@ def test_pairs_of_modes_of_unequal_size_would_train_another_objective():
         ({"sampler": {"name": "near-far"}}, "symmetric"),
         ({"sampler": {"name": "near-far", "alternating": True}}, "sum"),
         ({"sampler": {"name": "random"}, "views_per_step": 2}, "sum"),
+        ({"backward": "joint"}, "sum"),
+        ({"sampler": {"name": "near-far"}, "backward": "joint"}, "sum"),
     ],
 )
 def test_projection_for_pairs_that_the_user_s_sampler_draws(given, choice):
@@ -288,6 +298,15 @@ def test_modes_with_a_gap_are_two(share, views):
     # Where they part is where they are cut, however many are on either side.
     (shares,) = {round(each.cut.share * views) for each in found if each.two}
     assert shares == round(share * views)
+
+
+@pytest.mark.parametrize("views", [10, 20, 30, 50, 100])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_tenth_of_the_views_is_a_mode_on_either_side(views, side):
+    far = np.arange(views) < views // 10
+    found = modes_at(np.linspace(0.0, 0.1, views) + 2.0 * side * far)
+    assert found.two
+    assert found.cut.share == 0.1
 
 
 @pytest.mark.parametrize("stragglers", [1, 2, 5])
@@ -422,7 +441,9 @@ def test_dropout_where_few_photos_show_a_point(photos, choice):
     found = plan_for(orbit(photos)).of_part("dropout")
     assert (found.choice, found.basis, found.settings) == (choice, "decided", {})
     assert found.figures == {"photos_of_a_point": photos}
+    assert plan_for(orbit(photos), preset="fast").of_part("dropout").choice == choice
     assert plan_for(orbit(photos), dropout=0.2).of_part("dropout").basis == "given"
+    assert plan_for(orbit(photos), preset="inria").of_part("dropout").choice == "none"
 
 
 @pytest.mark.parametrize("backbone", ["scaffold", "mip"])

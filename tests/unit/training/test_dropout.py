@@ -53,6 +53,23 @@ def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
     assert np.mean(shares) == pytest.approx(share, abs=error)
 
 
+def test_what_is_nearly_opaque_can_still_fade():
+    """Its opacity is cut off at 1, its gradient is not."""
+    setup = setup_of(dropout=0.3)
+    state = first_state(setup)
+    logits = torch.full((500,), 3.0, requires_grad=True)
+    gaussians = replace(
+        decoded(setup, state),
+        **{name: torch.ones(500, n) for name, n in (("means", 3), ("quats", 4), ("scales", 3))},
+        opacities=torch.sigmoid(logits),
+    )
+    part = dropped(setup, state, gaussians)
+    assert set(part.opacities.tolist()) == {0.0, 1.0}
+    (gradient,) = torch.autograd.grad(part.opacities.sum(), [logits])
+    slope = torch.sigmoid(logits) * (1.0 - torch.sigmoid(logits)) / 0.7
+    torch.testing.assert_close(gradient, torch.where(part.opacities > 0.0, slope, 0.0))
+
+
 def test_no_share_is_no_change_and_no_draw():
     setup = setup_of(dropout=0.0)
     state = first_state(setup)
