@@ -131,7 +131,7 @@ def dropout(evidence: Evidence) -> Decision:
     part, config = "dropout", evidence.config
     if evidence.is_given("dropout") or config.preset == "inria":
         return given(part, config.dropout or "none", "--dropout SHARE")
-    rule = "some where a point lies in at most 5 photos; where more show it, SSIM falls"
+    rule = "some where a point lies in at most 5 photos; where more show it, no gain was measured"
     photos = photos_per_point(evidence.scene)
     share = usual_dropout(photos)
     choice = f"{share:g}" if share else "none"
