@@ -63,9 +63,9 @@ def pairs(evidence: Evidence) -> Decision:
     )
     plain = Decision(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
     if found.one:
-        return plain.found(f"one mode: {_figures(found)}", decided=True, saved="groups of views")
+        return plain.found("one mode: no near and far", decided=True, saved="groups of views")
     if not found.two:
-        return plain.found(f"modes undecided: {_figures(found)}")
+        return plain.found("modes undecided")
     return _pairs_of_two_modes(evidence, plain)
 
 
