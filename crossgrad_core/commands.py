@@ -28,7 +28,7 @@ from crossgrad_core.system.tables import table_bytes, write_table
 from crossgrad_core.system.terminal import is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.system.writability import check_file, check_folder
+from crossgrad_core.system.writability import check_file, check_folder, check_new
 from crossgrad_core.wording import did_you_mean, listed, plural, sentences, singular
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ __all__ = [
     "build",
     "check_file",
     "check_folder",
+    "check_new",
     "chosen",
     "clear_half_written",
     "configured",

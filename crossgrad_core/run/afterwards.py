@@ -1,7 +1,7 @@
 """Evaluation, renders and exports of a run that was trained."""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +42,7 @@ from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.run.session import CLOUD, totals
-from crossgrad_core.system.writability import check_file, check_folder
+from crossgrad_core.system.writability import check_file, check_folder, check_new
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -234,7 +234,7 @@ def render(
         writer = PanelWriter.of(folder, state.step, views, len(views))
         writer = replace(writer, folder=out or own)
         if out is not None:
-            _check_all_new(out / f"{file}.png" for file in writer.files.values())
+            check_new(*(out / f"{file}.png" for file in writer.files.values()))
         measured(views, draw, setup.metrics, on_view=writer.write)
         print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
 
@@ -269,11 +269,11 @@ def fly(
         )
     with _writing(folder, out, "rendering"):
         check_folder(out or folder)
-        _check_all_new(() if out is None else film_files(out))
+        check_new(*(() if out is None else film_files(out)))
         setup, state = how.open(folder)
         along = flight(setup.scene, path, frames or FRAMES)
         if out is not None:
-            _check_all_new(out / f"{number:05d}.png" for number in range(len(along.cameras)))
+            check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
         draw = camera_renderer(setup, state)
         out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
         with torch.no_grad():
@@ -333,7 +333,7 @@ def exported(
         find("exporters", file_format)
     with _writing(folder, out, "exporting"):
         if out is not None:
-            _check_all_new((out, georef_of(out)))
+            check_new(out, georef_of(out))
             check_file(out)
         setup, state = how.open(folder)
         exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
@@ -359,7 +359,7 @@ def exported(
             path = out or folder / _own_name(folder, name, state.step)
         else:
             path = out or folder / name
-            _check_all_new((path,))
+            check_new(path)
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
 
 
@@ -413,8 +413,3 @@ def _own_name(folder: Path, name: str, step: int) -> str:
 def _flat(setup: Setup, camera: str) -> str:
     """The view's name as a part of a file name; that of no view as it is, to be refused later."""
     return flat_names([view.name for view in setup.scene.views]).get(camera, "view")
-
-
-def _check_all_new(paths: Iterable[Path]) -> None:
-    if path := next((each for each in paths if each.exists()), None):
-        raise UserError("the file exists", where=path, todo="choose another --out, or remove it")

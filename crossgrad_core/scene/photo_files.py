@@ -70,15 +70,19 @@ def find_photo_folders(images: Path) -> list[PhotoFolder]:
     return folders
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of a photo: `<name>.png` after the full name or in place of its suffix.
+def mask_names(name: str) -> tuple[str, ...]:
+    """What the mask of a photo may be called in a folder of masks, the first that is there.
 
-    `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png` or
-    `aerial/0001.jpg`, in this order.
+    `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
+    `aerial/0001_mask.png` (Metashape) or `aerial/0001.jpg`.
     """
     stem = str(PurePosixPath(name).with_suffix(""))
-    candidates = (folder / f"{name}.png", folder / f"{stem}.png", folder / name)
-    return next(filter(is_file, candidates), None)
+    return f"{name}.png", f"{stem}.png", f"{stem}_mask.png", name
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """The mask of a photo; None where it has none."""
+    return next(filter(is_file, (folder / each for each in mask_names(name))), None)
 
 
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:

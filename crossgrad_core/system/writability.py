@@ -55,6 +55,16 @@ def check_own(path: Path) -> None:
         )
 
 
+def check_new(*paths: Path) -> None:
+    """Refuses files that are there already: nothing of the user's is overwritten.
+
+    Raises:
+        UserError: The first of them.
+    """
+    if path := next((each for each in paths if each.exists()), None):
+        raise UserError("the file exists", where=path, todo="choose another place, or remove it")
+
+
 def check_file(path: Path) -> None:
     """Refuses a file that cannot be written because of its folder or because it is one.
 

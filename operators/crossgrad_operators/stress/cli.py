@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
-from crossgrad_core.commands import Progress, UserError, announce, check_file
+from crossgrad_core.commands import Progress, UserError, announce, check_file, check_new
 
 if TYPE_CHECKING:
     import torch
@@ -110,8 +110,7 @@ def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
     if csv is not None:
         check_file(csv)
-        if csv.exists():
-            raise UserError("the file exists", where=csv, todo="choose another --csv, or remove it")
+        check_new(csv)
     names = operators or installed()
     dtypes = (precision or Precision.BOTH).dtypes
     if search is not None:

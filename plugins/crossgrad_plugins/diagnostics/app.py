@@ -11,6 +11,7 @@ from crossgrad_core.commands import (
     UserError,
     check_file,
     check_folder,
+    check_new,
     configured,
     disk_errors,
     open_run,
@@ -54,7 +55,7 @@ def diagnose(
     check_folder(out or run or Path("runs"))
     if options.signature is not None:
         check_file(options.signature)
-        _check_new(options.signature)
+        check_new(options.signature)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     if run is not None:
         setup, state = open_run(run, settings, accept_scene=accept_scene)
@@ -84,15 +85,7 @@ def _check_free(out: Path | None) -> None:
             todo="choose another --out, or remove it",
         )
     if out is not None:
-        for name in FILES:
-            _check_new(out / name)
-
-
-def _check_new(path: Path) -> None:
-    if path.exists():
-        raise UserError(
-            "the file exists", where=path, todo="choose another place, or remove the file"
-        )
+        check_new(*(out / name for name in FILES))
 
 
 def _write(report: Report, folder: Path) -> None:

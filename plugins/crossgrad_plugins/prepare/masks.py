@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crossgrad_core.commands import UserError
 from crossgrad_core.plugin import is_file
 from crossgrad_core.scene.decode import decode_mask, decode_photo, turn
-from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.photo_files import PhotoFolder, mask_names
 from crossgrad_core.scene.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
@@ -22,7 +22,8 @@ from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 #: Folders of this name hold masks, and so do files beside the photos whose stem ends so.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
-_HALF: Final = 128
+#: The level of a mask or of transparency below which a pixel does not count.
+HALF: Final = 128
 #: EXIF orientations by which a photo is shown turned by a quarter -> those that turn it back.
 _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
@@ -111,12 +112,6 @@ def _asked(root: Path, wanted: Path | None) -> str | None:
     return None if asked == os.path.realpath(root) else asked
 
 
-def _names(name: str) -> tuple[str, ...]:
-    """What the mask of a photo may be called in a folder of masks: `x.jpg.png`, `x.png` ..."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    return f"{name}.png", f"{stem}.png", f"{stem}_mask.png", name
-
-
 def _below(folder: str, name: str) -> str | None:
     """A photo's name below the folder that a folder of masks lies in; None where it is not."""
     base = PurePosixPath(folder).parent.as_posix()
@@ -128,12 +123,12 @@ def _below(folder: str, name: str) -> str | None:
 def _of_photos(folder: str, inside: Iterable[str], photos: Iterable[str]) -> set[str]:
     """Those files of a folder of masks that are named after photos."""
     below = (_below(folder, name) for name in photos)
-    named = {each for name in below if name is not None for each in _names(name)}
+    named = {each for name in below if name is not None for each in mask_names(name)}
     return {name for name in inside if name.removeprefix(f"{folder}/") in named}
 
 
 def _in(folder: Path, name: str) -> Iterator[Path]:
-    return (folder / each for each in _names(name))
+    return (folder / each for each in mask_names(name))
 
 
 def _usual(root: Path, name: str, folders: Iterable[str]) -> Iterator[Path]:
@@ -161,10 +156,11 @@ def _first(root: Path, places: Mapping[str, Iterable[Path]]) -> dict[str, Path]:
 def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) -> None:
     if masks or not photos:
         return
+    names = ", ".join(dict.fromkeys(mask_names(photos[0])))
     raise UserError(
         "no photo has a mask in the mask folder",
         where=wanted,
-        expected=f"one of {', '.join(dict.fromkeys(_names(photos[0])))} for the photo {photos[0]}",
+        expected=f"one of {names} for the photo {photos[0]}",
         found=name_some(PhotoFolder(wanted).names) or "no image",
         todo="name the masks after their photos, folders included, or leave --masks out",
     )
@@ -198,7 +194,7 @@ def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
         if str(path.with_suffix("")) not in masks:
             why = "named as a mask, but of no photo: rename it if it is one"
         elif path.suffix != ".png":
-            why = "a mask beside its photo has to be a PNG file"
+            why = "the name of a mask beside its photo has to end in .png"
         else:
             continue
         yield LeftOut(name=name_some([name]), why=why)
@@ -227,7 +223,7 @@ def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
     _, alpha = decode_photo(root / photo.name)
     if alpha is None:
         return kept
-    opaque = np.where(alpha >= _HALF, 255, 0).astype(np.uint8)
+    opaque = np.where(alpha >= HALF, 255, 0).astype(np.uint8)
     return opaque if kept is None else np.minimum(kept, opaque)
 
 

@@ -17,7 +17,7 @@ from crossgrad_core.scene.pillow import opened
 from crossgrad_core.scene.raw_checks import is_possible_name
 from crossgrad_core.scene.wording import megapixels, name_some
 from crossgrad_plugins.prepare.exif import camera_of, orientation_of, position_of
-from crossgrad_plugins.prepare.masks import sorted_out, with_mask
+from crossgrad_plugins.prepare.masks import HALF, sorted_out, with_mask
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, Settings, digest_of
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ _KNOWN: Final = _READ | _UNREAD
 _IMPOSSIBLE: Final = (
     "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
 )
-_HALF: Final = 128
 _SMALLEST: Final = 64
 #: So many times the usual most pixels may be those of a JPEG file: phones have 200 megapixels.
 _REDUCIBLE: Final = 2
@@ -212,7 +211,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
     transparent = False
     if header.alpha and not image.mode.startswith(("I", "F")):
         least, _ = image.convert("RGBA").getchannel("A").getextrema()
-        transparent = int(least) < _HALF  # type: ignore[arg-type]
+        transparent = int(least) < HALF  # type: ignore[arg-type]
     small = (image if image.mode in {"L", "RGB"} else image.convert("RGB")).convert("L")
     small.thumbnail((_LOOKED_AT, _LOOKED_AT))
     grey = np.asarray(small, dtype=np.float64)

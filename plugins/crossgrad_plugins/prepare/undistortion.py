@@ -9,7 +9,7 @@ import numpy as np
 
 from crossgrad_core.commands import UserError, disk_errors
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
-from crossgrad_plugins.prepare.masks import counting_pixels
+from crossgrad_plugins.prepare.masks import HALF, counting_pixels
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.waiting import quiet, waited
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 #: Photos that are undistorted between two looks at what is done.
 _BATCH: Final = 32
 _QUALITY: Final = 95
-_HALF: Final = 128
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
@@ -105,7 +104,7 @@ def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -
             bitmap, _ = pycolmap.undistort_image(
                 _options(plan), bitmap, model.camera(image.camera_id)
             )
-        kept = np.where(bitmap.to_array() >= _HALF, 255, 0).astype(np.uint8)
+        kept = np.where(bitmap.to_array() >= HALF, 255, 0).astype(np.uint8)
         scratch = place.with_name(f".{place.name}.tmp.png")
         with disk_errors(place):
             place.parent.mkdir(parents=True, exist_ok=True)

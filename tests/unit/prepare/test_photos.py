@@ -155,7 +155,7 @@ def test_masks_of_no_photo_are_told(tmp_path):
     assert left_out == {
         "masks/": "masks, but 1 file of no photo: masks/IMG_9.jpg",
         "death_mask.jpg": "named as a mask, but of no photo: rename it if it is one",
-        "1_mask.jpg": "a mask beside its photo has to be a PNG file",
+        "1_mask.jpg": "the name of a mask beside its photo has to end in .png",
     }
     assert used["2.jpg"].mask == str(tmp_path / "2.mask.png")
 

@@ -16,3 +16,11 @@ def test_a_name_without_room_for_a_suffix_has_no_mask_of_that_name(tmp_path):
 def test_a_name_that_is_too_long_has_no_photo(tmp_path):
     assert PhotoFolder(tmp_path).find("a" * 300 + ".png", ()) is None
     assert PhotoFolder(tmp_path).find("a/" * 3000 + "b.png", ()) is None
+
+
+def test_a_mask_is_called_as_other_programs_call_it_the_first_that_is_there(tmp_path):
+    for name in ("a/1.jpg", "a/1_mask.png", "a/1.png", "a/1.jpg.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+        assert find_mask(tmp_path, "a/1.jpg") == tmp_path / name
+    assert find_mask(tmp_path, "a/2.jpg") is None

@@ -109,6 +109,11 @@ def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share)
     assert len(noted) == (share > 0.0 and "dropout" not in given)
 
 
+def test_what_is_said_of_the_default_is_the_default():
+    said = RunConfig.model_fields["dropout"].description
+    assert f"{DROPOUT} where a point lies in at most {FEW_PHOTOS} training photos" in said
+
+
 def test_a_run_goes_on_with_the_same_bits():
     setup = setup_of(dropout=0.3)
     whole = first_state(setup)
