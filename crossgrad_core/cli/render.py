@@ -43,7 +43,8 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(metavar="N", min=2, max=100_000, help="Of a ladder. Default: 120.")
+        int | None,
+        typer.Option(metavar="N", min=2, max=100_000, help="Frames of a ladder. Default: 120."),
     ] = None,
     device: Device = None,
     threads: Threads = None,
