@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
-    from crossgrad_core.run.assemble import assemble
+    from crossgrad_core.run.assemble import DEFAULT_STEPS, assemble
     from crossgrad_core.run.opening import opened as open_run
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COMMANDS",
+    "DEFAULT_STEPS",
     "FAILED",
     "GROUPS",
     "LISTS",
@@ -142,6 +143,7 @@ FAILED: Final = 1
 #: What is imported when it is asked for -> where it is, with another name where it has one there.
 _LATE: Final = {
     "ComponentChoice": "config",
+    "DEFAULT_STEPS": "run.assemble",
     "NonFiniteError": "training.failure",
     "RunConfig": "config",
     "RunResults": "run.results.reading",
@@ -209,7 +211,7 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
-    """The configuration that `crossgrad run` would have, with scene and length filled in.
+    """The configuration that `crossgrad run` would have, with the scene filled in.
 
     Args:
         settings: As in a configuration file, components in their long form: `{"name": ...}`.

@@ -132,7 +132,10 @@ class RunConfig(BaseModel):
         None, ge=1, description="Optimizer steps; schedules stretch with them. Default: 30000."
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
-        None, ge=1, description="Length of the run in views: as many steps as draw them."
+        None,
+        ge=1,
+        description="Length of the run in views: as many steps as draw them. With --seconds the "
+        "shorter of both.",
     )
     seconds: Annotated[float | None, Flag("S", TRAINING)] = Field(
         None, gt=0, description="Training seconds; the number of steps follows the clock."

@@ -13,7 +13,6 @@ from typing import Any, cast
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin
-from crossgrad_core.run.assemble import DEFAULT_STEPS
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
@@ -48,7 +47,7 @@ from crossgrad_core.scene.photo_check import check_photos, fits
 from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
-from crossgrad_core.training.budget import Length, Planned, Timed, steps_for
+from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
@@ -158,8 +157,8 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     with _tried_out():
         compile_seconds = warm_up(setup)
         if config.seconds is not None:
+            length = Timed(config.seconds, config.clock, most=most_steps(setup))
             setup = _within(setup, config.seconds)
-            length = Timed(config.seconds, config.clock)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
     setup = replace(setup, notes=(*setup.notes, *told_of_start(state)))
@@ -195,22 +194,20 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
-    """The configuration with scene and length filled in."""
+    """The configuration with the scene filled in, and a length for the bundled one."""
     lengths = {"steps": config.steps, "views": config.max_views, "seconds": config.seconds}
     given = {unit: length for unit, length in lengths.items() if length is not None}
-    if len(given) > 1:
+    if "steps" in given and len(given) > 1:
         raise UserError(
-            "a run has one length: in steps, in views or in seconds",
+            "a run has one length: in steps, in views or in seconds, or views within seconds",
             where="--steps, --max-views, --seconds",
             found=listed(f"{length:g} {unit}" for unit, length in given.items()),
-            todo="leave all but one of them out",
+            todo="leave --steps out, or all but it",
         )
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
         if not given:
             config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
-    elif not given:
-        config = config.model_copy(update={"steps": DEFAULT_STEPS})
     return config
 
 
@@ -233,8 +230,8 @@ def _tried_out() -> Iterator[None]:
 def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note, share = steps_for(setup, seconds)
-    update = {"steps": steps, "seconds": None, "revisions": (), "planned_seconds": seconds}
-    config = setup.config.model_copy(update=update)
+    update = {"steps": steps, "seconds": None, "max_views": None, "revisions": ()}
+    config = setup.config.model_copy(update={**update, "planned_seconds": seconds})
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
     return replace(setup, notes=(*setup.notes, note, *notes_on_length(setup)))

@@ -236,13 +236,16 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 
 
 def _with_steps(config: RunConfig, views: ViewPlan) -> RunConfig:
-    """The configuration with a length in views turned into one in steps.
+    """The configuration with a length in steps, where it has none in seconds.
+
+    Views within seconds stay: whether there are seconds for them is known after the first steps.
 
     Raises:
         UserError: A single step draws more views.
     """
     if config.max_views is None:
-        return config
+        known = config.seconds is not None or config.steps is not None
+        return config if known else config.model_copy(update={"steps": DEFAULT_STEPS})
     steps = views.steps_of(config.max_views)
     if steps == 0:
         raise UserError(
@@ -252,6 +255,8 @@ def _with_steps(config: RunConfig, views: ViewPlan) -> RunConfig:
             found=str(config.max_views),
             todo="ask for more --max-views, or for fewer --views",
         )
+    if config.seconds is not None:
+        return config
     return config.model_copy(update={"steps": steps, "max_views": None})
 
 

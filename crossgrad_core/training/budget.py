@@ -59,10 +59,19 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         note += f", {steps} at full size {each * pace.at(_NEVER) * 1000:.1f} ms"
         share = min(1.0, max(0.0, (1.0 - first / each) / (1.0 - pixels)))
     measured, crowd = replace(setup, pixel_share=share), Crowd.of(setup, state)
-    total = _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
+    fits = _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
+    total = min(fits, most_steps(setup))
+    if total < fits:
+        note += f", which {fits} take in that time; --max-views allows no more than {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
     return total, f"{text}the length follows the clock as the run goes", share
+
+
+def most_steps(setup: Setup) -> int:
+    """The steps that a run within a budget of seconds may take, however fast they are."""
+    views = setup.config.max_views
+    return _NEVER if views is None else setup.selection.views.steps_of(views)
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
@@ -113,11 +122,13 @@ class Timed:
     Args:
         seconds: The budget.
         kind: The clock that it counts on.
+        most: The steps that the run may take, however fast they are.
     """
 
-    def __init__(self, seconds: float, kind: ClockKind = "wall") -> None:
+    def __init__(self, seconds: float, kind: ClockKind = "wall", *, most: int = _NEVER) -> None:
         self._seconds = seconds
         self._kind = kind
+        self._most = most
         self._step = 0
         self._clock = 0.0
         self._each: float | None = None
@@ -144,7 +155,8 @@ class Timed:
         self._look(state)
         affordable = (self._seconds - state.clock.trained(self._kind)) / each
         crowd, step = Crowd.of(setup, state), state.step
-        total = step + _fitting(lambda left: cost_ahead(setup, crowd, step, left), affordable)
+        fits = step + _fitting(lambda left: cost_ahead(setup, crowd, step, left), affordable)
+        total = min(fits, self._most)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
         revisions = (*setup.config.revisions, (state.step, total))

@@ -87,7 +87,31 @@ def test_a_run_shorter_than_a_step_is_refused():
         assembled(views=4, max_views=3)
 
 
-@pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "max_views": 4}])
+def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path):
+    settings = {"seconds": 60.0, "max_views": 9, "views": 2, "sampler": {"name": "epoch"}}
+    rows = run(scene, tmp_path / "run", **settings)
+    assert (rows[-1]["step"], rows[-1]["views"]) == ("4", "8")
+    stored = read_config(tmp_path / "run")
+    assert (stored["steps"], stored["seconds"], stored["max_views"]) == (4, None, None)
+    assert (stored["planned_seconds"], stored["revisions"]) == (60.0, [])
+    assert "--max-views allows no more than 4" in (tmp_path / "run/log.txt").read_text()
+    assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
+    again = (tmp_path / "again/point_cloud.ply").read_bytes()
+    assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
+
+
+def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
+    rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
+    assert float(rows[-1]["train_seconds"]) < 5.0
+    assert "--max-views allows" not in (tmp_path / "run/log.txt").read_text()
+
+
+def test_views_within_seconds_are_at_least_a_step():
+    with pytest.raises(UserError, match="at least 4, the views of a step"):
+        assembled(views=4, max_views=3, seconds=1.0)
+
+
+@pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "steps": 4}])
 def test_a_run_has_one_length(lengths):
     with pytest.raises(UserError, match="one length"):
         app.with_defaults(RunConfig(**lengths))

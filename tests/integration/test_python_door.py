@@ -159,7 +159,10 @@ def test_a_failed_run_raises_with_its_folder_and_cause(scene, tmp_path, monkeypa
         ({"steps": 0}, "greater than or equal to 1"),
         ({"operator": "sun"}, "did you mean 'sum'"),
         ({"operator": {"name": "cagrad", "d": 1}}, "cagrad has no option"),
-        ({"steps": 3, "seconds": 3}, "a run has one length: in steps, in views or in seconds"),
+        (
+            {"steps": 3, "seconds": 3},
+            "a run has one length: in steps, in views or in seconds, or views",
+        ),
     ],
 )
 def test_a_wrong_option_is_the_error_of_the_command(scene, tmp_path, options, words, capfd):

@@ -35,7 +35,7 @@ class Plan:
     seconds: float
 
     @property
-    def settings(self) -> Mapping[str, str | int]:
+    def settings(self) -> Mapping[str, str | float]:
         """The settings that change, as options are called."""
         return {name: value for each in self.decisions for name, value in each.settings.items()}
 

@@ -3,7 +3,13 @@
 from dataclasses import replace
 from typing import Final
 
-from crossgrad_core.commands import counting_of, photos_per_point, usual_budget, usual_dropout
+from crossgrad_core.commands import (
+    DEFAULT_STEPS,
+    counting_of,
+    photos_per_point,
+    usual_budget,
+    usual_dropout,
+)
 from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
 from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
@@ -14,6 +20,11 @@ _OF_PIXELS: Final = 0.6
 #: Photos whose spectra are looked at, at most, spread over all.
 _PHOTOS: Final = 8
 _FEW: Final = "docs/few-photos.md"
+_EXACTLY: Final = "--steps N or --max-views N"
+_FLAT: Final = "docs/plan.md, six scenes"
+#: Views of each training photo after which more of them stop to pay, and of all together at least.
+PASSES: Final = 100
+FEWEST_VIEWS: Final = 1_000
 #: A budget of more primitives is none.
 _NO_BOUND: Final = 2**31
 
@@ -75,22 +86,38 @@ def count(evidence: Evidence) -> Decision:
 
 def length(evidence: Evidence) -> Decision:
     """How long the run is."""
-    config, views = evidence.config, len(evidence.scene.train_views)
-    if config.seconds is not None:
-        choice = f"{config.seconds:g} s"
-    elif config.max_views is not None:
-        choice = f"{config.max_views:,} views"
-    else:
-        choice = f"{config.steps or 0:,} steps"
-    return Decision(
-        "length",
-        choice,
+    part, config, photos = "length", evidence.config, len(evidence.scene.train_views)
+    most, seconds = max(FEWEST_VIEWS, PASSES * photos), config.seconds
+    asked = f"{DEFAULT_STEPS:,} steps" if seconds is None else f"{seconds:g} s"
+    if config.max_views is not None or config.steps is not None:
+        exactly = f"{config.max_views or 0:,} views"
+        return given(part, exactly if config.steps is None else f"{config.steps:,} steps", _EXACTLY)
+    if config.preset == "inria" or config.schedule == "absolute":
+        return given(part, f"{asked}, as published", _EXACTLY)
+    plain = Decision(
+        part,
+        asked,
         "default",
-        f"{views} training photos; where more time stops to pay is not known of this scene",
-        "as long as you ask for",
-        "no measurement",
-        "--seconds S or --steps N",
+        "",
+        f"{PASSES} views of each training photo, {FEWEST_VIEWS:,} at least: more of them gain "
+        "little and take long, as Gaussians grow",
+        _FLAT,
+        _EXACTLY,
     )
+    shown = f"{photos} training photos: {most:,} views"
+    if not photos:
+        return plain.found("no training photos")
+    usual = DEFAULT_STEPS * max(views_of_steps(evidence).counts)
+    if seconds is None and most >= usual:
+        return plain.found(shown, decided=True, figures={"views": most})
+    saved = f"what is left of {asked} then"
+    if seconds is None:
+        saved = f"{1.0 - most / usual:.0%} of the views of {asked}"
+    found = plain.found(shown, figures={"views": most})
+    # A length replaces those of before as a whole.
+    settings = {"max_views": most} | ({} if seconds is None else {"seconds": seconds})
+    choice = f"{most:,} views" if seconds is None else f"{most:,} views within {asked}"
+    return found.changed(choice, settings, _EXACTLY, saved)
 
 
 def densifier(evidence: Evidence) -> Decision:
@@ -119,11 +146,14 @@ def densifier(evidence: Evidence) -> Decision:
 
 
 def _steps(evidence: Evidence) -> int | None:
-    """Length of the run in steps; None where it follows the clock."""
+    """Length of the run in steps, the decision on it included; None where it follows the clock."""
     config = evidence.config
-    if config.max_views is not None:
-        return views_of_steps(evidence).steps_of(config.max_views)
-    return config.steps
+    if config.seconds is not None:
+        return None
+    views = length(evidence).settings.get("max_views", config.max_views)
+    if views is not None:
+        return views_of_steps(evidence).steps_of(int(views))
+    return config.steps or DEFAULT_STEPS
 
 
 def dropout(evidence: Evidence) -> Decision:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossgrad_core.commands import configured, layered, read_scene
+from crossgrad_core.commands import DEFAULT_STEPS, configured, layered, read_scene
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
@@ -40,6 +40,7 @@ MEASURED = {
 #: Scene, depth over focal length as a logarithm, and height of each training camera.
 TABLE = Path(__file__).with_name("cameras.csv")
 PAIRS_BY_HEIGHT = {"sampler": "near-far", "grouping": "altitude", "grouping.cut": "otsu"}
+LENGTHS = {"steps", "max_views", "seconds"}
 PARTS_OF_THE_TABLE = [
     *("modes", "pairs of views", "views per step", "operator", "exposure", "SH degree"),
     *("scale filter", "resolution", "primitives", "length", "densifier", "dropout"),
@@ -76,8 +77,15 @@ def evidence_of(name, probe=None, **given):
     return evidence
 
 
+def length_of(photos, **given):
+    views = [posed_view((i, 0, 0), f"{i}.png") for i in range(photos)]
+    return sizes.length(Evidence(config_of(**given), posed_scene(views)))
+
+
 def plan_for(scene, **given):
-    return plan_of(config_of(**given), scene)
+    """The plan of a run that has a length, of 3,000 steps where none is given."""
+    length = {} if LENGTHS & given.keys() else {"steps": 3_000}
+    return plan_of(config_of(**length, **given), scene)
 
 
 @pytest.mark.parametrize("name", MEASURED)
@@ -123,7 +131,8 @@ def test_the_scenes_themselves(name):
 
 @pytest.fixture(scope="module")
 def bundled():
-    config = configured({"scene": str(bundled_scene()), "reading": {"max_size": 100}})
+    settings = {"scene": str(bundled_scene()), "reading": {"max_size": 100}, "steps": 3_000}
+    config = configured(settings)
     return config, read_scene(config)[0]
 
 
@@ -427,6 +436,61 @@ def test_few_photos_without_points(count):
     assert plan.settings == changes
     assert plan.of_part("exposure").basis == "default"
     assert planned(config_of(), scene)[0].reading.init == ("random" if count == 1 else "points")
+
+
+@pytest.mark.parametrize("photos", [1, 9, 10, 11, 40])
+def test_a_run_without_a_length_gets_one_by_its_photos(photos):
+    most = max(sizes.FEWEST_VIEWS, sizes.PASSES * photos)
+    found = length_of(photos)
+    assert (found.choice, found.basis) == (f"{most:,} views", "decided")
+    assert dict(found.settings) == {"max_views": most}
+    assert found.saved == f"{1 - most / DEFAULT_STEPS:.0%} of the views of 30,000 steps"
+    decided, _ = planned(config_of(), orbit(photos))
+    assert (decided.max_views, decided.steps, decided.seconds) == (most, None, None)
+
+
+@pytest.mark.parametrize(("photos", "stays"), [(299, False), (300, True), (2_000, True)])
+def test_it_never_gets_longer_than_by_default(photos, stays):
+    found = length_of(photos)
+    assert found.basis == "decided"
+    assert (found.choice == "30,000 steps") == stays
+    assert bool(found.settings) != stays
+
+
+def test_two_views_of_a_step_are_two_of_the_length():
+    assert length_of(300, views_per_step=2).choice == "30,000 views"
+    assert length_of(600, views_per_step=2).choice == "30,000 steps"
+
+
+@pytest.mark.parametrize("seconds", [0.5, 60.0])
+def test_seconds_are_the_most_that_may_be_spent(seconds):
+    found = length_of(20, seconds=seconds)
+    assert found.choice == f"2,000 views within {seconds:g} s"
+    assert dict(found.settings) == {"max_views": 2_000, "seconds": seconds}
+    decided, _ = planned(config_of(seconds=seconds), orbit(20))
+    assert (decided.max_views, decided.seconds, decided.steps) == (2_000, seconds, None)
+
+
+@pytest.mark.parametrize("mine", [{"preset": "inria"}, {"schedule": "absolute"}])
+def test_published_schedules_keep_their_length(mine):
+    found = length_of(20, **mine)
+    assert (found.choice, dict(found.settings)) == ("30,000 steps, as published", {})
+
+
+@pytest.mark.parametrize("mine", [{"steps": 7}, {"max_views": 90_000}])
+def test_steps_and_views_are_exactly_what_was_asked_for(mine):
+    found = length_of(20, **mine)
+    assert (found.basis, dict(found.settings)) == ("given", {})
+    decided, _ = planned(config_of(**mine), orbit(20))
+    assert (decided.steps, decided.max_views) == (mine.get("steps"), mine.get("max_views"))
+
+
+def test_other_parts_know_the_length_that_was_decided():
+    assert sizes.count(Evidence(config_of(), orbit(20))).figures["views"] == 2_000
+    assert sizes.densifier(Evidence(config_of(), orbit(20))).figures["edits"] > 0
+    few = Evidence(config_of(), posed_scene([]))
+    assert sizes.length(few).basis == "default"
+    assert sizes.count(few).figures["views"] == DEFAULT_STEPS
 
 
 @pytest.mark.parametrize(("steps", "choice"), [(100, "none"), (3_000, "adc")])

@@ -190,6 +190,18 @@ def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
     )
 
 
+@pytest.mark.parametrize(("each", "steps"), [(0.01, 3000), (0.04, 2334), (0.08, 1168)])
+def test_a_budget_with_a_bound_on_its_steps_ends_with_the_first_of_both(each, steps):
+    run, state, length = setup(steps=3000), reached(0), Timed(93.33, most=3000)
+    while state.step < run.schedule.total:
+        state.step += 1
+        state.clock.train += each
+        if state.step < run.schedule.total and length.due(state):
+            run = length.revised(run, state)
+    assert run.schedule.total == pytest.approx(steps, rel=0.01)
+    assert max(total for _, total in run.config.revisions or ((0, 3000),)) <= 3000
+
+
 def test_a_budget_that_is_used_up_ends_the_run():
     _, seconds = timed(10.0, 1000, lambda step, schedule: 1.0)
     assert seconds == 13.0  # the first look is after twelve steps
