@@ -57,3 +57,42 @@ def test_more_than_there_is_is_refused(has, arguments, named):
     with pytest.raises(UserError) as caught:
         divided(*arguments)
     assert named in caught.value.where and caught.value.expected
+
+
+def counts(**busy):
+    """Two looks at the counts of cores: all of 100 ticks in between, of which so many were work."""
+    first = "cpu  1 2 3 4 5\n" + "".join(f"{name} 7 0 0 70 1 0\n" for name in busy) + "intr 9\n"
+    rows = (f"{name} {7 + ticks} 0 0 {170 - ticks} 1 0\n" for name, ticks in busy.items())
+    return [first, "cpu  1 2 3 4 5\n" + "".join(rows) + "intr 9\n"]
+
+
+@pytest.mark.parametrize(
+    ("busy", "expected"),
+    [
+        ({"cpu0": 100, "cpu1": 0, "cpu2": 100, "cpu3": 3}, (1, 3, 0, 2)),
+        ({"cpu0": 20, "cpu1": 0, "cpu2": 10, "cpu3": 0}, (0, 1, 2, 3)),
+        ({"cpu0": 50, "cpu1": 40, "cpu2": 100, "cpu3": 0}, (3, 0, 1, 2)),
+        # Cores that are switched off are not listed.
+        ({"cpu0": 100, "cpu3": 0}, (1, 2, 3, 0)),
+        ({}, (0, 1, 2, 3)),
+    ],
+)
+def test_idle_cores_come_first(monkeypatch, tmp_path, busy, expected):
+    looks = counts(**busy)
+    file = tmp_path / "stat"
+    monkeypatch.setattr(machine, "_COUNTS", file)
+    file.write_text(looks[0])
+    monkeypatch.setattr(machine.time, "sleep", lambda seconds: file.write_text(looks[1]))
+    assert machine.idle_first((0, 1, 2, 3)) == expected
+
+
+def test_without_counts_cores_keep_their_order(monkeypatch, tmp_path):
+    monkeypatch.setattr(machine, "_COUNTS", tmp_path / "no-such-file")
+    assert machine.idle_first((4, 2)) == (4, 2)
+
+
+def test_cores_are_only_chosen_where_some_are_left(has, monkeypatch):
+    has(range(4), 64)
+    monkeypatch.setattr(machine, "idle_first", lambda cores: cores[::-1])
+    assert divided(2, 1, None).cores == ((3,), (2,))
+    assert divided(2, 2, None).cores == ((0, 1), (2, 3))
