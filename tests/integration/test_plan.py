@@ -1,6 +1,7 @@
 """`crossgrad plan` and `--plan auto`: the table, and runs without what is left out."""
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -43,6 +44,28 @@ def test_the_table(scene, capsys, monkeypatch):
     assert "gain (yours)" in out
     assert "cost saved" in out
     assert max(map(len, out.splitlines())) <= 120
+
+
+def test_the_command_that_follows_has_what_was_asked_for(scene, tmp_path, capsys):
+    file = tmp_path / "my plan.yaml"
+    file.write_text("seed: 3\n")
+    asked = ("--config", file, "--seconds", 90, "--max-size", 24, "--set", "background=1, 1, 1")
+    assert ended("plan", scene, *asked) == 0
+    (way,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("run it")]
+    command = shlex.split(way.removeprefix("run it: crossgrad run "))
+    assert command[:3] == [str(scene), "--plan", "auto"]
+    pairs = set(zip(command[3::2], command[4::2], strict=True))
+    assert pairs == {(flag, str(each)) for flag, each in zip(asked[::2], asked[1::2], strict=True)}
+
+
+@pytest.mark.parametrize("length", [(), ("--seconds", 60)])
+def test_a_length_that_was_decided_is_written_down(scene, tmp_path, length):
+    file = tmp_path / "plan.yaml"
+    assert ended("plan", scene, *length, "--write", file) == 0
+    stored = read_mapping(file, "a configuration", "repair it")
+    assert (stored["max_views"], stored.get("steps")) == (1_000, None)
+    assert stored.get("seconds") == (60.0 if length else None)
+    assert ended("run", "--config", file, "--dry-run", "-q") == 0
 
 
 def test_json_has_every_figure(scene, capsys):

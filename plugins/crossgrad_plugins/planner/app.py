@@ -55,7 +55,15 @@ def plan(
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:
         return made, "--write FILE keeps this for crossgrad run --config FILE"
-    return made, f"run it: crossgrad run {quote(str(config.scene))} --plan auto"
+    given = {**options, "config": file, "scene": None}
+    words = [quote(str(config.scene)), "--plan auto"]
+    words += [
+        f"--{name.replace('_', '-')} {quote(f'{each:.10g}' if isinstance(each, float) else str(each))}"
+        for name, each in given.items()
+        if each is not None
+    ]
+    words += [f"--set {quote(each)}" for each in assignments]
+    return made, f"run it: crossgrad run {' '.join(words)}"
 
 
 def show(made: Plan, way: str, *, as_json: bool) -> None:

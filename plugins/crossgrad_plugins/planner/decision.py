@@ -44,7 +44,7 @@ class Decision:
     force: str
     saved: str = NOTHING
     figures: Figures = field(default_factory=dict)
-    settings: Mapping[str, str | float] = field(default_factory=dict)
+    settings: Mapping[str, str | int] = field(default_factory=dict)
     seconds: float = 0.0
 
     def found(
@@ -69,7 +69,7 @@ class Decision:
         )
 
     def changed(
-        self, choice: str, settings: Mapping[str, str | float], force: str, saved: str = NOTHING
+        self, choice: str, settings: Mapping[str, str | int], force: str, saved: str = NOTHING
     ) -> "Decision":
         """Another choice on the same evidence, which decides.
 

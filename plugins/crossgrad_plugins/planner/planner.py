@@ -35,7 +35,7 @@ class Plan:
     seconds: float
 
     @property
-    def settings(self) -> Mapping[str, str | float]:
+    def settings(self) -> Mapping[str, str | int]:
         """The settings that change, as options are called."""
         return {name: value for each in self.decisions for name, value in each.settings.items()}
 
@@ -45,7 +45,11 @@ class Plan:
 
     def applied_to(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """A run's settings in their long form with what is decided."""
-        return layered([settings, self.settings])
+        decided, seconds = dict(self.settings), settings.get("seconds")
+        if "max_views" in decided and seconds is not None:
+            # A later length replaces those of before, and this one is within the seconds.
+            decided["seconds"] = seconds
+        return layered([settings, decided])
 
     def notes(self) -> Iterator[str]:
         """What a run tells its user: what changes, and what was set and stays."""

@@ -114,10 +114,8 @@ def length(evidence: Evidence) -> Decision:
     if seconds is None:
         saved = f"{1.0 - most / usual:.0%} of the views of {asked}"
     found = plain.found(shown, figures={"views": most})
-    # A length replaces those of before as a whole.
-    settings = {"max_views": most} | ({} if seconds is None else {"seconds": seconds})
     choice = f"{most:,} views" if seconds is None else f"{most:,} views within {asked}"
-    return found.changed(choice, settings, _EXACTLY, saved)
+    return found.changed(choice, {"max_views": most}, _EXACTLY, saved)
 
 
 def densifier(evidence: Evidence) -> Decision:
