@@ -46,6 +46,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 #: Parts into which the chunks are divided for counting; fixed, so as not to depend on the threads.
 PARTS = 16
 
+#: Records whose spans are computed before the first of their tiles is written: loops of unknown
+#: length would make the processor wait for the roots of each record.
+_GROUP = 32
+
 #: Records ahead for which memory is asked: first the slot numbers, then the slots.
 _FAR, _NEAR = 32, 16
 
@@ -100,6 +104,7 @@ def _spans(
     records: NDArray[np.float32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
+    place: int,
 ) -> None:
     """Writes the first and last tile reached in eight rows of tiles (first > last: none).
 
@@ -129,8 +134,8 @@ def _spans(
     first = round_up(fma(slope, left, u) - left_extent)
     last = round_down(fma(slope, right, u) + right_extent)
     empty = splat(np.float32(-1.0))
-    store(begins, 0, _tile(first, TILE_WIDTH))
-    store(ends, 0, where((top <= bottom) & (first <= last), _tile(last, TILE_WIDTH), empty))
+    store(begins, place, _tile(first, TILE_WIDTH))
+    store(ends, place, where((top <= bottom) & (first <= last), _tile(last, TILE_WIDTH), empty))
 
 
 @device
@@ -144,19 +149,23 @@ def _find(
     counts: NDArray[np.int32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
+    place: int,
     boxed: bool,
 ) -> int:
-    """Writes the tiles that record j reaches to its slots and counts them; returns their number."""
+    """Writes the tiles that record j reaches to its slots and counts them; returns their number.
+
+    The spans of the first eight rows of tiles are at `place`, unless all of the box is taken.
+    """
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
     slot = first_slot
     for block in range(boxes[j, 2], boxes[j, 3], LANES):
         if boxed:
-            begins[:], ends[:] = left, right
-        else:
-            _spans(j * RECORD, block, records, begins, ends)
+            begins[place : place + LANES], ends[place : place + LANES] = left, right
+        elif block > boxes[j, 2]:
+            _spans(j * RECORD, block, records, begins, ends, place)
         for row in range(min(LANES, boxes[j, 3] - block)):
-            begin = np.intp(max(left, begins[row]))
-            end = np.intp(min(right, ends[row]))
+            begin = np.intp(max(left, begins[place + row]))
+            end = np.intp(min(right, ends[place + row]))
             for column in range(begin, end + 1):
                 tile = (block + row) * tile_columns + column
                 tile_of_slot[slot] = tile
@@ -191,26 +200,34 @@ def find_tiles(
         counts: [PARTS, T] written: entries per part and tile; zero before.
     """
     chunks = drawn.shape[0]
-    begins = np.empty(LANES, np.float32)
-    ends = np.empty(LANES, np.float32)
+    begins = np.empty(_GROUP * LANES, np.float32)
+    ends = np.empty(_GROUP * LANES, np.float32)
     part = take(jobs)
     while part < PARTS:
         for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
-            for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-                shelves[j, SLOTS] = _find(
-                    j,
-                    tile_columns,
-                    records,
-                    boxes,
-                    np.intp(shelves[j, FIRST_SLOT]),
-                    tile_of_slot,
-                    counts[part],
-                    begins,
-                    ends,
-                    boxed,
-                )
-                shelves[j, FIRST_ROW] = boxes[j, 2]
-                shelves[j, LAST_ROW] = boxes[j, 3] - 1
+            last = chunk * CHUNK + drawn[chunk]
+            for first in range(chunk * CHUNK, last, _GROUP):
+                group = range(first, min(first + _GROUP, last))
+                if not boxed:
+                    for j in group:
+                        place = (j - first) * LANES
+                        _spans(j * RECORD, boxes[j, 2], records, begins, ends, place)
+                for j in group:
+                    shelves[j, SLOTS] = _find(
+                        j,
+                        tile_columns,
+                        records,
+                        boxes,
+                        np.intp(shelves[j, FIRST_SLOT]),
+                        tile_of_slot,
+                        counts[part],
+                        begins,
+                        ends,
+                        (j - first) * LANES,
+                        boxed,
+                    )
+                    shelves[j, FIRST_ROW] = boxes[j, 2]
+                    shelves[j, LAST_ROW] = boxes[j, 3] - 1
         part = take(jobs)
 
 
