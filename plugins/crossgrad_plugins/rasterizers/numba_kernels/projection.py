@@ -43,9 +43,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     SQUARE,
     VARIANCE_X,
     VARIANCE_Y,
-    analytic_record,
-    plain_record,
+    analytic_shape,
+    place_record,
+    plain_shape,
     square,
+    write_analytic,
+    write_plain,
 )
 
 #: Standard deviations at which a Gaussian of opacity 1 has faded, and 1 % for poses that are not
@@ -226,11 +229,16 @@ def _record_block(
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
         if analytic is None:
-            radius = plain_record(k, j, opacity, width, height, within, found, records, boxes)
+            radius, pixels, plain = plain_shape(k, opacity, width, height, within, found)
         else:
-            radius = analytic_record(k, j, opacity, width, height, within, found, records, boxes)
+            radius, pixels, turned = analytic_shape(k, opacity, width, height, within, found)
         if radius == 0 or (colors is not None and not _tint(i, j, colors, records)):
             continue
+        if analytic is None:
+            write_plain(j, plain, records)
+        else:
+            write_analytic(j, turned, records)
+        place_record(j, get(found, MEAN_U, k), get(found, MEAN_V, k), pixels, records, boxes)
         if limits is None:
             radii[i] = radius
         else:

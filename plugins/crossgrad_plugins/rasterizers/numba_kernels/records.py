@@ -53,6 +53,10 @@ FOUND = 8
 SIGMAS, LEAST_SPREAD, SQUARE = 3.0, 0.1, 16.0
 #: First and last pixel column, first and last pixel row.
 Rectangle = tuple[float, float, float, float]
+#: What a record says besides mean and colour, in the order of the layout: of the plain response
+#: SLOPE to LOG_OPACITY; of the analytic one COSINE to INVERSE_2, REACH_1 to RADIUS, PEAK.
+Plain = tuple[float, float, float, float, float]
+Analytic = tuple[float, float, float, float, float, float, float, float]
 
 _LARGEST_RADIUS = 2.0**30
 # Projected values beyond this are dropped; well inside float32.
@@ -120,8 +124,7 @@ def _hits(
 
 
 @device
-def _place(
-    j: int,
+def _pixels(
     u: float,
     v: float,
     extent_x: float,
@@ -129,26 +132,35 @@ def _place(
     width: int,
     height: int,
     within: Rectangle,
+) -> Rectangle:
+    """Returns the pixels that a footprint may touch (x0 > x1 or y0 > y1: none)."""
+    return (
+        max(first_pixel(u - extent_x), within[0]),
+        min(last_pixel(u + extent_x, width), within[1]),
+        max(first_pixel(v - extent_y), within[2]),
+        min(last_pixel(v + extent_y, height), within[3]),
+    )
+
+
+@device
+def place_record(
+    j: int,
+    u: float,
+    v: float,
+    pixels: Rectangle,
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
-) -> Rectangle:
-    """Writes mean and tile box of record j; returns its pixels x0, x1, y0, y1 (x0 > x1: none)."""
-    x0 = max(first_pixel(u - extent_x), within[0])
-    x1 = min(last_pixel(u + extent_x, width), within[1])
-    y0 = max(first_pixel(v - extent_y), within[2])
-    y1 = min(last_pixel(v + extent_y, height), within[3])
-    if x0 > x1 or y0 > y1:
-        return 1.0, 0.0, 1.0, 0.0
+) -> None:
+    """Writes mean and tile box of record j."""
     at = j * RECORD
     records[at + U_WHOLE] = np.floor(u)
     records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
     records[at + V_WHOLE] = np.floor(v)
     records[at + V_PART] = v - np.float64(records[at + V_WHOLE])
-    boxes[j, 0] = np.int32(x0) // TILE_WIDTH
-    boxes[j, 1] = np.int32(x1) // TILE_WIDTH + 1
-    boxes[j, 2] = np.int32(y0) // TILE_HEIGHT
-    boxes[j, 3] = np.int32(y1) // TILE_HEIGHT + 1
-    return x0, x1, y0, y1
+    boxes[j, 0] = np.int32(pixels[0]) // TILE_WIDTH
+    boxes[j, 1] = np.int32(pixels[1]) // TILE_WIDTH + 1
+    boxes[j, 2] = np.int32(pixels[2]) // TILE_HEIGHT
+    boxes[j, 3] = np.int32(pixels[3]) // TILE_HEIGHT + 1
 
 
 @device
@@ -199,18 +211,20 @@ def _radius(extent: float) -> int:
 
 
 @device
-def plain_record(
+def plain_shape(
     k: int,
-    j: int,
     opacity: float,
     width: int,
     height: int,
     within: Rectangle,
     found: NDArray[np.float64],
-    records: NDArray[np.float32],
-    boxes: NDArray[np.int32],
-) -> int:
-    """Makes record j of projected Gaussian k; returns its radius, 0 where it touches no pixel."""
+) -> tuple[int, Rectangle, Plain]:
+    """Returns the radius of projected Gaussian k, its pixels, and what its record says.
+
+    The radius is 0 where it touches no pixel. Nothing is written here: Numba counts references to
+    the arrays of a function with several ways out, which takes time.
+    """
+    nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
     inverse_c = 1.0 / c
@@ -226,18 +240,31 @@ def plain_record(
         and abs(u) + abs(v) + decay + inverse_c < _LARGEST
         and abs(slope) < _STEEPEST
     ):
-        return 0
+        return nothing
     extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
-    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, within, records, boxes)
-    if x0 > x1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
-        return 0
+    pixels = _pixels(u, v, extent_x, extent_y, width, height, within)
+    x0, x1, y0, y1 = pixels
+    if x0 > x1 or y0 > y1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
+        return nothing
+    numbers = (
+        slope,
+        max(0.5 * LOG2_E * inverse_c, _FLAT),
+        max(decay, _FLAT),
+        min(2.0 / LOG2_E * variance, 1.0 / _FLAT),
+        log_opacity,
+    )
+    return _radius(max(extent_x, extent_y)), pixels, numbers
+
+
+@device
+def write_plain(j: int, numbers: Plain, records: NDArray[np.float32]) -> None:
+    """Writes what record j of the plain response says."""
     at = j * RECORD
-    records[at + SLOPE] = slope
-    records[at + ROW_DECAY] = max(0.5 * LOG2_E * inverse_c, _FLAT)
-    records[at + DECAY] = max(decay, _FLAT)
-    records[at + WIDTH] = min(2.0 / LOG2_E * variance, 1.0 / _FLAT)
-    records[at + LOG_OPACITY] = log_opacity
-    return _radius(max(extent_x, extent_y))
+    records[at + SLOPE] = numbers[0]
+    records[at + ROW_DECAY] = numbers[1]
+    records[at + DECAY] = numbers[2]
+    records[at + WIDTH] = numbers[3]
+    records[at + LOG_OPACITY] = numbers[4]
 
 
 @device
@@ -260,37 +287,36 @@ def _covers(
 
 
 @device
-def analytic_record(
+def analytic_shape(
     k: int,
-    j: int,
     opacity: float,
     width: int,
     height: int,
     within: Rectangle,
     found: NDArray[np.float64],
-    records: NDArray[np.float32],
-    boxes: NDArray[np.int32],
-) -> int:
-    """As `plain_record` for the analytic response."""
+) -> tuple[int, Rectangle, Analytic]:
+    """As `plain_shape` for the analytic response."""
+    nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
     if not (det >= 0.0 and a + c + det < math.inf and abs(u) + abs(v) < _LARGEST):
-        return 0
+        return nothing
     cosine, sine, variance_1, variance_2 = main_axes(a, get(found, COVARIANCE, k), c, det)
     sigma_1 = clamped(math.sqrt(variance_1), SIGMA_FLOOR, SIGMA_CEILING)
     sigma_2 = clamped(math.sqrt(variance_2), SIGMA_FLOOR, SIGMA_CEILING)
     if not opacity * central_window(sigma_1) * central_window(sigma_2) >= ALPHA_THRESHOLD:
-        return 0
+        return nothing
     squared = squared_radius(opacity)
     reach_1 = 0.5 + sigma_1 * math.sqrt(squared)
     reach_2 = 0.5 + sigma_2 * math.sqrt(squared)
     if not reach_1 + reach_2 < _LARGEST:
-        return 0
+        return nothing
     extent_x = abs(cosine) * reach_1 + abs(sine) * reach_2
     extent_y = abs(sine) * reach_1 + abs(cosine) * reach_2
-    x0, x1, y0, y1 = _place(j, u, v, extent_x, extent_y, width, height, within, records, boxes)
-    if x0 > x1:
-        return 0
+    pixels = _pixels(u, v, extent_x, extent_y, width, height, within)
+    x0, x1, y0, y1 = pixels
+    if x0 > x1 or y0 > y1:
+        return nothing
     axis, sigma, reach = (cosine, sine), (sigma_1, sigma_2), (reach_1, reach_2)
     x, y = clamped(np.floor(u), x0, x1), clamped(np.floor(v), y0, y1)
     touched = _covers(x, y, u, v, axis, sigma, reach, opacity)
@@ -302,11 +328,26 @@ def analytic_record(
             x += 1.0
         y += 1.0
     if not touched:
-        return 0
+        return nothing
+    numbers = (
+        cosine,
+        sine,
+        1.0 / sigma_1,
+        1.0 / sigma_2,
+        reach_1,
+        reach_2,
+        squared,
+        2.0 * math.pi * opacity * sigma_1 * sigma_2,
+    )
+    radius = _radius(math.sqrt(2.0 * math.log(opacity / ALPHA_THRESHOLD) * max(a, c)))
+    return radius, pixels, numbers
+
+
+@device
+def write_analytic(j: int, numbers: Analytic, records: NDArray[np.float32]) -> None:
+    """Writes what record j of the analytic response says."""
     at = j * RECORD
-    records[at + COSINE], records[at + SINE] = cosine, sine
-    records[at + INVERSE_1], records[at + INVERSE_2] = 1.0 / sigma_1, 1.0 / sigma_2
-    records[at + REACH_1], records[at + REACH_2] = reach_1, reach_2
-    records[at + RADIUS] = squared
-    records[at + PEAK] = 2.0 * math.pi * opacity * sigma_1 * sigma_2
-    return _radius(math.sqrt(2.0 * math.log(opacity / ALPHA_THRESHOLD) * max(a, c)))
+    records[at + COSINE], records[at + SINE] = numbers[0], numbers[1]
+    records[at + INVERSE_1], records[at + INVERSE_2] = numbers[2], numbers[3]
+    records[at + REACH_1], records[at + REACH_2] = numbers[4], numbers[5]
+    records[at + RADIUS], records[at + PEAK] = numbers[6], numbers[7]
