@@ -4,10 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, take
-from crossgrad_core.numerics.simd import LANES, load, splat, store
+from crossgrad_core.numerics.simd import LANES, load, prefetch, splat, store
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
+
+#: Slots ahead for whose rows memory is asked: records follow each other in it.
+_AHEAD = 32
 
 
 @device
@@ -26,6 +29,7 @@ def add_up(
     low, high = splat(np.float32(0.0)), splat(np.float32(0.0))
     found = False
     for slot in range(first, first + count):
+        prefetch(partials, min(slot + _AHEAD, zeros) * PARTIAL)
         row = slot if written[slot] else zeros
         found |= row == slot
         low = low + load(partials, row * PARTIAL)
