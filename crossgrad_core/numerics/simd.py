@@ -207,12 +207,24 @@ def _broadcast(width: int) -> Callable[..., Any]:
     return emit
 
 
-def _broadcast_two(at: _Site, array: Any, index: Any) -> Any:
-    # A choice by a constant, not a shuffle: two instructions with AVX-512, and none more without.
-    upper = ir.Constant(ir.VectorType(ir.IntType(1), WIDE), [0] * LANES + [1] * LANES)
-    following = at.builder.add(index, ir.Constant(index.type, 1))
-    low, high = (_broadcast(WIDE)(at, array, i) for i in (index, following))
-    return at.builder.select(upper, high, low)
+def _broadcast_two(width: int) -> Callable[..., Any]:
+    def emit(at: _Site, array: Any, index: Any) -> Any:
+        # As one number of 64 bits it is a load and nothing else; two halves would need a shuffle.
+        two = at.builder.load(_element(at, array, index, _LONG), align=_ALIGNMENT)
+        empty = ir.Constant(ir.VectorType(_LONG, width // 2), ir.Undefined)
+        single = at.builder.insert_element(empty, two, _INT(0))
+        return at.builder.bitcast(_shuffle(at, single, single, [0] * (width // 2)), _floats(width))
+
+    return emit
+
+
+def _interleaved(at: _Site, a: Any, b: Any) -> Any:
+    return _shuffle(at, a, b, [lane + start for lane in range(LANES) for start in (0, LANES)])
+
+
+def _halves_added(at: _Site, a: Any) -> Any:
+    low, high = (_shuffle(at, a, a, range(start, start + LANES)) for start in (0, LANES))
+    return at.builder.fadd(low, high)
 
 
 def _store(at: _Site, array: Any, index: Any, value: Any) -> Any:
@@ -314,6 +326,10 @@ ramp: Callable[[], Lanes] = _function(_ramp(LANES), _eight)
 load: Callable[[_Array, int], Lanes] = _function(_load(LANES), _eight, None, types.intp)
 #: Returns one number of a flat float32 array in all lanes.
 broadcast: Callable[[_Array, int], Lanes] = _function(_broadcast(LANES), _eight, None, types.intp)
+#: Returns two consecutive numbers of a flat float32 array, by turns in eight lanes.
+broadcast_two: Callable[[_Array, int], Lanes] = _function(
+    _broadcast_two(LANES), _eight, None, types.intp
+)
 #: Returns a float32 number in sixteen lanes.
 splat_wide: Callable[[np.float32], Lanes] = _function(_splat(WIDE), _wide, types.float32)
 #: Returns (0, 1, ..., 15).
@@ -324,16 +340,22 @@ load_wide: Callable[[_Array, int], Lanes] = _function(_load(WIDE), _wide, None, 
 broadcast_wide: Callable[[_Array, int], Lanes] = _function(
     _broadcast(WIDE), _wide, None, types.intp
 )
-#: Returns two consecutive numbers of a flat float32 array, in eight lanes each.
-broadcast_two: Callable[[_Array, int], Lanes] = _function(_broadcast_two, _wide, None, types.intp)
-#: Returns the first eight of sixteen lanes.
-low_half: Callable[[Lanes], Lanes] = _function(
-    lambda at, a: _shuffle(at, a, a, range(LANES)), _eight, _wide
+#: Returns two consecutive numbers of a flat float32 array, by turns in sixteen lanes.
+broadcast_two_wide: Callable[[_Array, int], Lanes] = _function(
+    _broadcast_two(WIDE), _wide, None, types.intp
 )
-#: Returns the sixteen lanes of two vectors of eight.
-joined: Callable[[Lanes, Lanes], Lanes] = _function(
-    lambda at, a, b: _shuffle(at, a, b, range(WIDE)), _wide, _eight, _eight
+#: Returns the lanes of two vectors of eight by turns.
+interleaved: Callable[[Lanes, Lanes], Lanes] = _function(_interleaved, _wide, _eight, _eight)
+#: Returns the first of two vectors that were interleaved.
+even_lanes: Callable[[Lanes], Lanes] = _function(
+    lambda at, a: _shuffle(at, a, a, range(0, WIDE, 2)), _eight, _wide
 )
+#: Returns the second of them.
+odd_lanes: Callable[[Lanes], Lanes] = _function(
+    lambda at, a: _shuffle(at, a, a, range(1, WIDE, 2)), _eight, _wide
+)
+#: Returns the first eight of sixteen lanes plus the last eight.
+halves_added: Callable[[Lanes], Lanes] = _function(_halves_added, _eight, _wide)
 #: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
 #: vectors, from a flat index on.
 load_triples: Callable[[_Array, int], _Three] = _function(_load_triples, _triple, None, types.intp)

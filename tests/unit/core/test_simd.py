@@ -9,12 +9,15 @@ from crossgrad_core.numerics.simd import (
     WIDE,
     bits,
     broadcast_two,
+    broadcast_two_wide,
+    even_lanes,
     fma,
-    joined,
+    halves_added,
+    interleaved,
     load,
     load_triples,
     load_wide,
-    low_half,
+    odd_lanes,
     splat,
     splat_wide,
     square_root,
@@ -32,9 +35,13 @@ def _turned(source, target):
 
 @kernel
 def _two(source, target):
-    store(target, 0, broadcast_two(source, 3))
-    store(target, WIDE, low_half(broadcast_two(source, 4)))
-    store(target, WIDE + LANES, joined(load(source, LANES), load(source, 0)))
+    store(target, 0, broadcast_two_wide(source, 3))
+    store(target, WIDE, broadcast_two(source, 4))
+    both = interleaved(load(source, LANES), load(source, 0))
+    store(target, WIDE + LANES, both)
+    store(target, 2 * WIDE + LANES, even_lanes(both))
+    store(target, 3 * WIDE, odd_lanes(both))
+    store(target, 3 * WIDE + LANES, halves_added(load_wide(source, 0)))
 
 
 @kernel
@@ -67,11 +74,14 @@ def test_triples_come_apart_and_together_again():
     assert target[[0, 1, -1]].tolist() == [-1, -1, -1]
 
 
-def test_halves_of_a_wide_vector():
+def test_two_vectors_by_turns():
     source = np.arange(WIDE, dtype=np.float32)
-    target = np.empty(2 * WIDE + LANES, np.float32)
+    target = np.empty(4 * WIDE, np.float32)
     _two(source, target)
-    expected = [3] * LANES + [4] * LANES + [4] * LANES + [*range(LANES, WIDE), *range(LANES)]
+    first, second = range(LANES, WIDE), range(LANES)
+    by_turns = [lane for both in zip(first, second, strict=True) for lane in both]
+    sums = [a + b for a, b in zip(first, second, strict=True)]
+    expected = [*[3, 4] * LANES, *[4, 5] * (LANES // 2), *by_turns, *first, *second, *sums]
     assert target.tolist() == expected
 
 

@@ -19,19 +19,19 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_core.numerics.simd import (
-    LANES,
     Lanes,
     bits,
-    broadcast,
+    broadcast_two_wide,
+    broadcast_wide,
     fma,
     fnma,
     larger,
     magnitude,
-    ramp,
+    ramp_wide,
     round_down,
     round_up,
     smaller,
-    splat,
+    splat_wide,
     store,
     where,
 )
@@ -147,38 +147,37 @@ def fill_axis_rows(
     base: int,
 ) -> np.uint64:
     """As `footprint.fill_rows`: the segments within reach along both main axes."""
-    half = splat(np.float32(0.5))
-    dx = splat(left) - broadcast(records, record + U_WHOLE)
-    dx = dx + (half - broadcast(records, record + U_PART))
-    first_dy = splat(top) - broadcast(records, record + V_WHOLE)
-    first_dy = first_dy + (half - broadcast(records, record + V_PART))
-    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    reach_1, reach_2 = broadcast(records, record + REACH_1), broadcast(records, record + REACH_2)
+    half, zero = _number(0.5), _number(0.0)
+    dx = splat_wide(left) - broadcast_wide(records, record + U_WHOLE)
+    dx = dx + (half - broadcast_wide(records, record + U_PART))
+    first_dy = splat_wide(top) - broadcast_wide(records, record + V_WHOLE)
+    first_dy = first_dy + (half - broadcast_wide(records, record + V_PART))
+    cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
+    reach_1 = broadcast_wide(records, record + REACH_1)
+    reach_2 = broadcast_wide(records, record + REACH_2)
+    # One lane for each row of the tile.
+    dy = first_dy + ramp_wide()
+    u = fma(sine, dy, cosine * dx)
+    v = fnma(sine, dx, cosine * dy)
+    store(rows, base + ROW_U, u)
+    store(rows, base + ROW_V, v)
+    # Pixel x is at u + cosine x and v - sine x. Dividing by zero gives infinite bounds.
+    low_1, high_1 = (zero - reach_1 - u) / cosine, (reach_1 - u) / cosine
+    low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
+    first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))
+    last = round_down(smaller(larger(low_1, high_1), larger(low_2, high_2)))
+    row_reached = first <= last
     reached = np.uint64(0)
-    for block in range(0, TILE_HEIGHT, LANES):
-        dy = first_dy + (ramp() + splat(np.float32(block)))
-        u = fma(sine, dy, cosine * dx)
-        v = fnma(sine, dx, cosine * dy)
-        store(rows, base + ROW_U + block, u)
-        store(rows, base + ROW_V + block, v)
-        # Pixel x is at u + cosine x and v - sine x. Dividing by zero gives infinite bounds.
-        zero = splat(np.float32(0.0))
-        low_1, high_1 = (zero - reach_1 - u) / cosine, (reach_1 - u) / cosine
-        low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
-        first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))
-        last = round_down(smaller(larger(low_1, high_1), larger(low_2, high_2)))
-        row_reached = first <= last
-        for column in range(COLUMNS):
-            begin = splat(np.float32(column * SEGMENT))
-            end = splat(np.float32(column * SEGMENT + SEGMENT - 1))
-            inside = row_reached & (first <= end) & (last >= begin)
-            reached |= bits(inside) << np.uint64(column * TILE_HEIGHT + block)
+    for column in range(COLUMNS):
+        begin, end = _number(column * SEGMENT), _number(column * SEGMENT + SEGMENT - 1)
+        inside = row_reached & (first <= end) & (last >= begin)
+        reached |= bits(inside) << np.uint64(column * TILE_HEIGHT)
     return reached
 
 
 @device
 def _number(value: float) -> Lanes:
-    return splat(np.float32(value))
+    return splat_wide(np.float32(value))
 
 
 @device
@@ -309,7 +308,7 @@ def coverage_gradients(
 def axis_offsets(
     cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
 ) -> tuple[Lanes, Lanes]:
-    """Returns the offsets along the main axes of pixels `offsets` right of the row's first."""
-    u = fma(cosine, offsets, broadcast(rows, row + ROW_U))
-    v = fnma(sine, offsets, broadcast(rows, row + ROW_V))
+    """Returns the offsets along the main axes of pixels `offsets` right of a pair's first ones."""
+    u = fma(cosine, offsets, broadcast_two_wide(rows, row + ROW_U))
+    v = fnma(sine, offsets, broadcast_two_wide(rows, row + ROW_V))
     return u, v

@@ -16,16 +16,24 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
+    WIDE,
+    Lanes,
     broadcast,
+    broadcast_two,
+    broadcast_two_wide,
+    broadcast_wide,
     fma,
     fnma,
+    halves_added,
     load,
+    load_wide,
     lowest_bit,
     magnitude,
     prefetch,
     prefetch_write,
     smaller,
     splat,
+    splat_wide,
     store,
     sums,
     total,
@@ -89,10 +97,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     odds_of,
     start_tile,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, upper_of
 
-#: Numbers of the response in a segment: alpha, and its odds.
-RESPONSE = 2 * LANES
+#: Numbers of a pair of segments, WIDE each: alpha (later the gradient by the exponent), the odds of
+#: alpha, and the column offsets.
+_ALPHA, _ODDS, _DX = 0, WIDE, 2 * WIDE
+_RESPONSE = 3 * WIDE
 
 #: Entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
@@ -100,7 +110,7 @@ BATCH = 8
 
 @device
 def _respond(
-    reached: np.uint64,
+    pairs: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -109,35 +119,131 @@ def _respond(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> None:
-    """Writes the plain response in the reached segments, one after the other: alpha, its odds.
+    """Writes the plain response in pairs of segments, one after the other.
 
-    A loop of its own: nothing in it waits for the transmittance, which a segment gets from the
-    Gaussian before, so that the processor works on several segments at once.
+    A loop of its own: nothing in it waits for the transmittance, which a pair gets from the
+    Gaussian before, so that the processor works on several pairs at once.
     """
-    decay = broadcast(records, record + DECAY)
+    decay = broadcast_wide(records, record + DECAY)
     terms = terms_of(constants)
-    zero = splat(np.float32(0.0))
+    zero = splat_wide(np.float32(0.0))
     at = 0
-    while reached != np.uint64(0):
-        segment = lowest_bit(reached)
-        reached &= reached - np.uint64(1)
+    while pairs != np.uint64(0):
+        segment = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
         row = base + (segment & (TILE_HEIGHT - 1))
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
-        dx = offsets - broadcast(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-        touched = power >= load(constants, TOUCHED)
-        alpha = where(touched, smaller(exp2(power, terms), load(constants, LARGEST_ALPHA)), zero)
+        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+        dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+        touched = power >= load_wide(constants, TOUCHED)
+        # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
+        alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
+        alpha = where(touched, alpha, zero)
         odds = odds_of(alpha, constants)
         if capped is not None:
-            odds = where(power <= load(constants, CAPPED), odds, load(constants, FIXED))
-        store(responses, at, alpha)
-        store(responses, at + LANES, odds)
-        at += RESPONSE
+            odds = where(power <= load_wide(constants, CAPPED), odds, load_wide(constants, FIXED))
+        store(responses, at + _ALPHA, alpha)
+        store(responses, at + _ODDS, odds)
+        store(responses, at + _DX, dx)
+        at += _RESPONSE
+
+
+@device
+def _blend(
+    pairs: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+    capped: NDArray[np.float32] | None,
+    responses: NDArray[np.float32],
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Blends a plain Gaussian into pairs; turns alpha into the gradient by the exponent.
+
+    Returns:
+        The sums of the gradients by red, green, blue and the depth.
+    """
+    red = broadcast_wide(records, record + RED)
+    green = broadcast_wide(records, record + GREEN)
+    blue = broadcast_wide(records, record + BLUE)
+    z = broadcast_wide(records, record + DEPTH)
+    sum_red = sum_green = sum_blue = sum_depth = splat_wide(np.float32(0.0))
+    response = 0
+    while pairs != np.uint64(0):
+        segment = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
+        at = segment * (STATE // 2)
+        alpha = load_wide(responses, response + _ALPHA)
+        odds = load_wide(responses, response + _ODDS)
+        v_red = load_wide(state, at + V_RED)
+        v_green = load_wide(state, at + V_GREEN)
+        v_blue = load_wide(state, at + V_BLUE)
+        toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
+        if v_depth is not None:
+            v_z = load_wide(state, DEPTHS + segment * LANES)
+            toned = fma(v_z, z, toned)
+        weight, s = blend(alpha, odds, capped, toned, state, at, constants)
+        store(responses, response + _ALPHA, s)
+        response += _RESPONSE
+        sum_red = fma(weight, v_red, sum_red)
+        sum_green = fma(weight, v_green, sum_green)
+        sum_blue = fma(weight, v_blue, sum_blue)
+        if v_depth is not None:
+            sum_depth = fma(weight, v_z, sum_depth)
+    return sum_red, sum_green, sum_blue, sum_depth
+
+
+@device
+def _moments(
+    pairs: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    base: int,
+    absolute: NDArray[np.float32] | None,
+    responses: NDArray[np.float32],
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """Returns SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
+
+    Both halves of a pair's lanes have the same rows, hence the same dy: they are added before it
+    is multiplied by. Six sums of eight lanes also fit into the registers of machines with sixteen.
+    """
+    # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
+    pull = broadcast(records, record + ROW_DECAY)
+    lean = broadcast(records, record + DECAY) * broadcast(records, record + SLOPE)
+    sum_1 = sum_d = sum_y = sum_dd = sum_yy = sum_dy = splat(np.float32(0.0))
+    sum_abs_x = sum_abs_y = splat(np.float32(0.0))
+    response = 0
+    while pairs != np.uint64(0):
+        row = base + (lowest_bit(pairs) & (TILE_HEIGHT - 1))
+        pairs &= pairs - np.uint64(1)
+        first = load(responses, response + _ALPHA)
+        second = load(responses, response + _ALPHA + LANES)
+        first_dx = load(responses, response + _DX)
+        second_dx = load(responses, response + _DX + LANES)
+        response += _RESPONSE
+        dy = broadcast_two(rows, row + ROW_DY)
+        first_d, second_d = first * first_dx, second * second_dx
+        s, sd = first + second, first_d + second_d
+        sy = s * dy
+        sum_1 = sum_1 + s
+        sum_d = sum_d + sd
+        sum_y = sum_y + sy
+        sum_dd = fma(second_d, second_dx, fma(first_d, first_dx, sum_dd))
+        sum_yy = fma(sy, dy, sum_yy)
+        sum_dy = fma(sd, dy, sum_dy)
+        if absolute is not None:
+            sum_abs_x = sum_abs_x + (magnitude(first_d) + magnitude(second_d))
+            pulled = pull * dy
+            sum_abs_y = sum_abs_y + magnitude(fnma(lean, first_d, pulled * first))
+            sum_abs_y = sum_abs_y + magnitude(fnma(lean, second_d, pulled * second))
+    return sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y
 
 
 @device
 def _gather(
-    reached: np.uint64,
+    pairs: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -146,98 +252,116 @@ def _gather(
     constants: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
     absolute: NDArray[np.float32] | None,
-    analytic: NDArray[np.float32] | None,
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sums the gradients of one Gaussian over the reached segments into partials[partial:].
+    """Sums the gradients of one plain Gaussian over pairs of segments into partials[partial:].
 
-    `capped` is None for Gaussians whose alpha reaches the largest one nowhere.
+    A segment of them that it does not reach adds zeros. `capped` is None for Gaussians whose alpha
+    reaches the largest one nowhere.
     """
-    decay = broadcast(records, record + DECAY)
-    red = broadcast(records, record + RED)
-    green = broadcast(records, record + GREEN)
-    blue = broadcast(records, record + BLUE)
-    z = broadcast(records, record + DEPTH)
-    # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
-    pull = broadcast(records, record + ROW_DECAY)
-    lean = decay * broadcast(records, record + SLOPE)
-    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    inverse_1 = broadcast(records, record + INVERSE_1)
-    inverse_2 = broadcast(records, record + INVERSE_2)
-    peak = broadcast(records, record + PEAK)
-    zero = splat(np.float32(0.0))
-    sum_1 = sum_a = sum_b = sum_c = sum_d = sum_e = zero
+    _respond(pairs, records, record, rows, base, constants, capped, responses)
+    sum_red, sum_green, sum_blue, sum_depth = _blend(
+        pairs, records, record, state, constants, v_depth, capped, responses
+    )
+    sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y = _moments(
+        pairs, records, record, rows, base, absolute, responses
+    )
+    # In the order of the layout.
+    red, green = halves_added(sum_red), halves_added(sum_green)
+    store(partials, partial, sums(sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, red, green))
+    partials[partial + SUM_BLUE] = total(halves_added(sum_blue))
+    if v_depth is not None:
+        partials[partial + SUM_DEPTH] = total(halves_added(sum_depth))
+    if absolute is not None:
+        partials[partial + SUM_ABS_X] = total(sum_abs_x)
+        partials[partial + SUM_ABS_Y] = total(sum_abs_y)
+
+
+@device
+def _gather_analytic(
+    pairs: np.uint64,
+    records: NDArray[np.float32],
+    record: int,
+    rows: NDArray[np.float32],
+    base: int,
+    state: NDArray[np.float32],
+    constants: NDArray[np.float32],
+    v_depth: NDArray[np.float32] | None,
+    absolute: NDArray[np.float32] | None,
+    partials: NDArray[np.float32],
+    partial: int,
+) -> None:
+    """As `_gather` for the analytic response."""
+    red = broadcast_wide(records, record + RED)
+    green = broadcast_wide(records, record + GREEN)
+    blue = broadcast_wide(records, record + BLUE)
+    z = broadcast_wide(records, record + DEPTH)
+    cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
+    inverse_1 = broadcast_wide(records, record + INVERSE_1)
+    inverse_2 = broadcast_wide(records, record + INVERSE_2)
+    peak = broadcast_wide(records, record + PEAK)
+    zero = splat_wide(np.float32(0.0))
+    sum_1 = sum_u = sum_v = sum_sigma_1 = sum_sigma_2 = sum_turn = zero
     sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
-    if analytic is None:
-        _respond(reached, records, record, rows, base, constants, capped, responses)
-    response = 0
-    while reached != np.uint64(0):
-        segment = lowest_bit(reached)
-        reached &= reached - np.uint64(1)
+    while pairs != np.uint64(0):
+        segment = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
         row = base + (segment & (TILE_HEIGHT - 1))
-        at = segment * STATE
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
-        if analytic is None:
-            dx = offsets - broadcast(rows, row + ROW_CENTRE)
-            alpha, odds = load(responses, response), load(responses, response + LANES)
-            response += RESPONSE
-        else:
-            u, v = axis_offsets(cosine, sine, offsets, rows, row)
-            alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
-                peak, u, v, inverse_1, inverse_2, constants
-            )
-            touched = alpha >= load(constants, LEAST)
-            free = touched & (alpha <= load(constants, LARGEST_ALPHA))
-            alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-            odds = where(free, odds_of(alpha, constants), load(constants, FIXED))
-        v_red = load(state, at + V_RED)
-        v_green = load(state, at + V_GREEN)
-        v_blue = load(state, at + V_BLUE)
+        at = segment * (STATE // 2)
+        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+        u, v = axis_offsets(cosine, sine, offsets, rows, row)
+        alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
+            peak, u, v, inverse_1, inverse_2, constants
+        )
+        touched = alpha >= load_wide(constants, LEAST)
+        free = touched & (alpha <= load_wide(constants, LARGEST_ALPHA))
+        alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
+        odds = where(free, odds_of(alpha, constants), load_wide(constants, FIXED))
+        v_red = load_wide(state, at + V_RED)
+        v_green = load_wide(state, at + V_GREEN)
+        v_blue = load_wide(state, at + V_BLUE)
         toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
-            v_z = load(state, DEPTHS + segment * LANES)
+            v_z = load_wide(state, DEPTHS + segment * LANES)
             toned = fma(v_z, z, toned)
-        weight, s = blend(alpha, odds, capped, toned, state, at, constants)
+        weight, s = blend(alpha, odds, constants, toned, state, at, constants)
         sum_red = fma(weight, v_red, sum_red)
         sum_green = fma(weight, v_green, sum_green)
         sum_blue = fma(weight, v_blue, sum_blue)
         if v_depth is not None:
             sum_depth = fma(weight, v_z, sum_depth)
+        su = where(free, s * by_u * inverse_1, zero)
+        sv = where(free, s * by_v * inverse_2, zero)
         sum_1 = sum_1 + s
-        if analytic is None:
-            dy = broadcast(rows, row + ROW_DY)
-            sd = s * dx
-            sy = s * dy
-            sum_a = sum_a + sd
-            sum_b = sum_b + sy
-            sum_c = fma(sd, dx, sum_c)
-            sum_d = fma(sy, dy, sum_d)
-            sum_e = fma(sd, dy, sum_e)
-            if absolute is not None:
-                sum_abs_x = sum_abs_x + magnitude(sd)
-                sum_abs_y = sum_abs_y + magnitude(fnma(lean, sd, pull * sy))
-        else:
-            su = where(free, s * by_u * inverse_1, zero)
-            sv = where(free, s * by_v * inverse_2, zero)
-            sum_a = sum_a + su
-            sum_b = sum_b + sv
-            sum_c = fma(s, where(free, by_sigma_1, zero), sum_c)
-            sum_d = fma(s, where(free, by_sigma_2, zero), sum_d)
-            sum_e = sum_e + fnma(sv, u, su * v)
-            if absolute is not None:
-                sum_abs_x = sum_abs_x + magnitude(fnma(sine, sv, cosine * su))
-                sum_abs_y = sum_abs_y + magnitude(fma(cosine, sv, sine * su))
-    # In the order of SUM_1, SUM_D, SUM_Y, ... or SUM_1, SUM_U, SUM_V, ... of the layout.
-    store(partials, partial, sums(sum_1, sum_a, sum_b, sum_c, sum_d, sum_e, sum_red, sum_green))
-    partials[partial + SUM_BLUE] = total(sum_blue)
+        sum_u = sum_u + su
+        sum_v = sum_v + sv
+        sum_sigma_1 = fma(s, where(free, by_sigma_1, zero), sum_sigma_1)
+        sum_sigma_2 = fma(s, where(free, by_sigma_2, zero), sum_sigma_2)
+        sum_turn = sum_turn + fnma(sv, u, su * v)
+        if absolute is not None:
+            sum_abs_x = sum_abs_x + magnitude(fnma(sine, sv, cosine * su))
+            sum_abs_y = sum_abs_y + magnitude(fma(cosine, sv, sine * su))
+    # In the order of the layout.
+    eight = sums(
+        halves_added(sum_1),
+        halves_added(sum_u),
+        halves_added(sum_v),
+        halves_added(sum_sigma_1),
+        halves_added(sum_sigma_2),
+        halves_added(sum_turn),
+        halves_added(sum_red),
+        halves_added(sum_green),
+    )
+    store(partials, partial, eight)
+    partials[partial + SUM_BLUE] = total(halves_added(sum_blue))
     if v_depth is not None:
-        partials[partial + SUM_DEPTH] = total(sum_depth)
+        partials[partial + SUM_DEPTH] = total(halves_added(sum_depth))
     if absolute is not None:
-        partials[partial + SUM_ABS_X] = total(sum_abs_x)
-        partials[partial + SUM_ABS_Y] = total(sum_abs_y)
+        partials[partial + SUM_ABS_X] = total(halves_added(sum_abs_x))
+        partials[partial + SUM_ABS_Y] = total(halves_added(sum_abs_y))
 
 
 @device
@@ -265,40 +389,47 @@ def _backward(
     left = (tile % columns) * TILE_WIDTH
     state = aligned(DEPTHS + SEGMENTS * LANES)
     rows = aligned(BATCH * ROWS)
-    responses = aligned(SEGMENTS * RESPONSE)
+    responses = aligned(SEGMENTS // 2 * _RESPONSE)
     batch = np.empty(BATCH, np.int64)
     start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
     entry, stop = starts[tile], starts[tile + 1]
     while entry < stop:
         filled = 0
         while filled < BATCH and entry < stop:
-            prefetch(records, np.intp(entries[min(entry + BATCH, stop - 1), 0]) * RECORD)
-            record = np.intp(entries[entry, 0]) * RECORD
-            if analytic is None:
-                fill_rows(records, record, np.float32(left), np.float32(top), rows, filled * ROWS)
-            else:
-                fill_axis_rows(
-                    records, record, np.float32(left), np.float32(top), rows, filled * ROWS
-                )
-            batch[filled] = entry
+            prefetch(records, np.intp(entries[min(entry + 2 * BATCH, stop - 1), 0]) * RECORD)
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
+            batch[filled] = entry
+            # No branch: an entry without a mask is overwritten by the next one.
             filled += np.intp(masks[entry] != 0)
             entry += 1
+        for k in range(filled):
+            record, base = np.intp(entries[batch[k], 0]) * RECORD, k * ROWS
+            if analytic is None:
+                fill_rows(records, record, np.float32(left), np.float32(top), rows, base)
+            else:
+                fill_axis_rows(records, record, np.float32(left), np.float32(top), rows, base)
         for k in range(filled):
             at = batch[k]
             slot = np.intp(entries[at, 1])
             written[slot] = 1
             record = np.intp(entries[at, 0]) * RECORD
+            pairs = upper_of(np.uint64(masks[at]))
+            base, partial = k * ROWS, slot * PARTIAL
+            if analytic is not None:
+                _gather_analytic(
+                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    partials, partial,
+                )  # fmt: skip
             # Two loops: that of the many Gaussians that no pixel caps has less to do.
-            if analytic is None and records[record + LOG_OPACITY] <= constants[CAPPED]:
+            elif records[record + LOG_OPACITY] <= constants[CAPPED]:
                 _gather(
-                    np.uint64(masks[at]), records, record, rows, k * ROWS, state, constants,
-                    v_depth, absolute, analytic, None, responses, partials, slot * PARTIAL,
+                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    None, responses, partials, partial,
                 )  # fmt: skip
             else:
                 _gather(
-                    np.uint64(masks[at]), records, record, rows, k * ROWS, state, constants,
-                    v_depth, absolute, analytic, constants, responses, partials, slot * PARTIAL,
+                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    constants, responses, partials, partial,
                 )  # fmt: skip
 
 

@@ -15,7 +15,6 @@ from crossgrad_core.numerics.simd import (
     WIDE,
     Lanes,
     fma,
-    load,
     load_wide,
     scale_by_power,
 )
@@ -49,7 +48,7 @@ Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
-    """Returns the constants for one cap of alpha, WIDE equal numbers each (offsets: 0, 1, ...)."""
+    """Returns the constants for one cap of alpha, WIDE equal numbers each (offsets: by pairs)."""
     shared = (
         max_alpha,
         TOUCH,
@@ -60,8 +59,7 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
         ALPHA_THRESHOLD,
     )
     values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
-    offsets = np.arange(COLUMNS * SEGMENT, dtype=np.float32).reshape(COLUMNS, 1, SEGMENT)
-    pairs = np.repeat(offsets, PAIR // SEGMENT, axis=1).ravel()
+    pairs = np.repeat(np.arange(COLUMNS * SEGMENT, dtype=np.float32), PAIR // SEGMENT)
     flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), pairs])
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
@@ -73,24 +71,10 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
 
 @device
 def terms_of(constants: NDArray[np.float32]) -> Terms:
-    """Returns what `exp2` needs for eight lanes.
+    """Returns what `exp2` needs.
 
     Loaded before a loop it stays in registers where there are 32 of them.
     """
-    return (
-        load(constants, 0),
-        load(constants, EXP2),
-        load(constants, EXP2 + WIDE),
-        load(constants, EXP2 + 2 * WIDE),
-        load(constants, EXP2 + 3 * WIDE),
-        load(constants, EXP2 + 4 * WIDE),
-        load(constants, EXP2 + 5 * WIDE),
-    )
-
-
-@device
-def wide_terms_of(constants: NDArray[np.float32]) -> Terms:
-    """As `terms_of` for sixteen lanes."""
     return (
         load_wide(constants, 0),
         load_wide(constants, EXP2),

@@ -14,9 +14,11 @@ from crossgrad_core.numerics.simd import (
     Lanes,
     Mask,
     broadcast,
+    even_lanes,
     fma,
     larger,
     load,
+    load_wide,
     lowest_bit,
     magnitude,
     prefetch,
@@ -43,6 +45,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_gradients import mean_gradients
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import DEPTHS, start_tile
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, half_of, upper_of
 
 BINS, FIELDS = 6, 5
 #: Sums per entry: those of the bins, and two that are not used.
@@ -143,15 +146,20 @@ def _entry(
     )
     binned[:] = np.float32(0.0)
     width, height = np.float32(image.shape[1]), np.float32(image.shape[0])
-    while reached != np.uint64(0):
-        segment = lowest_bit(reached)
-        reached &= reached - np.uint64(1)
+    pairs = upper_of(reached)
+    while pairs != np.uint64(0):
+        upper = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
         gx, gy = mean_gradients(
-            segment, records, record, rows, 0, state, constants, v_depth, analytic
+            upper, records, record, rows, 0, state, constants, v_depth, analytic
         )
-        dx = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR) - u
-        dy = splat(np.float32(segment & (TILE_HEIGHT - 1))) - v
-        _spread(gx, gy, fma(axis_x, dx, axis_y * dy), width, height, places, binned)
+        dx = even_lanes(load_wide(constants, OFFSETS + (upper // TILE_HEIGHT) * PAIR)) - u
+        for segment in range(upper, upper + 2):
+            dy = splat(np.float32(segment & (TILE_HEIGHT - 1))) - v
+            along = fma(axis_x, dx, axis_y * dy)
+            _spread(
+                half_of(segment, gx), half_of(segment, gy), along, width, height, places, binned
+            )
     for group in range(SUMS // LANES):
         first = group * LANES * LANES
         eight = sums(
@@ -205,7 +213,7 @@ def bin_directions(
         found: [slots * SUMS] written for slots of entries with a mask.
     """
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
-    state = np.empty(DEPTHS + SEGMENTS * LANES, np.float32)
+    state = aligned(DEPTHS + SEGMENTS * LANES)
     rows = np.empty(ROWS, np.float32)
     places = np.empty(LANES, np.float32)
     binned = np.empty(SUMS * LANES, np.float32)

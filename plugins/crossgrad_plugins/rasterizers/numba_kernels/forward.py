@@ -11,15 +11,13 @@ from crossgrad_core.numerics.simd import (
     as_negative,
     bits,
     broadcast,
-    broadcast_two,
+    broadcast_two_wide,
     broadcast_wide,
     count_bits,
     fma,
     fnma,
-    joined,
-    load,
+    interleaved,
     load_wide,
-    low_half,
     lowest_bit,
     magnitude,
     prefetch,
@@ -44,7 +42,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import (
     STOPPED,
     TOUCHED,
     exp2,
-    wide_terms_of,
+    terms_of,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import (
     ROW_CENTRE,
@@ -72,8 +70,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SINE,
     TILE_HEIGHT,
     TILE_WIDTH,
+    UPPER,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, upper_of
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, half_of, lane_of, upper_of
 
 #: Entries whose reach is computed before any of them is blended: hides the latency of their
 #: memory reads and row extents, and is how often finished segments are looked for.
@@ -91,26 +90,20 @@ _DEPTHS = SEGMENTS // 2 * _STATE
 
 
 @device
-def _spot(segment: int) -> int:
-    """Returns where the state of a segment begins."""
-    return (segment >> 1) * _STATE + (segment & 1) * LANES
-
-
-@device
 def _start(state: NDArray[np.float32], width: int, height: int) -> np.uint64:
     """Clears the state of a tile of width x height pixels; returns its segments as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
-    for segment in range(SEGMENTS):
+    columns = interleaved(ramp(), ramp())
+    one, finished = splat_wide(np.float32(1.0)), splat_wide(np.float32(-1.0))
+    for segment in range(0, SEGMENTS, 2):
         row = segment % TILE_HEIGHT
-        left = min(width - (segment // TILE_HEIGHT) * SEGMENT, SEGMENT) if row < height else 0
-        inside = ramp() < splat(np.float32(left))
-        store(
-            state,
-            _spot(segment) + _T,
-            where(inside, splat(np.float32(1.0)), splat(np.float32(-1.0))),
-        )
-        live |= np.uint64(left > 0) << np.uint64(segment)
+        left = min(width - (segment // TILE_HEIGHT) * SEGMENT, SEGMENT)
+        upper, lower = left if row < height else 0, left if row + 1 < height else 0
+        inside = columns < interleaved(splat(np.float32(upper)), splat(np.float32(lower)))
+        store(state, segment * (_STATE // 2) + _T, where(inside, one, finished))
+        both = np.uint64(upper > 0) | (np.uint64(lower > 0) << np.uint64(1))
+        live |= both << np.uint64(segment)
     return live
 
 
@@ -133,8 +126,9 @@ def _unfinished(state: NDArray[np.float32], live: np.uint64) -> np.uint64:
     while rest != np.uint64(0):
         segment = lowest_bit(rest)
         rest &= rest - np.uint64(1)
-        pixels = bits(load_wide(state, _spot(segment) + _T) >= splat_wide(np.float32(0.0)))
-        upper, lower = (pixels & np.uint64(0xFF)) != 0, pixels > np.uint64(0xFF)
+        passed = load_wide(state, segment * (_STATE // 2) + _T)
+        pixels = bits(passed >= splat_wide(np.float32(0.0)))
+        upper, lower = (pixels & np.uint64(UPPER)) != 0, (pixels & ~np.uint64(UPPER)) != 0
         going |= (np.uint64(upper) | (np.uint64(lower) << np.uint64(1))) << np.uint64(segment)
     return live & going
 
@@ -155,24 +149,20 @@ def _coverage(
     Returns:
         Alpha, and `left` without those of the two segments that are out of reach.
     """
-    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    inverse_1 = broadcast(records, record + INVERSE_1)
-    inverse_2 = broadcast(records, record + INVERSE_2)
-    peak = broadcast(records, record + PEAK)
-    squared = broadcast(records, record + RADIUS)
-    eight = low_half(offsets)
-    u, v = axis_offsets(cosine, sine, eight, rows, row)
-    lower_u, lower_v = axis_offsets(cosine, sine, eight, rows, row + 1)
-    if near_enough(u, v, inverse_1, inverse_2, squared) == np.uint64(0):
+    cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
+    inverse_1 = broadcast_wide(records, record + INVERSE_1)
+    inverse_2 = broadcast_wide(records, record + INVERSE_2)
+    peak = broadcast_wide(records, record + PEAK)
+    squared = broadcast_wide(records, record + RADIUS)
+    u, v = axis_offsets(cosine, sine, offsets, rows, row)
+    near = near_enough(u, v, inverse_1, inverse_2, squared)
+    if near & np.uint64(UPPER) == np.uint64(0):
         left &= ~(np.uint64(1) << np.uint64(segment))
-    if near_enough(lower_u, lower_v, inverse_1, inverse_2, squared) == np.uint64(0):
+    if near & ~np.uint64(UPPER) == np.uint64(0):
         left &= ~(np.uint64(2) << np.uint64(segment))
     if (left >> np.uint64(segment)) & np.uint64(3) == np.uint64(0):
-        zero = splat(np.float32(0.0))
-        return joined(zero, zero), left
-    alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
-    lower = coverages(peak, lower_u, lower_v, inverse_1, inverse_2, constants)
-    return joined(alpha, lower), left
+        return splat_wide(np.float32(0.0)), left
+    return coverages(peak, u, v, inverse_1, inverse_2, constants), left
 
 
 @device
@@ -202,7 +192,7 @@ def _blend(
     green = broadcast_wide(records, record + GREEN)
     blue = broadcast_wide(records, record + BLUE)
     z = broadcast_wide(records, record + DEPTH)
-    terms = wide_terms_of(constants)
+    terms = terms_of(constants)
     most, stopped = load_wide(constants, LARGEST_ALPHA), load_wide(constants, STOPPED)
     least = load_wide(constants, TOUCHED if analytic is None else LEAST)
     zero = splat_wide(np.float32(0.0))
@@ -214,8 +204,8 @@ def _blend(
         at = segment * (_STATE // 2)
         offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
-            dx = offsets - broadcast_two(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast_two(rows, row + ROW_EXPONENT))
+            dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
             touched = power >= least
             alpha = exp2(power, terms)
         else:
@@ -251,18 +241,19 @@ def _finish_segment(
     depth: NDArray[np.float32] | None,
 ) -> None:
     """Adds the background to a segment and writes it to the pixels from a flat index on."""
-    at = _spot(segment)
-    through = magnitude(load(state, at + _T))
+    at = (segment >> 1) * _STATE
+    through = magnitude(half_of(segment, load_wide(state, at + _T)))
     store_triples(
         image,
         3 * pixel,
-        load(state, at + _RED) + through * broadcast(background, 0),
-        load(state, at + _GREEN) + through * broadcast(background, 1),
-        load(state, at + _BLUE) + through * broadcast(background, 2),
+        half_of(segment, load_wide(state, at + _RED)) + through * broadcast(background, 0),
+        half_of(segment, load_wide(state, at + _GREEN)) + through * broadcast(background, 1),
+        half_of(segment, load_wide(state, at + _BLUE)) + through * broadcast(background, 2),
     )
     store(alpha, pixel, splat(np.float32(1.0)) - through)
     if depth is not None:
-        store(depth, pixel, load(state, _DEPTHS + segment * LANES))
+        both = load_wide(state, _DEPTHS + (segment >> 1) * WIDE)
+        store(depth, pixel, half_of(segment, both))
 
 
 @device
@@ -286,14 +277,15 @@ def _finish(
         # A segment that the image cuts.
         for x in range(inside - inside % SEGMENT, inside):
             segment = (x // SEGMENT) * TILE_HEIGHT + y
-            at = _spot(segment) + x % SEGMENT
+            lane = lane_of(segment, x % SEGMENT)
+            at = (segment >> 1) * _STATE + lane
             through = abs(state[at + _T])
             image[top + y, left + x, 0] = state[at + _RED] + through * background[0]
             image[top + y, left + x, 1] = state[at + _GREEN] + through * background[1]
             image[top + y, left + x, 2] = state[at + _BLUE] + through * background[2]
             alpha[top + y, left + x] = np.float32(1.0) - through
             if depth is not None:
-                depth[top + y, left + x] = state[_DEPTHS + segment * LANES + x % SEGMENT]
+                depth[top + y, left + x] = state[_DEPTHS + (segment >> 1) * WIDE + lane]
 
 
 @device

@@ -19,8 +19,9 @@ TILE_HEIGHT = 16
 SEGMENT = 8
 COLUMNS = TILE_WIDTH // SEGMENT
 SEGMENTS = COLUMNS * TILE_HEIGHT
-#: Two segments, one above the other, are a pair and are worked on together; as bits, the upper
-#: segments of all pairs.
+#: Two segments, one above the other, are a pair and are worked on together, in vectors whose lanes
+#: are theirs by turns: what a row has in common is then a plain load. As bits, the upper segments
+#: of all pairs; likewise the lanes of the upper segment of a pair.
 PAIR = 2 * SEGMENT
 UPPER = sum(1 << segment for segment in range(0, SEGMENTS, 2))
 

@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
+    WIDE,
     bits,
-    broadcast,
+    broadcast_two_wide,
+    broadcast_wide,
     count_bits,
     fnma,
-    load,
+    load_wide,
     lowest_bit,
     prefetch,
     smaller,
-    splat,
+    splat_wide,
     store,
     where,
 )
@@ -58,6 +60,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, lane_of, upper_of
 
 #: Entries ahead for whose records memory is asked.
 _AHEAD = 8
@@ -76,7 +79,7 @@ def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left
         for x in range(min(TILE_WIDTH, marked.shape[1] - left)):
             if marked[top + y, left + x] != 0:
                 segment = (x // SEGMENT) * TILE_HEIGHT + y
-                state[segment * LANES + x % SEGMENT] = np.float32(1.0)
+                state[(segment >> 1) * WIDE + lane_of(segment, x % SEGMENT)] = np.float32(1.0)
                 live |= np.uint64(1) << np.uint64(segment)
     return live
 
@@ -91,35 +94,36 @@ def _count(
     constants: NDArray[np.float32],
     analytic: NDArray[np.float32] | None,
 ) -> int:
-    """Blends one Gaussian into the reached segments; returns the number of pixels."""
-    decay = broadcast(records, record + DECAY)
-    cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-    inverse_1 = broadcast(records, record + INVERSE_1)
-    inverse_2 = broadcast(records, record + INVERSE_2)
-    peak = broadcast(records, record + PEAK)
-    zero = splat(np.float32(0.0))
+    """Blends one Gaussian into the reached segments, in pairs; returns the number of pixels."""
+    decay = broadcast_wide(records, record + DECAY)
+    cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
+    inverse_1 = broadcast_wide(records, record + INVERSE_1)
+    inverse_2 = broadcast_wide(records, record + INVERSE_2)
+    peak = broadcast_wide(records, record + PEAK)
+    zero = splat_wide(np.float32(0.0))
     terms = terms_of(constants)
     pixels = 0
-    while reached != np.uint64(0):
-        segment = lowest_bit(reached)
-        reached &= reached - np.uint64(1)
+    pairs = upper_of(reached)
+    while pairs != np.uint64(0):
+        segment = lowest_bit(pairs)
+        pairs &= pairs - np.uint64(1)
         row = segment & (TILE_HEIGHT - 1)
-        offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
         if analytic is None:
-            dx = offsets - broadcast(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-            touched = power >= load(constants, TOUCHED)
+            dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+            touched = power >= load_wide(constants, TOUCHED)
             alpha = exp2(power, terms)
         else:
             u, v = axis_offsets(cosine, sine, offsets, rows, row)
             alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
-            touched = alpha >= load(constants, LEAST)
-        alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
-        before = load(state, segment * LANES)
+            touched = alpha >= load_wide(constants, LEAST)
+        alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
+        before = load_wide(state, segment * LANES)
         after = before - alpha * before
         # It only falls: a pixel that has stopped, or is not marked, is never blended again.
         store(state, segment * LANES, after)
-        pixels += count_bits(bits(touched & (after >= load(constants, STOPPED))))
+        pixels += count_bits(bits(touched & (after >= load_wide(constants, STOPPED))))
     return pixels
 
 
@@ -149,7 +153,7 @@ def count_marked(
         counts: [slots] written; zero before.
     """
     columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
-    state = np.empty(SEGMENTS * LANES, np.float32)
+    state = aligned(SEGMENTS * LANES)
     rows = np.empty(ROWS, np.float32)
     tile = take(jobs)
     while tile < starts.shape[0] - 1:

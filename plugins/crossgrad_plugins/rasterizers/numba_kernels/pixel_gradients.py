@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
-    broadcast,
+    broadcast_two_wide,
+    broadcast_wide,
     fma,
     fnma,
-    load,
+    load_wide,
     smaller,
-    splat,
+    splat_wide,
     where,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
@@ -73,14 +74,14 @@ def _toned(
     state: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
 ) -> Lanes:
-    """The gradients of a segment's pixels times the colour of the Gaussian."""
-    at = segment * STATE
-    toned = load(state, at + V_RED) * broadcast(records, record + RED)
-    toned = fma(load(state, at + V_GREEN), broadcast(records, record + GREEN), toned)
-    toned = fma(load(state, at + V_BLUE), broadcast(records, record + BLUE), toned)
+    """The gradients of a pair's pixels times the colour of the Gaussian."""
+    at = segment * (STATE // 2)
+    toned = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
+    toned = fma(load_wide(state, at + V_GREEN), broadcast_wide(records, record + GREEN), toned)
+    toned = fma(load_wide(state, at + V_BLUE), broadcast_wide(records, record + BLUE), toned)
     if v_depth is not None:
-        v_z = load(state, DEPTHS + segment * LANES)
-        toned = fma(v_z, broadcast(records, record + DEPTH), toned)
+        v_z = load_wide(state, DEPTHS + segment * LANES)
+        toned = fma(v_z, broadcast_wide(records, record + DEPTH), toned)
     return toned
 
 
@@ -96,38 +97,42 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blends a segment; returns its pixels' gradients by the projected mean (x and y).
+    """Blends a pair; returns its pixels' gradients by the projected mean (x and y).
 
-    Those of plain records are in units of 2 log 2 px^-1, the others in px^-1.
+    `segment` is the upper one of the pair. The gradients of plain records are in units of
+    2 log 2 px^-1, the others in px^-1.
     """
     row = base + (segment & (TILE_HEIGHT - 1))
-    offsets = load(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
-    zero = splat(np.float32(0.0))
+    offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+    zero = splat_wide(np.float32(0.0))
     if analytic is None:
-        decay = broadcast(records, record + DECAY)
-        dx = offsets - broadcast(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast(rows, row + ROW_EXPONENT))
-        touched = power >= load(constants, TOUCHED)
-        free = power <= load(constants, CAPPED)
+        decay = broadcast_wide(records, record + DECAY)
+        dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+        touched = power >= load_wide(constants, TOUCHED)
+        free = power <= load_wide(constants, CAPPED)
         alpha = exp2(power, terms_of(constants))
     else:
-        cosine, sine = broadcast(records, record + COSINE), broadcast(records, record + SINE)
-        inverse_1 = broadcast(records, record + INVERSE_1)
-        inverse_2 = broadcast(records, record + INVERSE_2)
-        peak = broadcast(records, record + PEAK)
+        cosine, sine = (
+            broadcast_wide(records, record + COSINE),
+            broadcast_wide(records, record + SINE),
+        )
+        inverse_1 = broadcast_wide(records, record + INVERSE_1)
+        inverse_2 = broadcast_wide(records, record + INVERSE_2)
+        peak = broadcast_wide(records, record + PEAK)
         u, v = axis_offsets(cosine, sine, offsets, rows, row)
         alpha, by_u, by_v, _, _ = coverage_gradients(peak, u, v, inverse_1, inverse_2, constants)
-        touched = alpha >= load(constants, LEAST)
-        free = touched & (alpha <= load(constants, LARGEST_ALPHA))
-    alpha = where(touched, smaller(alpha, load(constants, LARGEST_ALPHA)), zero)
+        touched = alpha >= load_wide(constants, LEAST)
+        free = touched & (alpha <= load_wide(constants, LARGEST_ALPHA))
+    alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
     toned = _toned(segment, records, record, state, v_depth)
-    odds = where(free, odds_of(alpha, constants), load(constants, FIXED))
-    _, s = blend(alpha, odds, constants, toned, state, segment * STATE, constants)
+    odds = where(free, odds_of(alpha, constants), load_wide(constants, FIXED))
+    _, s = blend(alpha, odds, constants, toned, state, segment * (STATE // 2), constants)
     if analytic is None:
         sd = s * dx
-        lean = decay * broadcast(records, record + SLOPE)
-        pull = broadcast(records, record + ROW_DECAY)
-        sy = s * broadcast(rows, row + ROW_DY)
+        lean = decay * broadcast_wide(records, record + SLOPE)
+        pull = broadcast_wide(records, record + ROW_DECAY)
+        sy = s * broadcast_two_wide(rows, row + ROW_DY)
         return decay * sd, fnma(lean, sd, pull * sy)
     su = where(free, s * by_u * inverse_1, zero)
     sv = where(free, s * by_v * inverse_2, zero)
