@@ -15,7 +15,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from _machine import facts, peak_mib
@@ -24,6 +23,7 @@ from torch import Tensor
 from crossgrad_core.contract.gaussians import Gaussians, Render
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
@@ -40,7 +40,8 @@ def main() -> None:
     parser.add_argument("--reps", type=int, default=30)
     parser.add_argument("--save", type=Path)
     arguments = parser.parse_args()
-    torch.set_num_threads(numba.get_num_threads())
+    # As a run does: the same threads for torch, and freed arrays are kept for the next step.
+    configure_threads()
     with np.load(arguments.case) as archive:
         case = dict(archive)
     options = {key: getattr(arguments, key) for key in ("max_alpha", "near", "dilation")}
