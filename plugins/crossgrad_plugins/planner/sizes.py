@@ -104,9 +104,9 @@ def length(evidence: Evidence) -> Decision:
         _FLAT,
         _EXACTLY,
     )
-    shown = f"{photos} training photos: {most:,} views"
     if not photos:
         return plain.found("no training photos")
+    shown = f"{most // photos:,} views of each of {photos:,} training photos"
     usual = DEFAULT_STEPS * max(views_of_steps(evidence).counts)
     if seconds is None and most >= usual:
         return plain.found(shown, decided=True, figures={"views": most})
