@@ -65,7 +65,9 @@ class Asked:
     def _fits_length(self, run: Run) -> bool:
         asked, found = self.config, run.config
         if asked.seconds is not None:
-            return run.length == ("s CPU" if asked.clock == "cpu" else "s", asked.seconds)
+            bound = found.get("planned_views") or found.get("max_views")
+            length = ("s CPU" if asked.clock == "cpu" else "s", asked.seconds)
+            return (run.length, bound) == (length, asked.max_views)
         if asked.max_views is None:
             return found.get("steps") == asked.steps
         # A run writes a length in views down in steps.

@@ -151,6 +151,9 @@ class RunConfig(BaseModel):
     planned_seconds: float | None = Field(
         None, gt=0, description="the seconds that a run with a time budget was given"
     )
+    planned_views: int | None = Field(
+        None, ge=1, description="the views that it was given at most within these seconds"
+    )
     seed: Annotated[int, Flag("N", TRAINING)] = Field(
         0, ge=0, description="Seed of every random number. Default: 0."
     )

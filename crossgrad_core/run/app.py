@@ -231,7 +231,8 @@ def _within(setup: Setup, seconds: float) -> Setup:
     """The setup with the length that fits into `seconds` of training."""
     steps, note, share = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "max_views": None, "revisions": ()}
-    config = setup.config.model_copy(update={**update, "planned_seconds": seconds})
+    given = {"planned_seconds": seconds, "planned_views": setup.config.max_views}
+    config = setup.config.model_copy(update={**update, **given})
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
     return replace(setup, notes=(*setup.notes, note, *notes_on_length(setup)))

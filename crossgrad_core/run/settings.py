@@ -28,7 +28,11 @@ ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
 #: Settings that say how long a run is.
 LENGTHS: Final = tuple(
-    (name,) for name in ("steps", "max_views", "seconds", "revisions", "planned_seconds")
+    (name,)
+    for name in (
+        *("steps", "max_views", "seconds", "revisions"),
+        *("planned_seconds", "planned_views"),
+    )
 )
 #: Settings that hold settings.
 GROUPS_OF_SETTINGS: Final = ("reading",)

@@ -62,7 +62,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     fits = _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
     total = min(fits, most_steps(setup))
     if total < fits:
-        note += f", which {fits} take in that time; --max-views allows no more than {total}"
+        note += f", of which {fits} fit into that time; the bound on views allows {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
     return total, f"{text}the length follows the clock as the run goes", share

@@ -93,8 +93,9 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
     assert (rows[-1]["step"], rows[-1]["views"]) == ("4", "8")
     stored = read_config(tmp_path / "run")
     assert (stored["steps"], stored["seconds"], stored["max_views"]) == (4, None, None)
-    assert (stored["planned_seconds"], stored["revisions"]) == (60.0, [])
-    assert "--max-views allows no more than 4" in (tmp_path / "run/log.txt").read_text()
+    assert (stored["planned_seconds"], stored["planned_views"]) == (60.0, 9)
+    assert stored["revisions"] == []
+    assert "the bound on views allows 4" in (tmp_path / "run/log.txt").read_text()
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
     again = (tmp_path / "again/point_cloud.ply").read_bytes()
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
@@ -103,7 +104,29 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
 def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0
-    assert "--max-views allows" not in (tmp_path / "run/log.txt").read_text()
+    assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
+
+
+def test_views_within_seconds_go_on_to_the_bound(scene, tmp_path):
+    out = tmp_path / "run"
+    run(scene, tmp_path / "whole", seconds=60.0, max_views=12, rasterizer={"name": "torch"})
+    rows = run(
+        scene, out, seconds=60.0, max_views=12, stop_after=5, rasterizer={"name": "torch"}
+    )  # fmt: skip
+    assert rows[-1]["step"] == "5"
+    assert app.run({}, resume=out, verbosity=-1) == 0
+    whole = (tmp_path / "whole/point_cloud.ply").read_bytes()
+    assert (out / "point_cloud.ply").read_bytes() == whole
+    assert read_config(out)["planned_views"] == 12
+
+
+def test_a_dry_run_of_views_within_seconds_is_a_configuration_of_it(scene, tmp_path, capsys):
+    given = {"scene": str(scene), "seconds": 60.0, "max_views": 500, "threads": 1}
+    assert app.run(given, dry_run=True, verbosity=-1) == 0
+    (tmp_path / "config.yaml").write_text(capsys.readouterr().out)
+    again = merged(tmp_path / "config.yaml", {}, ())
+    assert (again["seconds"], again["max_views"], again["steps"]) == (60.0, 500, None)
+    assert merged(tmp_path / "config.yaml", {"seconds": 30.0}, ()).get("max_views") is None
 
 
 def test_views_within_seconds_are_at_least_a_step():

@@ -10,6 +10,7 @@ import pytest
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.run.bundled import BUNDLED_SECONDS
 from crossgrad_core.system.yaml_values import read_mapping
 
 FEW = ("--steps", 4, "--threads", 1, "--rasterizer", "torch", "-q")
@@ -66,6 +67,17 @@ def test_a_length_that_was_decided_is_written_down(scene, tmp_path, length):
     assert (stored["max_views"], stored.get("steps")) == (1_000, None)
     assert stored.get("seconds") == (60.0 if length else None)
     assert ended("run", "--config", file, "--dry-run", "-q") == 0
+
+
+def test_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
+    file = tmp_path / "plan.yaml"
+    assert ended("plan", "--max-size", 64, "--write", file) == 0
+    stored = read_mapping(file, "a configuration", "repair it")
+    assert (stored["max_views"], stored["seconds"]) == (2_400, BUNDLED_SECONDS)
+    capsys.readouterr()
+    assert ended("plan", "--max-size", 64) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "run it: crossgrad run --plan auto --max-size 64"
 
 
 def test_json_has_every_figure(scene, capsys):

@@ -50,20 +50,24 @@ def plan(
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
-        whole = {"scene": str(config.scene), **made.applied_to(settings), "plan": "off"}
-        write_settings(write, whole)
+        # The bundled scene has a length by itself, which it would lose where the file names it.
+        length = {} if config.seconds is None else {"seconds": config.seconds}
+        asked = {**settings, **length, "scene": str(config.scene)}
+        write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:
         return made, "--write FILE keeps this for crossgrad run --config FILE"
-    given = {**options, "config": file, "scene": None}
-    words = [quote(str(config.scene)), "--plan auto"]
-    words += [
-        f"--{name.replace('_', '-')} {quote(f'{each:.10g}' if isinstance(each, float) else str(each))}"
-        for name, each in given.items()
-        if each is not None
-    ]
+    given = {"plan": "auto", **options, "config": file, "scene": None}
+    words = [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
     words += [f"--set {quote(each)}" for each in assignments]
+    if options.get("scene") is not None:
+        words.insert(0, quote(str(config.scene)))
     return made, f"run it: crossgrad run {' '.join(words)}"
+
+
+def _word(value: object) -> str:
+    """A value of an option as a shell reads it."""
+    return quote(f"{value:.10g}" if isinstance(value, float) else str(value))
 
 
 def show(made: Plan, way: str, *, as_json: bool) -> None:

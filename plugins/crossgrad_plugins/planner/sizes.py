@@ -21,7 +21,7 @@ _OF_PIXELS: Final = 0.6
 _PHOTOS: Final = 8
 _FEW: Final = "docs/few-photos.md"
 _EXACTLY: Final = "--steps N or --max-views N"
-_FLAT: Final = "docs/plan.md, six scenes"
+_FLAT: Final = "docs/plan.md, four scenes"
 #: Views of each training photo after which more of them stop to pay, and of all together at least.
 PASSES: Final = 100
 FEWEST_VIEWS: Final = 1_000
@@ -76,7 +76,7 @@ def count(evidence: Evidence) -> Decision:
     )
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
-    views = steps * max(views_of_steps(evidence).counts)
+    views = views_of_steps(evidence).paced(steps).views(steps)
     budget = usual_budget(points, views)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
@@ -88,12 +88,12 @@ def length(evidence: Evidence) -> Decision:
     """How long the run is."""
     part, config, photos = "length", evidence.config, len(evidence.scene.train_views)
     most, seconds = max(FEWEST_VIEWS, PASSES * photos), config.seconds
+    within = "" if seconds is None else f" within {seconds:g} s"
     asked = f"{DEFAULT_STEPS:,} steps" if seconds is None else f"{seconds:g} s"
-    if config.max_views is not None or config.steps is not None:
-        exactly = f"{config.max_views or 0:,} views"
-        return given(part, exactly if config.steps is None else f"{config.steps:,} steps", _EXACTLY)
-    if config.preset == "inria" or config.schedule == "absolute":
-        return given(part, f"{asked}, as published", _EXACTLY)
+    if config.steps is not None:
+        return given(part, f"{config.steps:,} steps", _EXACTLY)
+    if config.max_views is not None:
+        return given(part, f"{config.max_views:,} views{within}", _EXACTLY)
     plain = Decision(
         part,
         asked,
@@ -104,18 +104,19 @@ def length(evidence: Evidence) -> Decision:
         _FLAT,
         _EXACTLY,
     )
+    if config.preset == "inria" or config.schedule == "absolute":
+        return plain.found("a published schedule, which a shorter run would cut")
     if not photos:
         return plain.found("no training photos")
     shown = f"{most // photos:,} views of each of {photos:,} training photos"
-    usual = DEFAULT_STEPS * max(views_of_steps(evidence).counts)
+    usual = views_of_steps(evidence).paced(DEFAULT_STEPS).views(DEFAULT_STEPS)
     if seconds is None and most >= usual:
         return plain.found(shown, decided=True, figures={"views": most})
     saved = f"what is left of {asked} then"
     if seconds is None:
         saved = f"{1.0 - most / usual:.0%} of the views of {asked}"
     found = plain.found(shown, figures={"views": most})
-    choice = f"{most:,} views" if seconds is None else f"{most:,} views within {asked}"
-    return found.changed(choice, {"max_views": most}, _EXACTLY, saved)
+    return found.changed(f"{most:,} views{within}", {"max_views": most}, _EXACTLY, saved)
 
 
 def densifier(evidence: Evidence) -> Decision:

@@ -69,7 +69,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
     """The cores, those first that do nothing: another sweep has taken some, perhaps."""
-    with suppress(OSError):
+    with suppress(OSError, ValueError):  # Not Linux, or counts of another kind.
         before = _counts()
         time.sleep(_LOOK)
         after = _counts()

@@ -207,6 +207,12 @@ def test_arms_can_be_renamed(tmp_path):
             renamed(found, [wrong])
 
 
+def test_runs_that_were_to_end_after_some_views_are_another_arm():
+    whole = settings_of({"planned_seconds": 60.0, "planned_views": None})
+    assert settings_of({"planned_seconds": 60.0, "planned_views": 500}) != whole
+    assert settings_of({"planned_seconds": 90.0, "planned_views": None}) == whole
+
+
 def test_settings_are_flat_texts():
     config = {
         "scene": "x",

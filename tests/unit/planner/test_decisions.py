@@ -457,9 +457,10 @@ def test_it_never_gets_longer_than_by_default(photos, stays):
     assert bool(found.settings) != stays
 
 
-def test_two_views_of_a_step_are_two_of_the_length():
-    assert length_of(300, views_per_step=2).choice == "30,000 views"
-    assert length_of(600, views_per_step=2).choice == "30,000 steps"
+@pytest.mark.parametrize(("views", "photos"), [(2, 600), ("1..2@0.5", 450), ("2..1@0.9", 570)])
+def test_views_of_a_step_are_as_many_of_the_length(views, photos):
+    assert length_of(photos - 1, views_per_step=views).choice == f"{100 * photos - 100:,} views"
+    assert length_of(photos, views_per_step=views).choice == "30,000 steps"
 
 
 @pytest.mark.parametrize("seconds", [0.5, 60.0])
@@ -472,9 +473,16 @@ def test_seconds_are_the_most_that_may_be_spent(seconds):
 
 
 @pytest.mark.parametrize("mine", [{"preset": "inria"}, {"schedule": "absolute"}])
-def test_published_schedules_keep_their_length(mine):
-    found = length_of(20, **mine)
-    assert (found.choice, dict(found.settings)) == ("30,000 steps, as published", {})
+@pytest.mark.parametrize(("seconds", "choice"), [(None, "30,000 steps"), (60.0, "60 s")])
+def test_published_schedules_keep_their_length(mine, seconds, choice):
+    found = length_of(20, **mine, **({} if seconds is None else {"seconds": seconds}))
+    assert (found.choice, found.basis, dict(found.settings)) == (choice, "default", {})
+    assert "published" in found.evidence
+
+
+def test_views_within_seconds_are_yours():
+    found = length_of(20, seconds=60.0, max_views=500)
+    assert (found.choice, found.basis) == ("500 views within 60 s", "given")
 
 
 @pytest.mark.parametrize("mine", [{"steps": 7}, {"max_views": 90_000}])

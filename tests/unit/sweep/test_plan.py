@@ -27,7 +27,7 @@ def plan(folder, assignments=(), **grid):
 
 def test_what_a_run_notes_about_its_length_is_not_in_its_id():
     plain = {"seed": 1, "steps": 9}
-    noted = {**plain, "revisions": [[1, 9]], "planned_seconds": 5.0}
+    noted = {**plain, "revisions": [[1, 9]], "planned_seconds": 5.0, "planned_views": 9}
     assert run_id(noted, "scene") == run_id(plain, "scene")
 
 

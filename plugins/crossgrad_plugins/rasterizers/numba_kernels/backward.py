@@ -259,8 +259,8 @@ def _gather(
 ) -> None:
     """Sums the gradients of one plain Gaussian over pairs of segments into partials[partial:].
 
-    A segment of them that it does not reach adds zeros. `capped` is None for Gaussians whose alpha
-    reaches the largest one nowhere.
+    A segment of them that it does not reach adds zeros, where the loss has finite gradients.
+    `capped` is None for Gaussians whose alpha reaches the largest one nowhere.
     """
     _respond(pairs, records, record, rows, base, constants, capped, responses)
     sum_red, sum_green, sum_blue, sum_depth = _blend(

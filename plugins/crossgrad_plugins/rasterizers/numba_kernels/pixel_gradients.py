@@ -132,8 +132,8 @@ def mean_gradients(
         sd = s * dx
         lean = decay * broadcast_wide(records, record + SLOPE)
         pull = broadcast_wide(records, record + ROW_DECAY)
-        sy = s * broadcast_two_wide(rows, row + ROW_DY)
-        return decay * sd, fnma(lean, sd, pull * sy)
+        pulled = pull * broadcast_two_wide(rows, row + ROW_DY)
+        return decay * sd, fnma(lean, sd, pulled * s)
     su = where(free, s * by_u * inverse_1, zero)
     sv = where(free, s * by_v * inverse_2, zero)
     return fnma(cosine, su, sine * sv), zero - fma(cosine, sv, sine * su)
