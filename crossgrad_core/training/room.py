@@ -19,6 +19,9 @@ STATE = "budget"
 #: The budget of runs of so many views, and the power of the length with which that of longer ones
 #: grows at first: to 100,000 at 10,000 views. Source: measured by metal-gauss.
 SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
+#: Where a run begins with few primitives, so many times as many are enough, though not fewer than
+#: that: a short run has no time to place more. Measured by us (docs/schedules.md).
+GROWN, LEAST_BUDGET = 2, 10_000
 
 
 def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
@@ -78,7 +81,8 @@ def usual_budget(start: int, length: int) -> int:
     if length >= REFERENCE:
         return sys.maxsize
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
-    return round(max(SHORT_BUDGET, start) * stretch / (1.0 - length / REFERENCE))
+    enough = min(SHORT_BUDGET, max(LEAST_BUDGET, GROWN * start))
+    return round(max(enough, start) * stretch / (1.0 - length / REFERENCE))
 
 
 def curve(event: int, events: int, start: int, budget: int) -> int:

@@ -240,8 +240,11 @@ def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
 
 
 def test_budgets_by_length():
-    assert [usual_budget(5_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
-    assert usual_budget(5_000, 10_000) == 150_000
+    assert [usual_budget(20_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
+    assert usual_budget(20_000, 10_000) == 150_000
+    starts = (0, 5_000, 7_000, 15_000, 16_000, 30_000, 31_000)
+    budgets = [usual_budget(start, 0) for start in starts]
+    assert budgets == [10_000, 10_000, 14_000, 30_000, 30_000, 30_000, 31_000]
     assert usual_budget(90_000, 1_000) == 93_103
     assert usual_budget(90_000, 10_000) == 450_000
     assert usual_budget(5_000, 29_999) > 10**9
