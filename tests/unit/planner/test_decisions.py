@@ -37,6 +37,15 @@ MEASURED = {
     "ochota_kap_hybrid_gain": ("two modes", 0.946, 2.14, 2.61, 0.094, 0.040, "none"),
     "brighton_beach": ("one mode, one distance", 0.751, 1.03, 1.05, 0.433, 0.589, "gain"),
 }
+#: The length of a run on them that was given none, views.
+VIEWS = {
+    "city_hybrid": 11_200,
+    "city_unimodal": 6_500,
+    "boruszyn_kap": 2_400,
+    "ochota_kap_hybrid": 3_200,
+    "ochota_kap_hybrid_gain": 3_200,
+    "brighton_beach": 1_400,
+}
 #: Scene, depth over focal length as a logarithm, and height of each training camera.
 TABLE = Path(__file__).with_name("cameras.csv")
 PAIRS_BY_HEIGHT = {"sampler": "near-far", "grouping": "altitude", "grouping.cut": "otsu"}
@@ -123,6 +132,7 @@ def test_the_scenes_themselves(name):
     figures = plan.of_part("modes").figures
     assert plan.of_part("modes").choice == choice
     assert plan.of_part("exposure").choice == exposure
+    assert plan.settings["max_views"] == VIEWS[name]
     assert figures["separability"] == pytest.approx(separability, abs=0.002)
     assert figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
     assert figures["range"] == pytest.approx(spread, rel=0.01)
