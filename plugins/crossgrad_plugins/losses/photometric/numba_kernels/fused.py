@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jit import kernel, part
 from crossgrad_core.numerics.jobs import Jobs, share, take
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
+    BACK,
     CHANNELS,
     DIFFERENCE,
     HALO,
     LINE,
+    PARTIAL,
     SCRATCH,
     SLOTS,
     STRIDE,
@@ -40,7 +42,9 @@ from crossgrad_plugins.losses.photometric.numba_kernels.terms import (
     gradient_row,
     ssim_row,
     sum_absolute,
+    sum_gradient_rows,
     sum_of,
+    sum_rows,
 )
 from crossgrad_plugins.losses.photometric.reference import RADIUS
 
@@ -63,25 +67,32 @@ def _tile(
     absolute, dissimilarity = 0.0, 0.0
     set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
     loaded = top - halo - RADIUS
-    for row in range(top - halo, bottom + halo):
-        while loaded <= row + RADIUS:
+    # In pairs of rows; the last one may have a row that nobody needs.
+    for first in range(top - halo, bottom + halo, 2):
+        while loaded <= first + 1 + RADIUS:
             load_row(
                 scratch, image, target, target_8bit, is_8bit, mask, is_masked, loaded, box,
                 height, width,
             )  # fmt: skip
             loaded += 1
-        if 0 <= row < height:
-            ssim_row(scratch, row, columns)
-        else:
-            clear_row(scratch, row, columns)
-        if top <= row < bottom:
-            dissimilarity += sum_of(scratch, LINE + HALO, CHANNELS * columns)
-            slot = DIFFERENCE + (row & (SLOTS - 1)) * STRIDE + 2 * HALO
-            absolute += sum_absolute(scratch, slot, CHANNELS * columns)
-        if with_gradient and row - RADIUS >= top:
-            gradient_row(scratch, row - RADIUS, columns, l1_weight, ssim_weight)
-            destination = ((row - RADIUS) * width + left) * CHANNELS
-            copy(gradient, destination, scratch, LINE, CHANNELS * columns)
+        sum_rows(scratch, first, columns)
+        for row in range(first, min(first + 2, bottom + halo)):
+            if 0 <= row < height:
+                ssim_row(scratch, row, columns, PARTIAL + (row - first) * 4 * STRIDE)
+            else:
+                clear_row(scratch, row, columns)
+            if top <= row < bottom:
+                dissimilarity += sum_of(scratch, LINE + HALO, CHANNELS * columns)
+                slot = DIFFERENCE + (row & (SLOTS - 1)) * STRIDE + 2 * HALO
+                absolute += sum_absolute(scratch, slot, CHANNELS * columns)
+        ready = first - RADIUS
+        if with_gradient and ready + 1 >= top:
+            sum_gradient_rows(scratch, ready, columns)
+            for row in range(max(ready, top), min(ready + 2, bottom)):
+                back = BACK + (row - ready) * 3 * STRIDE
+                gradient_row(scratch, row, columns, back, l1_weight, ssim_weight)
+                destination = (row * width + left) * CHANNELS
+                copy(gradient, destination, scratch, LINE, CHANNELS * columns)
     return absolute, dissimilarity
 
 

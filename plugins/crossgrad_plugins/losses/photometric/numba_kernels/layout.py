@@ -8,7 +8,7 @@ from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384
-#: Rows of a ring; a power of two, at least WINDOW.
+#: Rows of a ring; a power of two, at least WINDOW and the two that follow.
 SLOTS = 16
 CHANNELS = 3
 #: Floats of the columns that a window reaches beyond its centre.
@@ -23,16 +23,16 @@ SUM = 0
 DIFFERENCE = SUM + SLOTS * STRIDE
 #: Ring of 1 where a pixel counts, else 0.
 KEEP = DIFFERENCE + SLOTS * STRIDE
-#: s, s^2, d, d^2 of one row, summed down the columns.
+#: s, s^2, d, d^2 of two rows, summed down the columns.
 PARTIAL = KEEP + SLOTS * STRIDE
 #: Rings of a, b, c.
-BY_MEAN = PARTIAL + 4 * STRIDE
+BY_MEAN = PARTIAL + 8 * STRIDE
 BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
 BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
-#: a, b, c of one row, summed down the columns.
+#: a, b, c of two rows, summed down the columns.
 BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
 #: A row of results.
-LINE = BACK + 3 * STRIDE
+LINE = BACK + 6 * STRIDE
 #: What is subtracted from s and from d.
 CENTRE_SUM = LINE + STRIDE
 CENTRE_DIFFERENCE = CENTRE_SUM + STRIDE

@@ -39,24 +39,36 @@ _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 
 
 @part
-def ssim_row(scratch: _Floats, row: int, columns: int) -> None:
-    """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts."""
+def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
+    """Sums s, s^2, d and d^2 down the columns, around a row and around the next one."""
     for j in range(0, CHANNELS * (columns + 4 * RADIUS), LANES):
-        values, squares = down_with_squares(scratch, SUM + j, row)
+        values, squares, next_values, next_squares = down_with_squares(scratch, SUM + j, row)
         store(scratch, PARTIAL + j, values)
         store(scratch, PARTIAL + STRIDE + j, squares)
-        values, squares = down_with_squares(scratch, DIFFERENCE + j, row)
+        store(scratch, PARTIAL + 4 * STRIDE + j, next_values)
+        store(scratch, PARTIAL + 5 * STRIDE + j, next_squares)
+        values, squares, next_values, next_squares = down_with_squares(scratch, DIFFERENCE + j, row)
         store(scratch, PARTIAL + 2 * STRIDE + j, values)
         store(scratch, PARTIAL + 3 * STRIDE + j, squares)
+        store(scratch, PARTIAL + 6 * STRIDE + j, next_values)
+        store(scratch, PARTIAL + 7 * STRIDE + j, next_squares)
+
+
+@part
+def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
+    """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts.
+
+    The row's sums down the columns begin at element `partial`.
+    """
     slot = (row & (SLOTS - 1)) * STRIDE
     zero, one, two = splat(_ZERO), splat(_ONE), splat(_TWO)
     twice_c1, twice_c2 = splat(_TWICE_C1), splat(_TWICE_C2)
     for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
         keep = load(scratch, KEEP + slot + HALO + j)
-        local_s = across(scratch, PARTIAL + j)
-        local_d = across(scratch, PARTIAL + 2 * STRIDE + j)
-        variance_s = fnma(local_s, local_s, across(scratch, PARTIAL + STRIDE + j))
-        variance_d = fnma(local_d, local_d, across(scratch, PARTIAL + 3 * STRIDE + j))
+        local_s = across(scratch, partial + j)
+        local_d = across(scratch, partial + 2 * STRIDE + j)
+        variance_s = fnma(local_s, local_s, across(scratch, partial + STRIDE + j))
+        variance_d = fnma(local_d, local_d, across(scratch, partial + 3 * STRIDE + j))
         # Rounding may take a variance of nothing slightly below zero.
         variance_s = where(zero < variance_s, variance_s, zero) + twice_c2
         variance_d = where(zero < variance_d, variance_d, zero)
@@ -95,14 +107,33 @@ def clear_row(scratch: _Floats, row: int, columns: int) -> None:
 
 
 @part
-def gradient_row(
-    scratch: _Floats, row: int, columns: int, l1_weight: np.float32, ssim_weight: np.float32
-) -> None:
-    """Writes the loss's gradient at a row of the tile to the line."""
+def sum_gradient_rows(scratch: _Floats, row: int, columns: int) -> None:
+    """Sums a, b and c down the columns, around a row and around the next one."""
     for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
-        store(scratch, BACK + j, down(scratch, BY_MEAN + j, row))
-        store(scratch, BACK + STRIDE + j, down(scratch, BY_SUM_VARIANCE + j, row))
-        store(scratch, BACK + 2 * STRIDE + j, down(scratch, BY_DIFFERENCE_VARIANCE + j, row))
+        this, below = down(scratch, BY_MEAN + j, row)
+        store(scratch, BACK + j, this)
+        store(scratch, BACK + 3 * STRIDE + j, below)
+        this, below = down(scratch, BY_SUM_VARIANCE + j, row)
+        store(scratch, BACK + STRIDE + j, this)
+        store(scratch, BACK + 4 * STRIDE + j, below)
+        this, below = down(scratch, BY_DIFFERENCE_VARIANCE + j, row)
+        store(scratch, BACK + 2 * STRIDE + j, this)
+        store(scratch, BACK + 5 * STRIDE + j, below)
+
+
+@part
+def gradient_row(
+    scratch: _Floats,
+    row: int,
+    columns: int,
+    back: int,
+    l1_weight: np.float32,
+    ssim_weight: np.float32,
+) -> None:
+    """Writes the loss's gradient at a row of the tile to the line.
+
+    The row's sums down the columns begin at element `back`.
+    """
     slot = (row & (SLOTS - 1)) * STRIDE + 2 * HALO
     zero, plus, weight = splat(_ZERO), splat(l1_weight), splat(ssim_weight)
     minus = zero - plus
@@ -110,9 +141,9 @@ def gradient_row(
         s = load(scratch, SUM + slot + j)
         d = load(scratch, DIFFERENCE + slot + j)
         difference = d + load(scratch, CENTRE_DIFFERENCE + j)
-        ssim = across(scratch, BACK + j)
-        ssim = fma(s, across(scratch, BACK + STRIDE + j), ssim)
-        ssim = fma(d, across(scratch, BACK + 2 * STRIDE + j), ssim)
+        ssim = across(scratch, back + j)
+        ssim = fma(s, across(scratch, back + STRIDE + j), ssim)
+        ssim = fma(d, across(scratch, back + 2 * STRIDE + j), ssim)
         l1 = where(zero < difference, plus, where(zero < zero - difference, minus, zero))
         keep = load(scratch, KEEP + slot + j)
         store(scratch, LINE + j, where(zero < keep, fnma(ssim, weight, l1), zero))

@@ -9,6 +9,7 @@ from crossgrad_plugins.losses.photometric.numba_kernels.layout import CHANNELS, 
 from crossgrad_plugins.losses.photometric.reference import RADIUS, gaussian_window
 
 _Floats = NDArray[np.float32]
+_Taps = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 _LAST = SLOTS - 1
 _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in gaussian_window().numpy()[: RADIUS + 1])
 
@@ -36,39 +37,77 @@ def _tap(ring: _Floats, start: int, row: int) -> Lanes:
 
 
 @device
-def down(ring: _Floats, start: int, row: int) -> Lanes:
-    """Window sum over rows row - 5 .. row + 5 of the ring whose column is at element `start`."""
-    total = _tap(ring, start, row) * splat(_W5)
-    pair = _tap(ring, start, row - 1) + _tap(ring, start, row + 1)
-    total = fma(pair, splat(_W4), total)
-    pair = _tap(ring, start, row - 2) + _tap(ring, start, row + 2)
-    total = fma(pair, splat(_W3), total)
-    pair = _tap(ring, start, row - 3) + _tap(ring, start, row + 3)
-    total = fma(pair, splat(_W2), total)
-    pair = _tap(ring, start, row - 4) + _tap(ring, start, row + 4)
-    total = fma(pair, splat(_W1), total)
-    pair = _tap(ring, start, row - 5) + _tap(ring, start, row + 5)
-    return fma(pair, splat(_W0), total)
+def _taps(ring: _Floats, start: int, row: int) -> _Taps:
+    """The twelve rows that the windows around `row` and the row below it reach."""
+    return (
+        _tap(ring, start, row - 5),
+        _tap(ring, start, row - 4),
+        _tap(ring, start, row - 3),
+        _tap(ring, start, row - 2),
+        _tap(ring, start, row - 1),
+        _tap(ring, start, row),
+        _tap(ring, start, row + 1),
+        _tap(ring, start, row + 2),
+        _tap(ring, start, row + 3),
+        _tap(ring, start, row + 4),
+        _tap(ring, start, row + 5),
+        _tap(ring, start, row + 6),
+    )
 
 
 @device
-def _add_pair(
-    ring: _Floats, start: int, row: int, reach: int, weight: Lanes, sums: tuple[Lanes, Lanes]
-) -> tuple[Lanes, Lanes]:
-    """Adds the rows `reach` above and below, and their squares."""
-    above, below = _tap(ring, start, row - reach), _tap(ring, start, row + reach)
-    squares = fma(above, above, below * below)
-    return fma(above + below, weight, sums[0]), fma(squares, weight, sums[1])
+def _sum(
+    a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
+    f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
+) -> Lanes:  # fmt: skip
+    """Window sum of eleven rows."""
+    total = middle * splat(_W5)
+    total = fma(e + f, splat(_W4), total)
+    total = fma(d + g, splat(_W3), total)
+    total = fma(c + h, splat(_W2), total)
+    total = fma(b + i, splat(_W1), total)
+    return fma(a + j, splat(_W0), total)
 
 
 @device
-def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
-    """Window sums over rows row - 5 .. row + 5 of the ring's values and of their squares."""
-    middle = _tap(ring, start, row)
-    weight = splat(_W5)
-    sums = (middle * weight, middle * middle * weight)
-    sums = _add_pair(ring, start, row, 1, splat(_W4), sums)
-    sums = _add_pair(ring, start, row, 2, splat(_W3), sums)
-    sums = _add_pair(ring, start, row, 3, splat(_W2), sums)
-    sums = _add_pair(ring, start, row, 4, splat(_W1), sums)
-    return _add_pair(ring, start, row, 5, splat(_W0), sums)
+def _sum_squares(
+    a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
+    f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
+) -> Lanes:  # fmt: skip
+    """Window sum of the squares of eleven rows."""
+    total = middle * middle * splat(_W5)
+    total = fma(fma(e, e, f * f), splat(_W4), total)
+    total = fma(fma(d, d, g * g), splat(_W3), total)
+    total = fma(fma(c, c, h * h), splat(_W2), total)
+    total = fma(fma(b, b, i * i), splat(_W1), total)
+    return fma(fma(a, a, j * j), splat(_W0), total)
+
+
+@device
+def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
+    """Window sums over the rows of a ring around `row` and around the next one.
+
+    Both at once: what they need comes from the second-level cache, and is mostly the same.
+
+    Args:
+        ring: Rows, of which `SLOTS` are kept.
+        start: Element where the column begins.
+        row: Number of a row.
+    """
+    a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
+    return (
+        _sum(a, b, c, d, e, f, g, h, i, j, k),
+        _sum(b, c, d, e, f, g, h, i, j, k, last),
+    )
+
+
+@device
+def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """As `down`: the sums of the values and of their squares, then the same around the next row."""
+    a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
+    return (
+        _sum(a, b, c, d, e, f, g, h, i, j, k),
+        _sum_squares(a, b, c, d, e, f, g, h, i, j, k),
+        _sum(b, c, d, e, f, g, h, i, j, k, last),
+        _sum_squares(b, c, d, e, f, g, h, i, j, k, last),
+    )
