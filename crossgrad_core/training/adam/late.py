@@ -21,6 +21,9 @@ from crossgrad_core.training.adam.coefficients import Coefficients
 
 #: Steps that a row may be late with: tables stay short.
 LONGEST: Final = 256
+#: Share of the rows from which on a step is taken with all of them, in the order of memory: to
+#: bring those left out up to date later takes longer.
+MOST_ROWS: Final = 0.2
 #: Second moments that fade faster may be gone before the kernel looks again.
 LEAST_BETA2: Final = 0.5
 
@@ -79,6 +82,8 @@ class Late:
     ) -> None:
         """Takes a step with the rows that `grad` (sparse) has; the others are late from now on.
 
+        Where it has many rows, the step is taken with all of them, and none is late.
+
         Args:
             name: Name of the tensor; its count in `adam` includes this step.
             param: The tensor, float32 and contiguous, on the CPU.
@@ -87,26 +92,27 @@ class Late:
             step: The coefficients of the step.
         """
         from crossgrad_core.numerics.jobs import share
-        from crossgrad_core.training.adam.numba_kernels.fused import numbers_of, update_arrays
-        from crossgrad_core.training.adam.numba_kernels.late import update_rows
+        from crossgrad_core.training.adam.numba_kernels.fused import numbers_of
+        from crossgrad_core.training.adam.numba_kernels.late import update_all, update_rows
 
         count = adam.steps[name]
+        rows = rows_of(grad).to(torch.int32)
+        most = len(rows) >= MOST_ROWS * param.shape[0]
+        self.catch_up(name, param, adam, None if most else rows)
+        flat, numbers, width = _flat(name, param, adam), numbers_of(step), _width(param)
+        values = values_of(grad).contiguous().view(-1).numpy()
+        update = update_all if most else update_rows
+        share(update, rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
+        _changed(name, param, adam)
+        if most:
+            return
         if name not in self._behind:
             done = np.full(param.shape[0], count - 1, np.int32)
             self._behind[name] = _Behind(done, count - 1)
-        rows = rows_of(grad).to(torch.int32)
-        self.catch_up(name, param, adam, rows)
-        behind, flat = self._behind[name], _flat(name, param, adam)
-        numbers, width = numbers_of(step), _width(param)
-        values = values_of(grad).contiguous().view(-1).numpy()
-        if len(rows) == len(behind.done):
-            update_arrays(flat[0], values, flat[1], flat[2], step)
-        else:
-            share(update_rows, rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
+        behind = self._behind[name]
         behind.done[rows.numpy()] = count
         beta1, _, beta2, _, step_size, root_scale, eps, _, _ = map(float, numbers)
         behind.add(beta1, beta2, step_size, root_scale, eps)
-        _changed(name, param, adam)
         if behind.count == LONGEST:
             self.catch_up(name, param, adam)
 

@@ -18,6 +18,7 @@ from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.coefficients import Rule
 from crossgrad_core.training.adam.late import Late
@@ -30,6 +31,12 @@ from crossgrad_operators.sum import Sum
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
 SHAPES = [(15, 3), (1, 3), (), (8,), (3, 3)]
+
+
+@pytest.fixture(autouse=True)
+def _rows_wait(monkeypatch):
+    """Whatever share of the rows is drawn: the scenes of these tests are small."""
+    monkeypatch.setattr(late, "MOST_ROWS", 2.0)
 
 
 class Both:
@@ -58,8 +65,10 @@ class Both:
         return self.adam.steps == self.other.steps and all(torch.equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.parametrize("most", [0.2, 2.0])
 @pytest.mark.parametrize("seed", range(10))
-def test_late_steps_have_the_bits_of_steps_taken_at_once(seed):
+def test_late_steps_have_the_bits_of_steps_taken_at_once(monkeypatch, seed, most):
+    monkeypatch.setattr(late, "MOST_ROWS", most)
     rng = np.random.default_rng(seed)
     shape = (int(rng.integers(1, 300)), *SHAPES[seed % len(SHAPES)])
     both = Both(
@@ -105,6 +114,19 @@ def long_wait():
         p -= rate * (m / (1 - 0.9**t)) / root
         gradient = 0.0
     return both, start, p
+
+
+@pytest.mark.parametrize("shape", [(3000, 15, 3), (3000, 1, 3)])
+@pytest.mark.parametrize("share", [0.25, 0.9, 1.0])
+def test_with_many_rows_a_step_is_taken_with_all(monkeypatch, shape, share):
+    monkeypatch.setattr(late, "MOST_ROWS", 0.2)
+    rng = np.random.default_rng(3)
+    both = Both(torch.from_numpy(rng.normal(size=shape).astype(np.float32)))
+    for size in (0.02, share, share):
+        rows = np.flatnonzero(np.repeat(rng.random(300) < size, 10))
+        both.step(rows, rng.normal(size=(len(rows), *shape[1:])).astype(np.float32), 1e-3, Rule())
+        assert ("x" in both.late.names) == (size < 0.2)
+    assert both.same()
 
 
 def test_ten_thousand_late_steps_have_the_bits_of_steps_taken_at_once(long_wait):
@@ -207,11 +229,11 @@ def trained(setup, plugins=()):
     for k, plugin in enumerate(plugins):
         setup.manager.register(plugin, name=f"own{k}")
     state = first_state(setup)
-    late = 0
+    waited = 0
     for _ in range(setup.schedule.total):
         timed_step(setup, state)
-        late += bool(state.late.names)
-    return state, late
+        waited += bool(state.late.names)
+    return state, waited
 
 
 def everything(state):
@@ -236,13 +258,17 @@ def everything(state):
     ids=str,
 )
 def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, plugins):
-    lazy, late = trained(setup_of(**settings), [plugin() for plugin in plugins])
+    lazy, waited = trained(setup_of(**settings), [plugin() for plugin in plugins])
+    monkeypatch.setattr(late, "MOST_ROWS", 0.2)
+    mixed, _ = trained(setup_of(**settings), [plugin() for plugin in plugins])
     monkeypatch.setattr(NumbaRasterizer, "by_rows", False)
     plain, none = trained(setup_of(**settings), [plugin() for plugin in plugins])
-    assert none == 0 and (late > 5 or settings.get("operator") == "graddrop")
-    (ours, steps), (theirs, others) = everything(lazy), everything(plain)
-    assert steps == others and ours.keys() == theirs.keys()
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert none == 0 and (waited > 5 or settings.get("operator") == "graddrop")
+    theirs, others = everything(plain)
+    for run in (lazy, mixed):
+        ours, steps = everything(run)
+        assert steps == others and ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
 @pytest.mark.parametrize("settings", [{}, {"operator": "pcgrad", "views": 2}], ids=str)

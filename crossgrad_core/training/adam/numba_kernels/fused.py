@@ -43,7 +43,7 @@ def update(
 
 
 @kernel
-def _moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
+def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
     """Whether the step changes a bit: gradient and moments of what was never drawn are 0."""
     few = min(64, len(grad))
     for end in (few, len(grad)):
@@ -68,7 +68,7 @@ def _update_chunks(
     while chunk * _CHUNK < len(param):
         for a in range(chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK), _RUN):
             b = min(len(param), a + _RUN)
-            if _moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
+            if moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
         chunk = take(jobs)
 

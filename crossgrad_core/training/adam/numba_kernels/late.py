@@ -30,7 +30,7 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY
-from crossgrad_core.training.adam.numba_kernels.fused import Numbers, update
+from crossgrad_core.training.adam.numba_kernels.fused import Numbers, moves, update
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -265,4 +265,57 @@ def update_rows(
                 for i in range(width):
                     param[at + i], exp_avg[at + i] = ps[to + i], ms[to + i]
                     exp_avg_sq[at + i] = vs[to + i]
+        task = take(jobs)
+
+
+@kernel
+def update_all(
+    jobs: Jobs,
+    rows: Ints,
+    width: int,
+    param: Floats,
+    grad: Floats,
+    exp_avg: Floats,
+    exp_avg_sq: Floats,
+    numbers: Numbers,
+) -> None:
+    """Takes one step with all rows of a tensor, of which those not listed have no gradient.
+
+    Args:
+        jobs: From `share`.
+        rows: [R], sorted, each once.
+        width: Elements of a row.
+        param: [N * width].
+        grad: [R * width].
+        exp_avg: [N * width].
+        exp_avg_sq: [N * width].
+        numbers: Of the step, as in `fused`.
+    """
+    count, wide = param.size // width, width >= LANES
+    pulls = np.empty(_GATHERED * width, np.float32)
+    task = take(jobs)
+    while task * _ROWS < count:
+        end = min(count, (task + 1) * _ROWS)
+        place = np.searchsorted(rows, task * _ROWS)
+        for first in range(task * _ROWS, end, _GATHERED):
+            stop = min(first + _GATHERED, end)
+            a, b, begin = first * width, stop * width, place
+            while place < rows.size and rows[place] < stop:
+                place += 1
+            if place - begin == stop - first:
+                own = grad[begin * width : place * width]
+                update(param[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], numbers)
+                continue
+            pulls[: b - a] = _ZERO
+            for k in range(begin, place):
+                at, to = k * width, (np.intp(rows[k]) - first) * width
+                if wide:
+                    for i in range(0, width - LANES, LANES):
+                        store(pulls, to + i, load(grad, at + i))
+                    store(pulls, to + width - LANES, load(grad, at + width - LANES))
+                    continue
+                for i in range(width):
+                    pulls[to + i] = grad[at + i]
+            if place > begin or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
+                update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
         task = take(jobs)
