@@ -1,5 +1,6 @@
 """The CPU kernels as arrays: closed forms, a float64 restatement in NumPy, bits, extremes."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,6 +16,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
+from crossgrad_plugins.rasterizers.numba_kernels.records import log2_of
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade
 
@@ -303,6 +305,14 @@ def test_harmonics_gradients_equal_difference_quotients(degree):
             losses.append(loss(replace(gaussians, **{name: values})))
         expected = (losses[0] - losses[1]) / (2 * step)
         assert getattr(found, name)[index] == pytest.approx(expected, rel=2e-2, abs=2e-3)
+
+
+def test_the_logarithm_of_opacities_is_right_to_a_float32_and_far_below():
+    rng = np.random.default_rng(0)
+    values = np.concatenate([2.0 ** rng.uniform(-1000, 3, 3000), 2.0 ** rng.uniform(-8, 0, 3000)])
+    for value in (*values, 1.0, 0.5, 1.0 / 255.0, np.nextafter(1.0, 0.0), math.sqrt(2.0)):
+        assert log2_of.py_func(value) == pytest.approx(math.log2(value), rel=1e-15, abs=1e-13)
+    assert log2_of.py_func(0.0) < -1000.0
 
 
 def test_the_harmonics_are_orthonormal_on_the_sphere():

@@ -166,10 +166,19 @@ def _find(
         for row in range(min(LANES, boxes[j, 3] - block)):
             begin = np.intp(max(left, begins[place + row]))
             end = np.intp(min(right, ends[place + row]))
-            for column in range(begin, end + 1):
-                tile = (block + row) * tile_columns + column
-                tile_of_slot[slot] = tile
-                counts[tile] += 1
+            if begin > end:
+                continue
+            tile = (block + row) * tile_columns + begin
+            # Most rows have one tile or two, by chance: no branch between these.
+            more = np.intp(end > begin)
+            tile_of_slot[slot] = tile
+            tile_of_slot[slot + more] = tile + more
+            counts[tile] += 1
+            counts[tile + more] += more
+            slot += 1 + more
+            for further in range(tile + 2, tile + 1 + end - begin):
+                tile_of_slot[slot] = further
+                counts[further] += 1
                 slot += 1
     return slot - first_slot
 

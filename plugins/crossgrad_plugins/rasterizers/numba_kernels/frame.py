@@ -188,12 +188,13 @@ def backward(
 
 
 def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
-    """Zeros for the gradient of one field: of all Gaussians, or of the rows that were drawn."""
+    """Room for the gradient of one field: zeros for all Gaussians, or rows for those drawn."""
     if like is None:
         return None
     rows = frame.projected.rows
-    by_rows = rows is not None and field in frame.gaussians.by_rows
-    return np.zeros((len(rows) if by_rows else len(like), *like.shape[1:]), np.float32)
+    if rows is not None and field in frame.gaussians.by_rows:
+        return np.empty((len(rows), *like.shape[1:]), np.float32)
+    return np.zeros(like.shape, np.float32)
 
 
 def _directions(

@@ -46,6 +46,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     analytic_shape,
     place_record,
     plain_shape,
+    shape_block,
     square,
     write_analytic,
     write_plain,
@@ -118,12 +119,14 @@ def _picked(
     means: NDArray[np.float32],
     quats: NDArray[np.float32],
     scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
     chosen: NDArray[np.int64],
     picked: NDArray[np.float32],
 ) -> int:
     """Copies those of a block that may be drawn side by side; returns their number.
 
-    `chosen` says which they are; `picked` has their means, their quaternions and their scales.
+    `chosen` says which they are; `picked` has their means, their quaternions, their scales and
+    their opacities.
     """
     count = 0
     for k in range(size):
@@ -137,6 +140,7 @@ def _picked(
             picked[7 * BLOCK + 3 * place + axis] = scales[i, axis]
         for axis in range(4):
             picked[3 * BLOCK + 4 * place + axis] = quats[i, axis]
+        picked[10 * BLOCK + place] = opacities[i]
     return count
 
 
@@ -229,7 +233,7 @@ def _record_block(
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
         if analytic is None:
-            radius, pixels, plain = plain_shape(k, opacity, width, height, within, found)
+            radius, pixels, plain = plain_shape(k, width, height, within, found)
         else:
             radius, pixels, turned = analytic_shape(k, opacity, width, height, within, found)
         if radius == 0 or (colors is not None and not _tint(i, j, colors, records)):
@@ -316,7 +320,7 @@ def project(
     found = np.empty(FOUND * BLOCK, np.float64)
     flags = np.ones(BLOCK, np.uint8)
     chosen = np.empty(BLOCK, np.int64)
-    picked = np.empty(10 * BLOCK, np.float32)
+    picked = np.empty(11 * BLOCK, np.float32)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
         first = chunk * CHUNK
@@ -335,7 +339,7 @@ def project(
                     opacities[begin:],
                     flags,
                 )
-            left = _picked(begin, size, flags, means, quats, scales, chosen, picked)
+            left = _picked(begin, size, flags, means, quats, scales, opacities, chosen, picked)
             _project_block(
                 left,
                 camera,
@@ -346,6 +350,8 @@ def project(
                 picked[7 * BLOCK :],
                 found,
             )
+            if analytic is None:
+                shape_block(left, picked[10 * BLOCK :], found)
             end = _record_block(
                 chosen[:left],
                 end,

@@ -14,7 +14,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
     squared_radius,
     window,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.blocks import get
+from crossgrad_plugins.rasterizers.numba_kernels.blocks import get, get_four, put
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import clamped
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
@@ -46,7 +46,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 #: dilated 2-D covariance (px^2) and its determinant (negative for what cannot be drawn), and the
 #: factor of the opacity.
 CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
-FOUND = 8
+#: Of the plain response: 1 / variance in y, the slope of the rows' centres, their variance and
+#: decay, log2 of the opacity, and both half extents of the footprint, pixels.
+_INVERSE_C, _SLOPE, _VARIANCE, _DECAY, _LOG_OPACITY, _EXTENT_X, _EXTENT_Y = range(8, 15)
+FOUND = 15
 
 #: The published footprint: standard deviations, least square of half the difference of the
 #: variances (px^4), and side of its tiles, pixels.
@@ -64,6 +67,11 @@ _LARGEST = 1e30
 _STEEPEST = 1e15
 # Smallest decay in a record (px^-2): flat over any image, and its inverse is a float32.
 _FLAT = 1e-30
+
+# A float64's bits: those of the mantissa, the exponent of 1, the bits of 1.0.
+_MANTISSA_BITS, _BIAS = 52, 1023
+_MANTISSA, _ONE = np.int64((1 << _MANTISSA_BITS) - 1), np.int64(_BIAS << _MANTISSA_BITS)
+_ROOT_OF_TWO = math.sqrt(2.0)
 
 
 @device
@@ -211,13 +219,53 @@ def _radius(extent: float) -> int:
 
 
 @device
+def log2_of(value: float) -> float:
+    """Returns log2 of a normal positive number, error below 1e-13; any number below 2**-1000 else.
+
+    Loops that call it are vectorised, which those that call the C library are not.
+    """
+    raw = np.float64(value).view(np.int64)
+    exponent = (raw >> _MANTISSA_BITS) - _BIAS
+    mantissa = np.int64((raw & _MANTISSA) | _ONE).view(np.float64)
+    large = mantissa > _ROOT_OF_TWO
+    mantissa = 0.5 * mantissa if large else mantissa
+    # log((1 + s) / (1 - s)) = 2 (s + s^3 / 3 + s^5 / 5 + ...), |s| <= 0.172
+    s = (mantissa - 1.0) / (mantissa + 1.0)
+    q = s * s
+    high = (1.0 / 17.0 * q + 1.0 / 15.0) * q + 1.0 / 13.0
+    middle = (1.0 / 11.0 * q + 1.0 / 9.0) * q + 1.0 / 7.0
+    low = (0.2 * q + 1.0 / 3.0) * q + 1.0
+    series = (high * (q * q * q) + middle) * (q * q * q) + low
+    return np.float64(exponent + large) + 2.0 * LOG2_E * s * series
+
+
+@device
+def shape_block(count: int, opacities: NDArray[np.float32], found: NDArray[np.float64]) -> None:
+    """Finds what the plain response of `count` projected Gaussians is like, drawn or not."""
+    for k in range(count):
+        a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
+        inverse_c = 1.0 / c
+        variance = det * inverse_c
+        log_opacity = log2_of(np.float64(opacities[k]) * get(found, FACTOR, k))
+        reach = _reach(log_opacity)
+        put(found, _INVERSE_C, k, inverse_c)
+        put(found, _SLOPE, k, get(found, COVARIANCE, k) * inverse_c)
+        put(found, _VARIANCE, k, variance)
+        put(found, _DECAY, k, 0.5 * LOG2_E / variance)
+        put(found, _LOG_OPACITY, k, log_opacity)
+        put(found, _EXTENT_X, k, math.sqrt(reach * a))
+        put(found, _EXTENT_Y, k, math.sqrt(reach * c))
+
+
+@device
+def _reach(log_opacity: float) -> float:
+    """Returns the largest squared distance of a touched pixel, in standard deviations."""
+    return 2.0 / LOG2_E * (log_opacity - TOUCH)
+
+
+@device
 def plain_shape(
-    k: int,
-    opacity: float,
-    width: int,
-    height: int,
-    within: Rectangle,
-    found: NDArray[np.float64],
+    k: int, width: int, height: int, within: Rectangle, found: NDArray[np.float64]
 ) -> tuple[int, Rectangle, Plain]:
     """Returns the radius of projected Gaussian k, its pixels, and what its record says.
 
@@ -227,11 +275,9 @@ def plain_shape(
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
-    inverse_c = 1.0 / c
-    slope, variance = get(found, COVARIANCE, k) * inverse_c, det * inverse_c
-    log_opacity = math.log2(opacity * get(found, FACTOR, k))
-    reach = 2.0 / LOG2_E * (log_opacity - TOUCH)  # largest squared distance in standard deviations
-    decay = 0.5 * LOG2_E / variance
+    inverse_c, slope, variance, decay = get_four(found, _INVERSE_C, k)
+    log_opacity = get(found, _LOG_OPACITY, k)
+    reach = _reach(log_opacity)
     # The sums are NaN or infinite if any term is, and then fail the comparison.
     if not (
         det > 0.0
@@ -241,7 +287,7 @@ def plain_shape(
         and abs(slope) < _STEEPEST
     ):
         return nothing
-    extent_x, extent_y = math.sqrt(reach * a), math.sqrt(reach * c)
+    extent_x, extent_y = get(found, _EXTENT_X, k), get(found, _EXTENT_Y, k)
     pixels = _pixels(u, v, extent_x, extent_y, width, height, within)
     x0, x1, y0, y1 = pixels
     if x0 > x1 or y0 > y1 or not _hits(y0, y1, u, v, inverse_c, slope, variance, reach, width):
