@@ -207,19 +207,21 @@ def _broadcast(width: int) -> Callable[..., Any]:
     return emit
 
 
-def _broadcast_two(width: int) -> Callable[..., Any]:
+def _broadcast_four(width: int) -> Callable[..., Any]:
     def emit(at: _Site, array: Any, index: Any) -> Any:
-        # As one number of 64 bits it is a load and nothing else; two halves would need a shuffle.
-        two = at.builder.load(_element(at, array, index, _LONG), align=_ALIGNMENT)
-        empty = ir.Constant(ir.VectorType(_LONG, width // 2), ir.Undefined)
-        single = at.builder.insert_element(empty, two, _INT(0))
-        return at.builder.bitcast(_shuffle(at, single, single, [0] * (width // 2)), _floats(width))
+        four = at.builder.load(_element(at, array, index, _floats(4)), align=_ALIGNMENT)
+        return _shuffle(at, four, four, [0, 1, 2, 3] * (width // 4))
 
     return emit
 
 
-def _interleaved(at: _Site, a: Any, b: Any) -> Any:
-    return _shuffle(at, a, b, [lane + start for lane in range(LANES) for start in (0, LANES)])
+def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
+    """Makes a function that returns lanes of two vectors of sixteen in a fixed order.
+
+    Args:
+        order: Sixteen numbers of lanes; those of the second vector count from 16 on.
+    """
+    return _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
 
 
 def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
@@ -288,6 +290,34 @@ def _pick(sign: str) -> Callable[..., Any]:
     return emit
 
 
+def _reached_patches(at: _Site, first: Any, last: Any) -> Any:
+    build, whole = at.builder, _same(first)
+
+    def number(kind: ir.Type, value: float) -> Any:
+        return ir.Constant(kind, [value] * WIDE)
+
+    zero, end = number(first.type, 0.0), number(first.type, 63.0)
+    inside = build.and_(
+        build.fcmp_ordered("<=", first, last),
+        build.and_(build.fcmp_ordered("<=", first, end), build.fcmp_ordered(">=", last, zero)),
+    )
+    low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
+    high = build.select(build.fcmp_ordered("<", last, end), last, end)
+    # Where nothing is inside there may be NaN, of which no whole number can be made.
+    columns = [
+        build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
+        for edge in (low, high)
+    ]
+    run = build.sub(
+        build.shl(number(whole, 2), columns[1]), build.shl(number(whole, 1), columns[0])
+    )
+    run = build.select(inside, run, number(whole, 0))
+    for distance in (1, 2):
+        run = build.or_(run, _shuffle(at, run, run, [lane ^ distance for lane in range(WIDE)]))
+    four = build.trunc(_shuffle(at, run, run, range(0, WIDE, 4)), ir.VectorType(ir.IntType(16), 4))
+    return build.bitcast(four, _LONG)
+
+
 def _bits(at: _Site, mask: Any) -> Any:
     return at.builder.zext(at.builder.bitcast(mask, ir.IntType(mask.type.count)), _LONG)
 
@@ -335,9 +365,9 @@ ramp: Callable[[], Lanes] = _function(_ramp(LANES), _eight)
 load: Callable[[_Array, int], Lanes] = _function(_load(LANES), _eight, None, types.intp)
 #: Returns one number of a flat float32 array in all lanes.
 broadcast: Callable[[_Array, int], Lanes] = _function(_broadcast(LANES), _eight, None, types.intp)
-#: Returns two consecutive numbers of a flat float32 array, by turns in eight lanes.
-broadcast_two: Callable[[_Array, int], Lanes] = _function(
-    _broadcast_two(LANES), _eight, None, types.intp
+#: Returns four consecutive numbers of a flat float32 array, twice.
+broadcast_four: Callable[[_Array, int], Lanes] = _function(
+    _broadcast_four(LANES), _eight, None, types.intp
 )
 #: Returns a float32 number in sixteen lanes.
 splat_wide: Callable[[np.float32], Lanes] = _function(_splat(WIDE), _wide, types.float32)
@@ -349,19 +379,21 @@ load_wide: Callable[[_Array, int], Lanes] = _function(_load(WIDE), _wide, None, 
 broadcast_wide: Callable[[_Array, int], Lanes] = _function(
     _broadcast(WIDE), _wide, None, types.intp
 )
-#: Returns two consecutive numbers of a flat float32 array, by turns in sixteen lanes.
-broadcast_two_wide: Callable[[_Array, int], Lanes] = _function(
-    _broadcast_two(WIDE), _wide, None, types.intp
+#: Returns four consecutive numbers of a flat float32 array, four times.
+broadcast_four_wide: Callable[[_Array, int], Lanes] = _function(
+    _broadcast_four(WIDE), _wide, None, types.intp
 )
-#: Returns the lanes of two vectors of eight by turns.
-interleaved: Callable[[Lanes, Lanes], Lanes] = _function(_interleaved, _wide, _eight, _eight)
-#: Returns the first of two vectors that were interleaved.
-even_lanes: Callable[[Lanes], Lanes] = _function(
-    lambda at, a: _shuffle(at, a, a, range(0, WIDE, 2)), _eight, _wide
+#: Returns the lanes of two vectors of eight, one vector after the other.
+joined: Callable[[Lanes, Lanes], Lanes] = _function(
+    lambda at, a, b: _shuffle(at, a, b, range(WIDE)), _wide, _eight, _eight
 )
-#: Returns the second of them.
-odd_lanes: Callable[[Lanes], Lanes] = _function(
-    lambda at, a: _shuffle(at, a, a, range(1, WIDE, 2)), _eight, _wide
+#: Returns the first eight of sixteen lanes.
+first_half: Callable[[Lanes], Lanes] = _function(
+    lambda at, a: _shuffle(at, a, a, range(LANES)), _eight, _wide
+)
+#: Returns the last eight of sixteen lanes.
+last_half: Callable[[Lanes], Lanes] = _function(
+    lambda at, a: _shuffle(at, a, a, range(LANES, WIDE)), _eight, _wide
 )
 #: Returns the first eight of sixteen lanes plus the last eight.
 halves_added: Callable[[Lanes], Lanes] = _function(_halves_added, _eight, _wide)
@@ -409,6 +441,12 @@ larger: Callable[[Lanes, Lanes], Lanes] = _function(_pick(">"), _lanes, _lanes, 
 #: Returns the first number where the mask is true and the second elsewhere.
 where: Callable[[Mask, Lanes, Lanes], Lanes] = _function(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
+)
+#: Returns the patches of 4 x 4 pixels reached in sixteen rows, given the first and the last pixel
+#: of each (none where these do not compare): in bit 16 r + c the patch of columns 4 c to 4 c + 3 of
+#: rows 4 r to 4 r + 3. Pixels are counted from 0 to 63; others are left out.
+reached_patches: Callable[[Lanes, Lanes], np.uint64] = _function(
+    _reached_patches, types.uint64, _wide, _wide
 )
 #: Returns the mask as a number, lane 0 in the lowest bit.
 bits: Callable[[Mask], np.uint64] = _function(_bits, types.uint64, _mask)

@@ -21,13 +21,14 @@ from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_core.numerics.simd import (
     Lanes,
     bits,
-    broadcast_two_wide,
+    broadcast_four_wide,
     broadcast_wide,
     fma,
     fnma,
     larger,
     magnitude,
     ramp_wide,
+    reached_patches,
     round_down,
     round_up,
     smaller,
@@ -38,12 +39,10 @@ from crossgrad_core.numerics.simd import (
 from crossgrad_plugins.rasterizers.numba_kernels.constants import exp2, terms_of
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    COLUMNS,
     COSINE,
     LOG2_E,
     REACH_1,
     REACH_2,
-    SEGMENT,
     SINE,
     SPARE,
     TILE_HEIGHT,
@@ -146,7 +145,7 @@ def fill_axis_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """As `footprint.fill_rows`: the segments within reach along both main axes."""
+    """As `footprint.fill_rows`: the patches within reach along both main axes."""
     half, zero = _number(0.5), _number(0.0)
     dx = splat_wide(left) - broadcast_wide(records, record + U_WHOLE)
     dx = dx + (half - broadcast_wide(records, record + U_PART))
@@ -166,13 +165,7 @@ def fill_axis_rows(
     low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
     first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))
     last = round_down(smaller(larger(low_1, high_1), larger(low_2, high_2)))
-    row_reached = first <= last
-    reached = np.uint64(0)
-    for column in range(COLUMNS):
-        begin, end = _number(column * SEGMENT), _number(column * SEGMENT + SEGMENT - 1)
-        inside = row_reached & (first <= end) & (last >= begin)
-        reached |= bits(inside) << np.uint64(column * TILE_HEIGHT)
-    return reached
+    return reached_patches(first, last)
 
 
 @device
@@ -308,7 +301,7 @@ def coverage_gradients(
 def axis_offsets(
     cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
 ) -> tuple[Lanes, Lanes]:
-    """Returns the offsets along the main axes of pixels `offsets` right of a pair's first ones."""
-    u = fma(cosine, offsets, broadcast_two_wide(rows, row + ROW_U))
-    v = fnma(sine, offsets, broadcast_two_wide(rows, row + ROW_V))
+    """Returns the offsets along the main axes of pixels `offsets` from the left of four rows."""
+    u = fma(cosine, offsets, broadcast_four_wide(rows, row + ROW_U))
+    v = fnma(sine, offsets, broadcast_four_wide(rows, row + ROW_V))
     return u, v

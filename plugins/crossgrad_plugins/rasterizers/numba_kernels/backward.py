@@ -19,8 +19,8 @@ from crossgrad_core.numerics.simd import (
     WIDE,
     Lanes,
     broadcast,
-    broadcast_two,
-    broadcast_two_wide,
+    broadcast_four,
+    broadcast_four_wide,
     broadcast_wide,
     fma,
     fnma,
@@ -71,13 +71,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     INVERSE_1,
     INVERSE_2,
     LOG_OPACITY,
-    PAIR,
     PARTIAL,
+    PATCHES,
     PEAK,
     RECORD,
     RED,
     ROW_DECAY,
-    SEGMENTS,
     SINE,
     SLOPE,
     SUM_ABS_X,
@@ -87,6 +86,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.patches import aligned, column_of, row_of
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     DEPTHS,
     STATE,
@@ -97,9 +97,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     odds_of,
     start_tile,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, upper_of
 
-#: Numbers of a pair of segments, WIDE each: alpha (later the gradient by the exponent), the odds of
+#: Numbers of a patch, WIDE each: alpha (later the gradient by the exponent), the odds of
 #: alpha, and the column offsets.
 _ALPHA, _ODDS, _DX = 0, WIDE, 2 * WIDE
 _RESPONSE = 3 * WIDE
@@ -110,7 +109,7 @@ BATCH = 8
 
 @device
 def _respond(
-    pairs: np.uint64,
+    patches: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -119,22 +118,22 @@ def _respond(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> None:
-    """Writes the plain response in pairs of segments, one after the other.
+    """Writes the plain response in patches, one after the other.
 
-    A loop of its own: nothing in it waits for the transmittance, which a pair gets from the
-    Gaussian before, so that the processor works on several pairs at once.
+    A loop of its own: nothing in it waits for the transmittance, which a patch gets from the
+    Gaussian before, so that the processor works on several patches at once.
     """
     decay = broadcast_wide(records, record + DECAY)
     terms = terms_of(constants)
     zero = splat_wide(np.float32(0.0))
     at = 0
-    while pairs != np.uint64(0):
-        segment = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
-        row = base + (segment & (TILE_HEIGHT - 1))
-        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
-        dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+    while patches != np.uint64(0):
+        patch = lowest_bit(patches)
+        patches &= patches - np.uint64(1)
+        row = base + row_of(patch)
+        offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
+        dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
         # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
@@ -150,7 +149,7 @@ def _respond(
 
 @device
 def _blend(
-    pairs: np.uint64,
+    patches: np.uint64,
     records: NDArray[np.float32],
     record: int,
     state: NDArray[np.float32],
@@ -159,7 +158,7 @@ def _blend(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Blends a plain Gaussian into pairs; turns alpha into the gradient by the exponent.
+    """Blends a plain Gaussian into patches; turns alpha into the gradient by the exponent.
 
     Returns:
         The sums of the gradients by red, green, blue and the depth.
@@ -170,10 +169,10 @@ def _blend(
     z = broadcast_wide(records, record + DEPTH)
     sum_red = sum_green = sum_blue = sum_depth = splat_wide(np.float32(0.0))
     response = 0
-    while pairs != np.uint64(0):
-        segment = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
-        at = segment * (STATE // 2)
+    while patches != np.uint64(0):
+        patch = lowest_bit(patches)
+        patches &= patches - np.uint64(1)
+        at = patch * STATE
         alpha = load_wide(responses, response + _ALPHA)
         odds = load_wide(responses, response + _ODDS)
         v_red = load_wide(state, at + V_RED)
@@ -181,7 +180,7 @@ def _blend(
         v_blue = load_wide(state, at + V_BLUE)
         toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
-            v_z = load_wide(state, DEPTHS + segment * LANES)
+            v_z = load_wide(state, DEPTHS + patch * WIDE)
             toned = fma(v_z, z, toned)
         weight, s = blend(alpha, odds, capped, toned, state, at, constants)
         store(responses, response + _ALPHA, s)
@@ -196,7 +195,7 @@ def _blend(
 
 @device
 def _moments(
-    pairs: np.uint64,
+    patches: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -206,7 +205,7 @@ def _moments(
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
     """Returns SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
 
-    Both halves of a pair's lanes have the same rows, hence the same dy: they are added before it
+    Both halves of a patch's lanes have the same rows, hence the same dy: they are added before it
     is multiplied by. Six sums of eight lanes also fit into the registers of machines with sixteen.
     """
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
@@ -215,15 +214,15 @@ def _moments(
     sum_1 = sum_d = sum_y = sum_dd = sum_yy = sum_dy = splat(np.float32(0.0))
     sum_abs_x = sum_abs_y = splat(np.float32(0.0))
     response = 0
-    while pairs != np.uint64(0):
-        row = base + (lowest_bit(pairs) & (TILE_HEIGHT - 1))
-        pairs &= pairs - np.uint64(1)
+    while patches != np.uint64(0):
+        row = base + row_of(lowest_bit(patches))
+        patches &= patches - np.uint64(1)
         first = load(responses, response + _ALPHA)
         second = load(responses, response + _ALPHA + LANES)
         first_dx = load(responses, response + _DX)
         second_dx = load(responses, response + _DX + LANES)
         response += _RESPONSE
-        dy = broadcast_two(rows, row + ROW_DY)
+        dy = broadcast_four(rows, row + ROW_DY)
         first_d, second_d = first * first_dx, second * second_dx
         s, sd = first + second, first_d + second_d
         sy = s * dy
@@ -243,7 +242,7 @@ def _moments(
 
 @device
 def _gather(
-    pairs: np.uint64,
+    patches: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -257,17 +256,16 @@ def _gather(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sums the gradients of one plain Gaussian over pairs of segments into partials[partial:].
+    """Sums the gradients of one plain Gaussian over patches into partials[partial:].
 
-    A segment of them that it does not reach adds zeros, where the loss has finite gradients.
     `capped` is None for Gaussians whose alpha reaches the largest one nowhere.
     """
-    _respond(pairs, records, record, rows, base, constants, capped, responses)
+    _respond(patches, records, record, rows, base, constants, capped, responses)
     sum_red, sum_green, sum_blue, sum_depth = _blend(
-        pairs, records, record, state, constants, v_depth, capped, responses
+        patches, records, record, state, constants, v_depth, capped, responses
     )
     sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y = _moments(
-        pairs, records, record, rows, base, absolute, responses
+        patches, records, record, rows, base, absolute, responses
     )
     # In the order of the layout.
     red, green = halves_added(sum_red), halves_added(sum_green)
@@ -282,7 +280,7 @@ def _gather(
 
 @device
 def _gather_analytic(
-    pairs: np.uint64,
+    patches: np.uint64,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -306,12 +304,12 @@ def _gather_analytic(
     zero = splat_wide(np.float32(0.0))
     sum_1 = sum_u = sum_v = sum_sigma_1 = sum_sigma_2 = sum_turn = zero
     sum_red = sum_green = sum_blue = sum_depth = sum_abs_x = sum_abs_y = zero
-    while pairs != np.uint64(0):
-        segment = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
-        row = base + (segment & (TILE_HEIGHT - 1))
-        at = segment * (STATE // 2)
-        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+    while patches != np.uint64(0):
+        patch = lowest_bit(patches)
+        patches &= patches - np.uint64(1)
+        row = base + row_of(patch)
+        at = patch * STATE
+        offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
         u, v = axis_offsets(cosine, sine, offsets, rows, row)
         alpha, by_u, by_v, by_sigma_1, by_sigma_2 = coverage_gradients(
             peak, u, v, inverse_1, inverse_2, constants
@@ -325,7 +323,7 @@ def _gather_analytic(
         v_blue = load_wide(state, at + V_BLUE)
         toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
-            v_z = load_wide(state, DEPTHS + segment * LANES)
+            v_z = load_wide(state, DEPTHS + patch * WIDE)
             toned = fma(v_z, z, toned)
         weight, s = blend(alpha, odds, constants, toned, state, at, constants)
         sum_red = fma(weight, v_red, sum_red)
@@ -387,9 +385,9 @@ def _backward(
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
-    state = aligned(DEPTHS + SEGMENTS * LANES)
+    state = aligned(DEPTHS + PATCHES * WIDE)
     rows = aligned(BATCH * ROWS)
-    responses = aligned(SEGMENTS // 2 * _RESPONSE)
+    responses = aligned(PATCHES * _RESPONSE)
     batch = np.empty(BATCH, np.int64)
     start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
     entry, stop = starts[tile], starts[tile + 1]
@@ -413,22 +411,22 @@ def _backward(
             slot = np.intp(entries[at, 1])
             written[slot] = 1
             record = np.intp(entries[at, 0]) * RECORD
-            pairs = upper_of(np.uint64(masks[at]))
+            patches = np.uint64(masks[at])
             base, partial = k * ROWS, slot * PARTIAL
             if analytic is not None:
                 _gather_analytic(
-                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    patches, records, record, rows, base, state, constants, v_depth, absolute,
                     partials, partial,
                 )  # fmt: skip
             # Two loops: that of the many Gaussians that no pixel caps has less to do.
             elif records[record + LOG_OPACITY] <= constants[CAPPED]:
                 _gather(
-                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    patches, records, record, rows, base, state, constants, v_depth, absolute,
                     None, responses, partials, partial,
                 )  # fmt: skip
             else:
                 _gather(
-                    pairs, records, record, rows, base, state, constants, v_depth, absolute,
+                    patches, records, record, rows, base, state, constants, v_depth, absolute,
                     constants, responses, partials, partial,
                 )  # fmt: skip
 
@@ -458,7 +456,7 @@ def differentiate(
         jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] segments per entry, as the forward pass left them.
+        masks: [E] patches per entry, as the forward pass left them.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
         image: [H, W, 3] as drawn, background included.

@@ -20,9 +20,8 @@ from crossgrad_core.numerics.simd import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    COLUMNS,
-    PAIR,
-    SEGMENT,
+    SIDE,
+    TILE_WIDTH,
     TOUCH,
 )
 
@@ -41,14 +40,14 @@ FINISHED = 11 * WIDE
 FIXED = FINISHED  # the odds of an alpha that no parameter changes
 CAPPED = 12 * WIDE
 LEAST = 13 * WIDE
-OFFSETS = 14 * WIDE  # pixel offsets of each column of segments, for both segments of a pair
+OFFSETS = 14 * WIDE  # pixel offsets of each column of patches
 
 #: What `exp2` needs.
 Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
-    """Returns the constants for one cap of alpha, WIDE equal numbers each (offsets: by pairs)."""
+    """Returns the constants for one cap of alpha, WIDE equal numbers each but for the offsets."""
     shared = (
         max_alpha,
         TOUCH,
@@ -59,8 +58,8 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
         ALPHA_THRESHOLD,
     )
     values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
-    pairs = np.repeat(np.arange(COLUMNS * SEGMENT, dtype=np.float32), PAIR // SEGMENT)
-    flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), pairs])
+    offsets = np.repeat(np.arange(TILE_WIDTH, dtype=np.float32), SIDE)
+    flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), offsets])
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
     # From the beginning of a cache line on: no vector lies across two.

@@ -11,17 +11,20 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
+    WIDE,
     Lanes,
     Mask,
     broadcast,
-    even_lanes,
+    first_half,
     fma,
+    fnma,
     larger,
+    last_half,
     load,
-    load_wide,
     lowest_bit,
     magnitude,
     prefetch,
+    ramp,
     splat,
     square_root,
     store,
@@ -33,9 +36,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import OFFSETS
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import ROWS, fill_rows
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    PAIR,
+    PATCHES,
     RECORD,
-    SEGMENTS,
+    SIDE,
     TILE_HEIGHT,
     TILE_WIDTH,
     U_PART,
@@ -43,9 +46,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.patches import aligned, column_of, row_of
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_gradients import mean_gradients
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import DEPTHS, start_tile
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, half_of, upper_of
 
 BINS, FIELDS = 6, 5
 #: Sums per entry: those of the bins, and two that are not used.
@@ -79,7 +82,7 @@ def _spread(
     places: NDArray[np.float32],
     binned: NDArray[np.float32],
 ) -> None:
-    """Adds the gradients of eight pixels to the sums of the bins that hold them.
+    """Adds the gradients of two columns of four pixels to the sums of the bins that hold them.
 
     Args:
         gx: Gradients by the projected mean, px^-1; likewise `gy`.
@@ -100,10 +103,11 @@ def _spread(
     hx, hy = hx * scale, hy * scale
     inverse = one / square_root(fma(hx, hx, hy * hy))
     hx, hy, gx, gy = hx * inverse, hy * inverse, magnitude(gx), magnitude(gy)
-    # Places rise or fall along a row of pixels, so the first and the last one bound the bins.
+    # Places rise or fall along rows and columns of pixels: those at the corners bound the bins.
     store(places, 0, along)
-    first, last = _bin(places[0]), _bin(places[LANES - 1])
-    for number in range(min(first, last), max(first, last) + 1):
+    a, b = _bin(places[0]), _bin(places[SIDE - 1])
+    c, d = _bin(places[LANES - SIDE]), _bin(places[LANES - 1])
+    for number in range(min(a, b, c, d), max(a, b, c, d) + 1):
         low = splat(np.float32(number - 3 if number > 0 else -np.inf))
         high = splat(np.float32(number - 2 if number < BINS - 1 else np.inf))
         inside = moved & (along >= low) & (along < high)
@@ -134,7 +138,7 @@ def _entry(
     found: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Writes the sums of one Gaussian over the reached segments of a tile to found[at:]."""
+    """Writes the sums of one Gaussian over the reached patches of a tile to found[at:]."""
     half = splat(np.float32(0.5))
     axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
     # Pixel centres are at whole numbers here, as in `fill_rows`.
@@ -146,20 +150,22 @@ def _entry(
     )
     binned[:] = np.float32(0.0)
     width, height = np.float32(image.shape[1]), np.float32(image.shape[0])
-    pairs = upper_of(reached)
-    while pairs != np.uint64(0):
-        upper = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
+    x = load(constants, OFFSETS)
+    y = fnma(splat(np.float32(SIDE)), x, ramp())
+    rest = reached
+    while rest != np.uint64(0):
+        patch = lowest_bit(rest)
+        rest &= rest - np.uint64(1)
         gx, gy = mean_gradients(
-            upper, records, record, rows, 0, state, constants, v_depth, analytic
+            patch, records, record, rows, 0, state, constants, v_depth, analytic
         )
-        dx = even_lanes(load_wide(constants, OFFSETS + (upper // TILE_HEIGHT) * PAIR)) - u
-        for segment in range(upper, upper + 2):
-            dy = splat(np.float32(segment & (TILE_HEIGHT - 1))) - v
-            along = fma(axis_x, dx, axis_y * dy)
-            _spread(
-                half_of(segment, gx), half_of(segment, gy), along, width, height, places, binned
-            )
+        dx = x + splat(np.float32(column_of(patch) * SIDE)) - u
+        dy = y + splat(np.float32(row_of(patch))) - v
+        along = fma(axis_x, dx, axis_y * dy)
+        _spread(first_half(gx), first_half(gy), along, width, height, places, binned)
+        # Half a patch further to the right.
+        along = fma(axis_x, dx + splat(np.float32(SIDE // 2)), axis_y * dy)
+        _spread(last_half(gx), last_half(gy), along, width, height, places, binned)
     for group in range(SUMS // LANES):
         first = group * LANES * LANES
         eight = sums(
@@ -213,7 +219,7 @@ def bin_directions(
         found: [slots * SUMS] written for slots of entries with a mask.
     """
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
-    state = aligned(DEPTHS + SEGMENTS * LANES)
+    state = aligned(DEPTHS + PATCHES * WIDE)
     rows = np.empty(ROWS, np.float32)
     places = np.empty(LANES, np.float32)
     binned = np.empty(SUMS * LANES, np.float32)

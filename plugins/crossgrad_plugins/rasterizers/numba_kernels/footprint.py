@@ -1,14 +1,14 @@
-"""Which segments of a tile a Gaussian reaches, and its 1-D Gaussian in each row."""
+"""Which patches of a tile a Gaussian reaches, and its 1-D Gaussian in each row."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import (
-    bits,
     broadcast_wide,
     fma,
     fnma,
     ramp_wide,
+    reached_patches,
     round_down,
     round_up,
     splat_wide,
@@ -17,10 +17,8 @@ from crossgrad_core.numerics.simd import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    COLUMNS,
     LOG_OPACITY,
     ROW_DECAY,
-    SEGMENT,
     SLOPE,
     SPARE,
     TILE_HEIGHT,
@@ -48,7 +46,7 @@ def fill_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """Writes the row buffer at `base` and returns the reached segments as bits.
+    """Writes the row buffer at `base` and returns the reached patches as bits.
 
     `left`, `top` are the tile's corner in pixels; row centres are relative to it and count from
     the middle of the first pixel.
@@ -75,11 +73,4 @@ def fill_rows(
     extent = square_root(budget)
     first = round_up(centre - extent)
     last = round_down(centre + extent)
-    row_reached = first <= last
-    reached = np.uint64(0)
-    for column in range(COLUMNS):
-        begin = splat_wide(np.float32(column * SEGMENT))
-        end = splat_wide(np.float32(column * SEGMENT + SEGMENT - 1))
-        inside = row_reached & (first <= end) & (last >= begin)
-        reached |= bits(inside) << np.uint64(column * TILE_HEIGHT)
-    return reached
+    return reached_patches(first, last)

@@ -11,17 +11,16 @@ from crossgrad_core.numerics.simd import (
     as_negative,
     bits,
     broadcast,
-    broadcast_two_wide,
+    broadcast_four_wide,
     broadcast_wide,
     count_bits,
     fma,
     fnma,
-    interleaved,
     load_wide,
     lowest_bit,
     magnitude,
     prefetch,
-    ramp,
+    ramp_wide,
     smaller,
     splat,
     splat_wide,
@@ -60,83 +59,88 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
-    PAIR,
+    PATCHES,
     PEAK,
     RADIUS,
     RECORD,
     RED,
-    SEGMENT,
-    SEGMENTS,
+    SIDE,
     SINE,
     TILE_HEIGHT,
     TILE_WIDTH,
-    UPPER,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, half_of, lane_of, upper_of
+from crossgrad_plugins.rasterizers.numba_kernels.patches import (
+    aligned,
+    column_of,
+    four_rows,
+    place_of,
+    row_of,
+)
 
 #: Entries whose reach is computed before any of them is blended: hides the latency of their
-#: memory reads and row extents, and is how often finished segments are looked for.
+#: memory reads and row extents, and is how often finished patches are looked for.
 BATCH = 16
 
-# Side of the squares that limits count, pixels; the segments of one column of segments as bits.
+# Side of the squares that limits count, pixels; the patches of the first such column as bits.
 _SQUARE = 16
-_COLUMN = np.uint64((1 << TILE_HEIGHT) - 1)
+_ABREAST = np.uint64(
+    sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)
+)
 
-# State of a pair of segments, WIDE numbers each: transmittance (negative once a pixel is finished)
-# and three channels. The depths of all pairs follow the states of all pairs.
+# State of a patch, WIDE numbers each: transmittance (negative once a pixel is finished) and three
+# channels. The depths of all patches follow the states of all patches.
 _T, _RED, _GREEN, _BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE
 _STATE = 4 * WIDE
-_DEPTHS = SEGMENTS // 2 * _STATE
+_DEPTHS = PATCHES * _STATE
 
 
 @device
-def _start(state: NDArray[np.float32], width: int, height: int) -> np.uint64:
-    """Clears the state of a tile of width x height pixels; returns its segments as bits."""
+def _start(
+    state: NDArray[np.float32], width: int, height: int, constants: NDArray[np.float32]
+) -> np.uint64:
+    """Clears the state of a tile of width x height pixels; returns its patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
-    columns = interleaved(ramp(), ramp())
+    x = load_wide(constants, OFFSETS)
+    y = fnma(splat_wide(np.float32(SIDE)), x, ramp_wide())
     one, finished = splat_wide(np.float32(1.0)), splat_wide(np.float32(-1.0))
-    for segment in range(0, SEGMENTS, 2):
-        row = segment % TILE_HEIGHT
-        left = min(width - (segment // TILE_HEIGHT) * SEGMENT, SEGMENT)
-        upper, lower = left if row < height else 0, left if row + 1 < height else 0
-        inside = columns < interleaved(splat(np.float32(upper)), splat(np.float32(lower)))
-        store(state, segment * (_STATE // 2) + _T, where(inside, one, finished))
-        both = np.uint64(upper > 0) | (np.uint64(lower > 0) << np.uint64(1))
-        live |= both << np.uint64(segment)
+    for patch in range(PATCHES):
+        right, below = width - column_of(patch) * SIDE, height - row_of(patch)
+        inside = (x < splat_wide(np.float32(right))) & (y < splat_wide(np.float32(below)))
+        store(state, patch * _STATE + _T, where(inside, one, finished))
+        live |= np.uint64((right > 0) & (below > 0)) << np.uint64(patch)
     return live
 
 
 @device
 def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
-    """Returns the segments of a tile, whose first column is `left`, within a record's limits."""
+    """Returns the patches of a tile, whose first column is `left`, within a record's limits."""
     inside = np.uint64(0)
-    for column in range(COLUMNS):
-        square = (left + column * SEGMENT) // _SQUARE
+    for column in range(0, COLUMNS, _SQUARE // SIDE):
+        square = (left + column * SIDE) // _SQUARE
         if limits[record, 0] <= square <= limits[record, 1]:
-            inside |= _COLUMN << np.uint64(column * TILE_HEIGHT)
+            inside |= _ABREAST << np.uint64(column)
     return inside
 
 
 @device
 def _unfinished(state: NDArray[np.float32], live: np.uint64) -> np.uint64:
-    """Returns the live segments that still have an unfinished pixel."""
-    rest = upper_of(live)
+    """Returns the live patches that still have an unfinished pixel."""
+    rest = live
     going = np.uint64(0)
     while rest != np.uint64(0):
-        segment = lowest_bit(rest)
+        patch = lowest_bit(rest)
         rest &= rest - np.uint64(1)
-        passed = load_wide(state, segment * (_STATE // 2) + _T)
-        pixels = bits(passed >= splat_wide(np.float32(0.0)))
-        upper, lower = (pixels & np.uint64(UPPER)) != 0, (pixels & ~np.uint64(UPPER)) != 0
-        going |= (np.uint64(upper) | (np.uint64(lower) << np.uint64(1))) << np.uint64(segment)
-    return live & going
+        passed = load_wide(state, patch * _STATE + _T)
+        left = bits(passed >= splat_wide(np.float32(0.0))) != np.uint64(0)
+        going |= np.uint64(left) << np.uint64(patch)
+    return going
 
 
 @device
 def _coverage(
     left: np.uint64,
-    segment: int,
+    patch: int,
     offsets: Lanes,
     rows: NDArray[np.float32],
     row: int,
@@ -144,10 +148,10 @@ def _coverage(
     record: int,
     constants: NDArray[np.float32],
 ) -> tuple[Lanes, np.uint64]:
-    """The analytic response in a pair of segments.
+    """The analytic response in a patch.
 
     Returns:
-        Alpha, and `left` without those of the two segments that are out of reach.
+        Alpha, and `left` without the patch if it is out of reach.
     """
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -156,12 +160,8 @@ def _coverage(
     squared = broadcast_wide(records, record + RADIUS)
     u, v = axis_offsets(cosine, sine, offsets, rows, row)
     near = near_enough(u, v, inverse_1, inverse_2, squared)
-    if near & np.uint64(UPPER) == np.uint64(0):
-        left &= ~(np.uint64(1) << np.uint64(segment))
-    if near & ~np.uint64(UPPER) == np.uint64(0):
-        left &= ~(np.uint64(2) << np.uint64(segment))
-    if (left >> np.uint64(segment)) & np.uint64(3) == np.uint64(0):
-        return splat_wide(np.float32(0.0)), left
+    if near == np.uint64(0):
+        return splat_wide(np.float32(0.0)), left & ~(np.uint64(1) << np.uint64(patch))
     return coverages(peak, u, v, inverse_1, inverse_2, constants), left
 
 
@@ -178,15 +178,12 @@ def _blend(
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[int, np.uint64]:
-    """Blends one Gaussian into the reached segments, in pairs.
-
-    The other segment of a pair is left as it is: none of its pixels is touched, or all are done.
+    """Blends one Gaussian into the reached patches.
 
     Returns:
-        The number of pixels blended, and the segments without those found to be out of reach.
+        The number of pixels blended, and the patches without those found to be out of reach.
     """
-    left = reached
-    pairs = upper_of(reached)
+    left = rest = reached
     decay = broadcast_wide(records, record + DECAY)
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
@@ -197,19 +194,18 @@ def _blend(
     least = load_wide(constants, TOUCHED if analytic is None else LEAST)
     zero = splat_wide(np.float32(0.0))
     pixels = 0
-    while pairs != np.uint64(0):
-        segment = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
-        row = base + (segment & (TILE_HEIGHT - 1))
-        at = segment * (_STATE // 2)
-        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+    while rest != np.uint64(0):
+        patch = lowest_bit(rest)
+        rest &= rest - np.uint64(1)
+        row, at = base + row_of(patch), patch * _STATE
+        offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
         if analytic is None:
-            dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+            dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
             touched = power >= least
             alpha = exp2(power, terms)
         else:
-            alpha, left = _coverage(left, segment, offsets, rows, row, records, record, constants)
+            alpha, left = _coverage(left, patch, offsets, rows, row, records, record, constants)
             touched = alpha >= least
         # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
         alpha = where(touched, smaller(alpha, most), zero)
@@ -223,7 +219,7 @@ def _blend(
         store(state, at + _GREEN, fma(weight, green, load_wide(state, at + _GREEN)))
         store(state, at + _BLUE, fma(weight, blue, load_wide(state, at + _BLUE)))
         if depth is not None:
-            spot = _DEPTHS + segment * LANES
+            spot = _DEPTHS + patch * WIDE
             store(state, spot, fma(weight, z, load_wide(state, spot)))
         if counts is not None:
             pixels += count_bits(bits(touched & blended))
@@ -231,29 +227,60 @@ def _blend(
 
 
 @device
-def _finish_segment(
+def _finish_row(
+    passed: Lanes,
+    red: Lanes,
+    green: Lanes,
+    blue: Lanes,
+    pixel: int,
+    background: NDArray[np.float32],
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+) -> None:
+    """Adds the background to eight pixels and writes them from a flat index on."""
+    through = magnitude(passed)
+    store_triples(
+        image,
+        3 * pixel,
+        red + through * broadcast(background, 0),
+        green + through * broadcast(background, 1),
+        blue + through * broadcast(background, 2),
+    )
+    store(alpha, pixel, splat(np.float32(1.0)) - through)
+
+
+@device
+def _finish_two(
     state: NDArray[np.float32],
-    segment: int,
+    patch: int,
     pixel: int,
     background: NDArray[np.float32],
     image: NDArray[np.float32],
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
 ) -> None:
-    """Adds the background to a segment and writes it to the pixels from a flat index on."""
-    at = (segment >> 1) * _STATE
-    through = magnitude(half_of(segment, load_wide(state, at + _T)))
-    store_triples(
-        image,
-        3 * pixel,
-        half_of(segment, load_wide(state, at + _RED)) + through * broadcast(background, 0),
-        half_of(segment, load_wide(state, at + _GREEN)) + through * broadcast(background, 1),
-        half_of(segment, load_wide(state, at + _BLUE)) + through * broadcast(background, 2),
-    )
-    store(alpha, pixel, splat(np.float32(1.0)) - through)
+    """Writes a patch and the one on its right, whose pixels begin at a flat index."""
+    at, width = patch * _STATE, image.shape[1]
+    t = _rows_at(state, at + _T, _STATE)
+    r = _rows_at(state, at + _RED, _STATE)
+    g = _rows_at(state, at + _GREEN, _STATE)
+    b = _rows_at(state, at + _BLUE, _STATE)
+    _finish_row(t[0], r[0], g[0], b[0], pixel, background, image, alpha)
+    _finish_row(t[1], r[1], g[1], b[1], pixel + width, background, image, alpha)
+    _finish_row(t[2], r[2], g[2], b[2], pixel + 2 * width, background, image, alpha)
+    _finish_row(t[3], r[3], g[3], b[3], pixel + 3 * width, background, image, alpha)
     if depth is not None:
-        both = load_wide(state, _DEPTHS + (segment >> 1) * WIDE)
-        store(depth, pixel, half_of(segment, both))
+        z = _rows_at(state, _DEPTHS + patch * WIDE, WIDE)
+        store(depth, pixel, z[0])
+        store(depth, pixel + width, z[1])
+        store(depth, pixel + 2 * width, z[2])
+        store(depth, pixel + 3 * width, z[3])
+
+
+@device
+def _rows_at(state: NDArray[np.float32], at: int, ahead: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Returns the rows of a patch and of the next one, `ahead` of it."""
+    return four_rows(load_wide(state, at), load_wide(state, at + ahead))
 
 
 @device
@@ -268,24 +295,25 @@ def _finish(
 ) -> None:
     """Adds the background and writes the tile's pixels."""
     width = image.shape[1]
-    for y in range(min(TILE_HEIGHT, image.shape[0] - top)):
-        inside = min(TILE_WIDTH, width - left)
-        for column in range(inside // SEGMENT):
-            pixel = (top + y) * width + left + column * SEGMENT
-            segment = column * TILE_HEIGHT + y
-            _finish_segment(state, segment, pixel, background, image, alpha, depth)
-        # A segment that the image cuts.
-        for x in range(inside - inside % SEGMENT, inside):
-            segment = (x // SEGMENT) * TILE_HEIGHT + y
-            lane = lane_of(segment, x % SEGMENT)
-            at = (segment >> 1) * _STATE + lane
+    high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
+    # Two patches side by side where all of their pixels are there, then single pixels.
+    whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
+    for y in range(0, whole_high, SIDE):
+        for x in range(0, whole_wide, LANES):
+            patch, _ = place_of(x, y)
+            pixel = (top + y) * width + left + x
+            _finish_two(state, patch, pixel, background, image, alpha, depth)
+    for y in range(high):
+        for x in range(whole_wide if y < whole_high else 0, wide):
+            patch, lane = place_of(x, y)
+            at = patch * _STATE + lane
             through = abs(state[at + _T])
             image[top + y, left + x, 0] = state[at + _RED] + through * background[0]
             image[top + y, left + x, 1] = state[at + _GREEN] + through * background[1]
             image[top + y, left + x, 2] = state[at + _BLUE] + through * background[2]
             alpha[top + y, left + x] = np.float32(1.0) - through
             if depth is not None:
-                depth[top + y, left + x] = state[_DEPTHS + (segment >> 1) * WIDE + lane]
+                depth[top + y, left + x] = state[_DEPTHS + patch * WIDE + lane]
 
 
 @device
@@ -304,14 +332,14 @@ def _composite(
     limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composites one tile and leaves in `masks` the segments that each entry was blended into."""
+    """Composites one tile and leaves in `masks` the patches that each entry was blended into."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
-    state = aligned(_DEPTHS + SEGMENTS * LANES)
+    state = aligned(_DEPTHS + PATCHES * WIDE)
     rows = aligned(BATCH * ROWS)
     batch = np.empty(BATCH, np.int64)
-    live = _start(state, image.shape[1] - left, image.shape[0] - top)
+    live = _start(state, image.shape[1] - left, image.shape[0] - top, constants)
     entry, stop = starts[tile], starts[tile + 1]
     while entry < stop and live != np.uint64(0):
         end = min(entry + BATCH, stop)
@@ -378,7 +406,7 @@ def composite(
         counts: [slots] pixels blended per slot, written; zero before. None: not counted.
         analytic: Any vector says that the records are of the analytic response; None: plain.
         limits: [N, 2] first and last column of 16 pixels per record; None: no limits.
-        masks: [E] segments per entry, written; zero before.
+        masks: [E] patches per entry, written; zero before.
     """
     tile = take(jobs)
     while tile < starts.shape[0] - 1:

@@ -12,18 +12,15 @@ import math
 
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 
-#: Pixels of a tile, a multiple of eight on both sides.
-TILE_WIDTH = 32
+#: Pixels of a tile.
+TILE_WIDTH = 64
 TILE_HEIGHT = 16
-#: A segment is eight pixels of a row; a tile's segments are numbered down its columns of segments.
-SEGMENT = 8
-COLUMNS = TILE_WIDTH // SEGMENT
-SEGMENTS = COLUMNS * TILE_HEIGHT
-#: Two segments, one above the other, are a pair and are worked on together, in vectors whose lanes
-#: are theirs by turns: what a row has in common is then a plain load. As bits, the upper segments
-#: of all pairs; likewise the lanes of the upper segment of a pair.
-PAIR = 2 * SEGMENT
-UPPER = sum(1 << segment for segment in range(0, SEGMENTS, 2))
+#: A patch is 4 x 4 pixels, worked on together in vectors whose lanes are its pixels column by
+#: column: what the rows have in common is then a plain load. A tile's patches are numbered along
+#: its rows of patches, and are as many as an integer has bits.
+SIDE = 4
+COLUMNS = TILE_WIDTH // SIDE
+PATCHES = COLUMNS * TILE_HEIGHT // SIDE
 
 #: Gaussians that one job of the projection handles.
 CHUNK = 2048

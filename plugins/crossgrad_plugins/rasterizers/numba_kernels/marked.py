@@ -2,7 +2,7 @@
 
 A pass of its own over a finished render, for those who can only tell from it which pixels they ask
 about: it takes the tile lists of the forward pass and repeats its blending, without colours, in the
-segments that hold a marked pixel. The operations are those of `forward`, and so are the decisions.
+patches that hold a marked pixel. The operations are those of `forward`, and so are the decisions.
 """
 
 import numpy as np
@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
-    LANES,
     WIDE,
     bits,
-    broadcast_two_wide,
+    broadcast_four_wide,
     broadcast_wide,
     count_bits,
     fnma,
@@ -51,16 +50,19 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     DECAY,
     INVERSE_1,
     INVERSE_2,
-    PAIR,
+    PATCHES,
     PEAK,
     RECORD,
-    SEGMENT,
-    SEGMENTS,
     SINE,
     TILE_HEIGHT,
     TILE_WIDTH,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import aligned, lane_of, upper_of
+from crossgrad_plugins.rasterizers.numba_kernels.patches import (
+    aligned,
+    column_of,
+    place_of,
+    row_of,
+)
 
 #: Entries ahead for whose records memory is asked.
 _AHEAD = 8
@@ -71,16 +73,16 @@ def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left
     """Writes the transmittances of a tile: 1 in marked pixels, -1 in all others.
 
     Returns:
-        The segments that hold a marked pixel, as bits.
+        The patches that hold a marked pixel, as bits.
     """
     state[:] = np.float32(-1.0)
     live = np.uint64(0)
     for y in range(min(TILE_HEIGHT, marked.shape[0] - top)):
         for x in range(min(TILE_WIDTH, marked.shape[1] - left)):
             if marked[top + y, left + x] != 0:
-                segment = (x // SEGMENT) * TILE_HEIGHT + y
-                state[(segment >> 1) * WIDE + lane_of(segment, x % SEGMENT)] = np.float32(1.0)
-                live |= np.uint64(1) << np.uint64(segment)
+                patch, lane = place_of(x, y)
+                state[patch * WIDE + lane] = np.float32(1.0)
+                live |= np.uint64(1) << np.uint64(patch)
     return live
 
 
@@ -94,7 +96,7 @@ def _count(
     constants: NDArray[np.float32],
     analytic: NDArray[np.float32] | None,
 ) -> int:
-    """Blends one Gaussian into the reached segments, in pairs; returns the number of pixels."""
+    """Blends one Gaussian into the reached patches; returns the number of pixels."""
     decay = broadcast_wide(records, record + DECAY)
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -103,15 +105,15 @@ def _count(
     zero = splat_wide(np.float32(0.0))
     terms = terms_of(constants)
     pixels = 0
-    pairs = upper_of(reached)
-    while pairs != np.uint64(0):
-        segment = lowest_bit(pairs)
-        pairs &= pairs - np.uint64(1)
-        row = segment & (TILE_HEIGHT - 1)
-        offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+    rest = reached
+    while rest != np.uint64(0):
+        patch = lowest_bit(rest)
+        rest &= rest - np.uint64(1)
+        row = row_of(patch)
+        offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
         if analytic is None:
-            dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
-            power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+            dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
+            power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
             touched = power >= load_wide(constants, TOUCHED)
             alpha = exp2(power, terms)
         else:
@@ -119,10 +121,10 @@ def _count(
             alpha = coverages(peak, u, v, inverse_1, inverse_2, constants)
             touched = alpha >= load_wide(constants, LEAST)
         alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
-        before = load_wide(state, segment * LANES)
+        before = load_wide(state, patch * WIDE)
         after = before - alpha * before
         # It only falls: a pixel that has stopped, or is not marked, is never blended again.
-        store(state, segment * LANES, after)
+        store(state, patch * WIDE, after)
         pixels += count_bits(bits(touched & (after >= load_wide(constants, STOPPED))))
     return pixels
 
@@ -145,7 +147,7 @@ def count_marked(
         jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] segments per entry, as the forward pass left them.
+        masks: [E] patches per entry, as the forward pass left them.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
         marked: [H, W], not 0 where a pixel counts.
@@ -153,7 +155,7 @@ def count_marked(
         counts: [slots] written; zero before.
     """
     columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
-    state = aligned(SEGMENTS * LANES)
+    state = aligned(PATCHES * WIDE)
     rows = np.empty(ROWS, np.float32)
     tile = take(jobs)
     while tile < starts.shape[0] - 1:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import (
-    LANES,
+    WIDE,
     Lanes,
-    broadcast_two_wide,
+    broadcast_four_wide,
     broadcast_wide,
     fma,
     fnma,
@@ -47,14 +47,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
-    PAIR,
     PEAK,
     RED,
     ROW_DECAY,
     SINE,
     SLOPE,
-    TILE_HEIGHT,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.patches import column_of, row_of
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     DEPTHS,
     STATE,
@@ -68,26 +67,26 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
 
 @device
 def _toned(
-    segment: int,
+    patch: int,
     records: NDArray[np.float32],
     record: int,
     state: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
 ) -> Lanes:
-    """The gradients of a pair's pixels times the colour of the Gaussian."""
-    at = segment * (STATE // 2)
+    """The gradients of a patch's pixels times the colour of the Gaussian."""
+    at = patch * STATE
     toned = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
     toned = fma(load_wide(state, at + V_GREEN), broadcast_wide(records, record + GREEN), toned)
     toned = fma(load_wide(state, at + V_BLUE), broadcast_wide(records, record + BLUE), toned)
     if v_depth is not None:
-        v_z = load_wide(state, DEPTHS + segment * LANES)
+        v_z = load_wide(state, DEPTHS + patch * WIDE)
         toned = fma(v_z, broadcast_wide(records, record + DEPTH), toned)
     return toned
 
 
 @device
 def mean_gradients(
-    segment: int,
+    patch: int,
     records: NDArray[np.float32],
     record: int,
     rows: NDArray[np.float32],
@@ -97,18 +96,18 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blends a pair; returns its pixels' gradients by the projected mean (x and y).
+    """Blends into a patch; returns its pixels' gradients by the projected mean (x and y).
 
-    `segment` is the upper one of the pair. The gradients of plain records are in units of
+    The gradients of plain records are in units of
     2 log 2 px^-1, the others in px^-1.
     """
-    row = base + (segment & (TILE_HEIGHT - 1))
-    offsets = load_wide(constants, OFFSETS + (segment // TILE_HEIGHT) * PAIR)
+    row = base + row_of(patch)
+    offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
     zero = splat_wide(np.float32(0.0))
     if analytic is None:
         decay = broadcast_wide(records, record + DECAY)
-        dx = offsets - broadcast_two_wide(rows, row + ROW_CENTRE)
-        power = fnma(decay * dx, dx, broadcast_two_wide(rows, row + ROW_EXPONENT))
+        dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
+        power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
         free = power <= load_wide(constants, CAPPED)
         alpha = exp2(power, terms_of(constants))
@@ -125,14 +124,14 @@ def mean_gradients(
         touched = alpha >= load_wide(constants, LEAST)
         free = touched & (alpha <= load_wide(constants, LARGEST_ALPHA))
     alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
-    toned = _toned(segment, records, record, state, v_depth)
+    toned = _toned(patch, records, record, state, v_depth)
     odds = where(free, odds_of(alpha, constants), load_wide(constants, FIXED))
-    _, s = blend(alpha, odds, constants, toned, state, segment * (STATE // 2), constants)
+    _, s = blend(alpha, odds, constants, toned, state, patch * STATE, constants)
     if analytic is None:
         sd = s * dx
         lean = decay * broadcast_wide(records, record + SLOPE)
         pull = broadcast_wide(records, record + ROW_DECAY)
-        pulled = pull * broadcast_two_wide(rows, row + ROW_DY)
+        pulled = pull * broadcast_four_wide(rows, row + ROW_DY)
         return decay * sd, fnma(lean, sd, pulled * s)
     su = where(free, s * by_u * inverse_1, zero)
     sv = where(free, s * by_v * inverse_2, zero)

@@ -1,13 +1,13 @@
-"""Pixel states of the backward passes in the pairs of segments of a tile, and their step."""
+"""Pixel states of the backward passes in the patches of a tile, and their step."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import (
+    LANES,
     WIDE,
     Lanes,
     fnma,
-    interleaved,
     load,
     load_triples,
     load_wide,
@@ -19,19 +19,19 @@ from crossgrad_core.numerics.simd import (
 from crossgrad_plugins.rasterizers.numba_kernels.constants import FINISHED, ONE, STOPPED
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
-    SEGMENT,
-    SEGMENTS,
+    PATCHES,
+    SIDE,
     TILE_HEIGHT,
     TILE_WIDTH,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.segments import lane_of
+from crossgrad_plugins.rasterizers.numba_kernels.patches import place_of, two_patches
 
-#: State of a pair of segments, WIDE numbers each: transmittance (negative once finished), the part
+#: State of a patch, WIDE numbers each: transmittance (negative once finished), the part
 #: S of the loss' linear form still to come (see `backward`), gradient of the three channels.
 PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE, 4 * WIDE
 STATE = 5 * WIDE
-#: The gradients of the depths of all pairs follow the states of all pairs.
-DEPTHS = SEGMENTS // 2 * STATE
+#: The gradients of the depths of all patches follow the states of all patches.
+DEPTHS = PATCHES * STATE
 
 #: Eight pixels: S, gradient of the three channels, gradient of the depth.
 _Eight = tuple[Lanes, Lanes, Lanes, Lanes, Lanes]
@@ -61,9 +61,19 @@ def _eight(
 
 
 @device
-def _start_pair(
+def _store_two(
+    state: NDArray[np.float32], at: int, ahead: int, a: Lanes, b: Lanes, c: Lanes, d: Lanes
+) -> None:
+    """Writes four rows of eight pixels to a patch and to the next one, `ahead` of it."""
+    left, right = two_patches(a, b, c, d)
+    store(state, at, left)
+    store(state, at + ahead, right)
+
+
+@device
+def _start_two(
     state: NDArray[np.float32],
-    segment: int,
+    patch: int,
     pixel: int,
     image: NDArray[np.float32],
     alpha: NDArray[np.float32],
@@ -72,25 +82,27 @@ def _start_pair(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Fills the state of a pair; its upper segment are the pixels from a flat index on."""
-    at = (segment >> 1) * STATE
-    below = pixel + image.shape[1]
-    upper = _eight(pixel, image, alpha, depth, v_image, v_alpha, v_depth)
-    lower = _eight(below, image, alpha, depth, v_image, v_alpha, v_depth)
-    store(state, at + PASSED, splat_wide(np.float32(1.0)))
-    store(state, at + REST, interleaved(upper[0], lower[0]))
-    store(state, at + V_RED, interleaved(upper[1], lower[1]))
-    store(state, at + V_GREEN, interleaved(upper[2], lower[2]))
-    store(state, at + V_BLUE, interleaved(upper[3], lower[3]))
+    """Fills the states of a patch and the one on its right, from a flat index of pixels on."""
+    at, width = patch * STATE, image.shape[1]
+    a = _eight(pixel, image, alpha, depth, v_image, v_alpha, v_depth)
+    b = _eight(pixel + width, image, alpha, depth, v_image, v_alpha, v_depth)
+    c = _eight(pixel + 2 * width, image, alpha, depth, v_image, v_alpha, v_depth)
+    d = _eight(pixel + 3 * width, image, alpha, depth, v_image, v_alpha, v_depth)
+    one = splat(np.float32(1.0))
+    _store_two(state, at + PASSED, STATE, one, one, one, one)
+    _store_two(state, at + REST, STATE, a[0], b[0], c[0], d[0])
+    _store_two(state, at + V_RED, STATE, a[1], b[1], c[1], d[1])
+    _store_two(state, at + V_GREEN, STATE, a[2], b[2], c[2], d[2])
+    _store_two(state, at + V_BLUE, STATE, a[3], b[3], c[3], d[3])
     if v_depth is not None:
-        store(state, DEPTHS + (segment >> 1) * WIDE, interleaved(upper[4], lower[4]))
+        _store_two(state, DEPTHS + patch * WIDE, WIDE, a[4], b[4], c[4], d[4])
 
 
 @device
 def _start_pixel(
     state: NDArray[np.float32],
-    segment: int,
-    x: int,
+    patch: int,
+    lane: int,
     i: int,
     j: int,
     image: NDArray[np.float32],
@@ -100,16 +112,15 @@ def _start_pixel(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Fills the state of pixel x of a segment, which is (i, j) of the image."""
-    lane = lane_of(segment, x)
-    at = (segment >> 1) * STATE + lane
+    """Fills the state of a lane of a patch, which is pixel (i, j) of the image."""
+    at = patch * STATE + lane
     red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
     rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
     if v_alpha is not None:
         rest -= v_alpha[i, j] * (np.float32(1.0) - alpha[i, j])
     if depth is not None and v_depth is not None:
         rest += v_depth[i, j] * depth[i, j]
-        state[DEPTHS + (segment >> 1) * WIDE + lane] = v_depth[i, j]
+        state[DEPTHS + patch * WIDE + lane] = v_depth[i, j]
     state[at + PASSED] = np.float32(1.0)
     state[at + REST] = rest
     state[at + V_RED] = red
@@ -131,24 +142,25 @@ def start_tile(
 ) -> None:
     """Fills the state of a tile."""
     width = image.shape[1]
-    height, inside = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
-    if height < TILE_HEIGHT or inside < TILE_WIDTH:
+    high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
+    if high < TILE_HEIGHT or wide < TILE_WIDTH:
         state[:] = np.float32(0.0)
-        for segment in range(0, SEGMENTS, 2):
-            store(state, (segment >> 1) * STATE + PASSED, splat_wide(np.float32(-1.0)))
-    for y in range(0, height, 2):
-        # Whole pairs; then the pixels of those that the image cuts.
-        whole = inside // SEGMENT if y + 1 < height else 0
-        for column in range(whole):
-            pixel = (top + y) * width + left + column * SEGMENT
-            segment = column * TILE_HEIGHT + y
-            _start_pair(state, segment, pixel, image, alpha, depth, v_image, v_alpha, v_depth)
-        for i in range(y, min(y + 2, height)):
-            for x in range(whole * SEGMENT, inside):
-                _start_pixel(
-                    state, (x // SEGMENT) * TILE_HEIGHT + i, x % SEGMENT, top + i, left + x,
-                    image, alpha, depth, v_image, v_alpha, v_depth,
-                )  # fmt: skip
+        for patch in range(PATCHES):
+            store(state, patch * STATE + PASSED, splat_wide(np.float32(-1.0)))
+    # Two patches side by side where all of their pixels are there, then single pixels.
+    whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
+    for y in range(0, whole_high, SIDE):
+        for x in range(0, whole_wide, LANES):
+            patch, _ = place_of(x, y)
+            pixel = (top + y) * width + left + x
+            _start_two(state, patch, pixel, image, alpha, depth, v_image, v_alpha, v_depth)
+    for y in range(high):
+        for x in range(whole_wide if y < whole_high else 0, wide):
+            patch, lane = place_of(x, y)
+            _start_pixel(
+                state, patch, lane, top + y, left + x,
+                image, alpha, depth, v_image, v_alpha, v_depth,
+            )  # fmt: skip
 
 
 @device
@@ -167,7 +179,7 @@ def blend(
     at: int,
     constants: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes]:
-    """Blends a Gaussian into the pixels of a pair of segments.
+    """Blends a Gaussian into the pixels of a patch.
 
     Args:
         alpha: The Gaussian's opacity in the pixels, at most the largest; 0 where it is not drawn.
@@ -176,7 +188,7 @@ def blend(
         capped: None says that no odds are negative.
         toned: The gradients of the pixels times the colour of the Gaussian.
         state: State of the tile.
-        at: Where that of the pair begins.
+        at: Where that of the patch begins.
         constants: From `vector_constants`.
 
     Returns:
