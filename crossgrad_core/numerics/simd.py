@@ -224,15 +224,6 @@ def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
     return _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
 
 
-def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
-    """Makes a function that returns lanes of two vectors of sixteen in a fixed order.
-
-    Args:
-        order: Sixteen numbers of lanes; those of the second vector count from 16 on.
-    """
-    return _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
-
-
 def _halves_added(at: _Site, a: Any) -> Any:
     low, high = (_shuffle(at, a, a, range(start, start + LANES)) for start in (0, LANES))
     return at.builder.fadd(low, high)

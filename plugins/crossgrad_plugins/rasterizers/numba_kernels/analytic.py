@@ -41,6 +41,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     COSINE,
     LOG2_E,
+    MIDDLE,
     REACH_1,
     REACH_2,
     SINE,
@@ -70,7 +71,7 @@ _SERIES = (
     0.006771038068732109,
 )
 
-#: Row buffer: offset along both axes of the row's first pixel centre.
+#: Row buffer: offset along both axes of the pixel centre in the row's middle column.
 ROW_U = 0
 ROW_V = TILE_HEIGHT
 
@@ -147,7 +148,8 @@ def fill_axis_rows(
 ) -> np.uint64:
     """As `footprint.fill_rows`: the patches within reach along both main axes."""
     half, zero = _number(0.5), _number(0.0)
-    dx = splat_wide(left) - broadcast_wide(records, record + U_WHOLE)
+    middle = _number(MIDDLE)
+    dx = (splat_wide(left) + middle) - broadcast_wide(records, record + U_WHOLE)
     dx = dx + (half - broadcast_wide(records, record + U_PART))
     first_dy = splat_wide(top) - broadcast_wide(records, record + V_WHOLE)
     first_dy = first_dy + (half - broadcast_wide(records, record + V_PART))
@@ -165,7 +167,7 @@ def fill_axis_rows(
     low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
     first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))
     last = round_down(smaller(larger(low_1, high_1), larger(low_2, high_2)))
-    return reached_patches(first, last)
+    return reached_patches(first + middle, last + middle)
 
 
 @device
@@ -301,7 +303,7 @@ def coverage_gradients(
 def axis_offsets(
     cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
 ) -> tuple[Lanes, Lanes]:
-    """Returns the offsets along the main axes of pixels `offsets` from the left of four rows."""
+    """Returns the offsets along the main axes of pixels `offsets` from the middle of four rows."""
     u = fma(cosine, offsets, broadcast_four_wide(rows, row + ROW_U))
     v = fnma(sine, offsets, broadcast_four_wide(rows, row + ROW_V))
     return u, v

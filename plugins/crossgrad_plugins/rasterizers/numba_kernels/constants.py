@@ -20,6 +20,7 @@ from crossgrad_core.numerics.simd import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    MIDDLE,
     SIDE,
     TILE_WIDTH,
     TOUCH,
@@ -40,7 +41,7 @@ FINISHED = 11 * WIDE
 FIXED = FINISHED  # the odds of an alpha that no parameter changes
 CAPPED = 12 * WIDE
 LEAST = 13 * WIDE
-OFFSETS = 14 * WIDE  # pixel offsets of each column of patches
+OFFSETS = 14 * WIDE  # pixel offsets from the middle, by columns of patches
 
 #: What `exp2` needs.
 Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
@@ -58,7 +59,7 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
         ALPHA_THRESHOLD,
     )
     values = (_ROUND, *_EXP2, *_EXP2_HIGH, *shared)
-    offsets = np.repeat(np.arange(TILE_WIDTH, dtype=np.float32), SIDE)
+    offsets = np.repeat(np.arange(TILE_WIDTH, dtype=np.float32) - np.float32(MIDDLE), SIDE)
     flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), offsets])
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE

@@ -36,6 +36,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.constants import OFFSETS
 from crossgrad_plugins.rasterizers.numba_kernels.footprint import ROWS, fill_rows
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    MIDDLE,
     PATCHES,
     RECORD,
     SIDE,
@@ -150,7 +151,7 @@ def _entry(
     )
     binned[:] = np.float32(0.0)
     width, height = np.float32(image.shape[1]), np.float32(image.shape[0])
-    x = load(constants, OFFSETS)
+    x = load(constants, OFFSETS) + splat(np.float32(MIDDLE))
     y = fnma(splat(np.float32(SIDE)), x, ramp())
     rest = reached
     while rest != np.uint64(0):

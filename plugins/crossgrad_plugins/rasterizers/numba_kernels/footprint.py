@@ -18,6 +18,7 @@ from crossgrad_core.numerics.simd import (
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     LOG_OPACITY,
+    MIDDLE,
     ROW_DECAY,
     SLOPE,
     SPARE,
@@ -48,11 +49,12 @@ def fill_rows(
 ) -> np.uint64:
     """Writes the row buffer at `base` and returns the reached patches as bits.
 
-    `left`, `top` are the tile's corner in pixels; row centres are relative to it and count from
-    the middle of the first pixel.
+    `left`, `top` are the tile's corner in pixels; row centres are relative to the middle of a pixel
+    of the middle column.
     """
     half = splat_wide(np.float32(0.5))
-    u = (broadcast_wide(records, record + U_WHOLE) - splat_wide(left)) + (
+    middle = splat_wide(np.float32(MIDDLE))
+    u = (broadcast_wide(records, record + U_WHOLE) - (splat_wide(left) + middle)) + (
         broadcast_wide(records, record + U_PART) - half
     )
     v = (broadcast_wide(records, record + V_WHOLE) - splat_wide(top)) + (
@@ -73,4 +75,4 @@ def fill_rows(
     extent = square_root(budget)
     first = round_up(centre - extent)
     last = round_down(centre + extent)
-    return reached_patches(first, last)
+    return reached_patches(first + middle, last + middle)

@@ -59,6 +59,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     GREEN,
     INVERSE_1,
     INVERSE_2,
+    MIDDLE,
     PATCHES,
     PEAK,
     RADIUS,
@@ -101,7 +102,7 @@ def _start(
     """Clears the state of a tile of width x height pixels; returns its patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
-    x = load_wide(constants, OFFSETS)
+    x = load_wide(constants, OFFSETS) + splat_wide(np.float32(MIDDLE))
     y = fnma(splat_wide(np.float32(SIDE)), x, ramp_wide())
     one, finished = splat_wide(np.float32(1.0)), splat_wide(np.float32(-1.0))
     for patch in range(PATCHES):

@@ -20,6 +20,9 @@ TILE_HEIGHT = 16
 #: its rows of patches, and are as many as an integer has bits.
 SIDE = 4
 COLUMNS = TILE_WIDTH // SIDE
+#: Pixels from a tile's first column to the one from which columns are counted: the shorter the way,
+#: the finer is a place in float32.
+MIDDLE = TILE_WIDTH // 2
 PATCHES = COLUMNS * TILE_HEIGHT // SIDE
 
 #: Gaussians that one job of the projection handles.
