@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Literal, Protocol
 
 from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.system.allocator import use_large_pages
 from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
@@ -62,6 +63,7 @@ def train(
             note. After any exception `state` is the last good one.
     """
     check_start(state)
+    use_large_pages()
     keeper = keeper or Keeper(state)
     try:
         status = _steps(setup, state, sink, stopper, pauses, keeper)
@@ -97,6 +99,7 @@ def _steps(
             keeper.settle(state, look=leaves or looks_after(setup, state.step))
             if copies_after(setup, state.step):
                 keeper.copy(state)
+                use_large_pages()
         except NonFiniteError as error:
             _rewind(setup, state, sink, keeper, error)
             continue

@@ -4,6 +4,7 @@ import platform
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numba
 import pytest
@@ -127,3 +128,38 @@ def test_memory_that_was_freed_is_used_again_without_faults():
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     # 48 MiB are 12,288 pages.
     assert int(shown) < 500
+
+
+LARGE_PAGES = """
+import numpy as np
+
+from crossgrad_core.system.allocator import KEPT, keep_freed_memory, use_large_pages
+
+
+def asks(array):
+    address, inside = array.ctypes.data + array.nbytes // 2, False
+    for line in open("/proc/self/smaps"):
+        words = line.split()
+        if "-" in words[0]:
+            first, end = (int(word, 16) for word in words[0].split("-"))
+            inside = first <= address < end
+        elif inside and words[0] == "VmFlags:":
+            return "hg" in words
+
+
+keep_freed_memory()
+# More than the heap has room for: it grows, and asks for pages of the new part when it is told.
+arrays = [np.empty(3 << 20, np.uint8) for _ in range(KEPT // (3 << 20) + 20)]
+use_large_pages()
+print(asks(arrays[20]), asks(arrays[-1]))
+"""
+
+
+@pytest.mark.skipif(
+    not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="a system without large pages"
+)
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_arrays_of_the_heap_ask_for_large_pages():
+    command = [sys.executable, "-c", LARGE_PAGES]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert shown.strip() == "True True"
