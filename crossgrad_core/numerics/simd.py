@@ -221,7 +221,8 @@ def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
     Args:
         order: Sixteen numbers of lanes; those of the second vector count from 16 on.
     """
-    return _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
+    pick = _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
+    return cast("Callable[[Lanes, Lanes], Lanes]", pick)
 
 
 def _halves_added(at: _Site, a: Any) -> Any:
