@@ -6,14 +6,23 @@ r"""The end of runs of so many seconds, by the code of several commits, in turns
     python benchmarks/time_to_quality.py table OUT
 
 `30:10` gives the first code 30 and the second one 10 seconds. Files of both are drawn on the views
-that the last code held out, which the first one has to hold out, too. Runs have 400 px, one thread
-and one core (Linux), and those of a pair follow one another there; finished ones are not repeated.
-Figures are of the exported PLY on black: drawn by `crossgrad eval --ply` and by `viewer.py`.
+that the last code held out, which the first one has to hold out, too. Runs have 400 px, or as many
+as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of a
+pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
+black: drawn by `crossgrad eval --ply` and, where `--max-size` is not 0, by `viewer.py`.
+
+    python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \
+        --code long=VENV/bin/crossgrad --code new=VENV/bin/crossgrad --max-size 0 --seconds 600:60
+    python benchmarks/time_to_quality.py share OUT
+
+compares short runs with long ones of the same code: of what the long one gains over a picture of
+the training photos' mean colour, in dB, how much the short one has.
 """
 
 import argparse
 import csv
 import json
+import math
 import os
 import shlex
 import shutil
@@ -26,13 +35,14 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
+import torch
 import viewer
 
 import crossgrad_core as cg
+from crossgrad_core.contract.scene import Scene
 from crossgrad_plugins.compare.statistics.estimate import estimate
 from crossgrad_plugins.compare.statistics.verdict import verdicts
 
-MAX_SIZE = 400
 Row = dict[str, Any]
 
 
@@ -51,22 +61,24 @@ class Code:
         program, *options = shlex.split(words)
         return cls(name, program, tuple(options))
 
-    def train(self, scene: Path, folder: Path, *length: str) -> None:
+    def train(self, scene: Path, folder: Path, threads: int, size: int, *length: str) -> None:
         """Trains into a folder, which must not exist."""
-        command = [self.program, "run", str(scene), "--out", str(folder), "--threads", "1"]
-        command += ["--max-size", str(MAX_SIZE), *length, *self.options]
+        command = [self.program, "run", str(scene), "--out", str(folder)]
+        command += ["--threads", str(threads), *(["--max-size", str(size)] if size else [])]
+        command += [*length, *self.options]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def run(given: argparse.Namespace) -> None:
     """Runs what is missing."""
-    os.sched_setaffinity(0, {given.core})
+    os.sched_setaffinity(0, given.core)
+    kind = len(given.core), given.max_size
     codes = [Code.of(text) for text in given.code]
     for code in codes:
         # Compiles the kernels of all that a run needs, so that no timed run does.
-        warm = given.out / f"warm-up-{code.name}-{given.core}"
+        warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
-            code.train(given.scene[0], warm, "--steps", "700")
+            code.train(given.scene[0], warm, *kind, "--steps", "700")
     for seed, scene, lengths in _cases(given):
         folders = {
             code: given.out / f"{scene.name}-{lengths.replace(':', '_')}-{code.name}-{seed}"
@@ -79,10 +91,11 @@ def run(given: argparse.Namespace) -> None:
         for code, seconds in pairs if seed % 2 else reversed(pairs):
             if not _finished(folders[code]):
                 shutil.rmtree(folders[code], ignore_errors=True)
-                code.train(scene, folders[code], "--seconds", seconds, "--seed", str(seed))
+                code.train(scene, folders[code], *kind, "--seconds", seconds, "--seed", str(seed))
         for code, folder in folders.items():
             row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
-            row |= _figures(folder, folders[codes[-1]])
+            # By the slow renderer only where photos are small.
+            row |= _figures(folder, folders[codes[-1]], independent=given.max_size > 0)
             (folder / "row.json").write_text(json.dumps(row))
 
 
@@ -105,7 +118,7 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
                 yield seed, scene, lengths
 
 
-def _figures(folder: Path, judge: Path) -> Row:
+def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
     """What a run came to, its file drawn on the held-out views of another run."""
     if _held_out(folder) != _held_out(judge):
         raise SystemExit(
@@ -116,15 +129,27 @@ def _figures(folder: Path, judge: Path) -> Row:
     command = [sys.executable, "-m", "crossgrad_core", "eval", str(judge), "--ply", str(ply)]
     shown = subprocess.run([*command, "--threads", "1"], check=True, capture_output=True, text=True)
     (drawn,) = (line.split()[2] for line in shown.stdout.splitlines() if line.startswith("overall"))
+    run = cg.open(judge)
     return {
         "psnr": summary["overall"]["psnr"],
+        "mean_colour": _mean_colour(run.scene),
         "ply": float(drawn),
-        "viewer": viewer.psnr(cg.open(judge), ply),
+        **({"viewer": viewer.psnr(run, ply)} if independent else {}),
         "steps": summary["step"],
         "primitives": summary["primitives"],
         "seconds": summary["train_seconds"],
         "commit": (summary.get("environment") or {}).get("commit") or "not recorded",
     }
+
+
+def _mean_colour(scene: Scene) -> float:
+    """PSNR of the training photos' mean colour on the held-out views, mean."""
+    photos = [view.photo.image().double() / 255 for view in scene.train_views]
+    mean = torch.stack([photo.mean((0, 1)) for photo in photos]).mean(0)
+    errors = [
+        (view.photo.image().double() / 255 - mean).square().mean() for view in scene.test_views
+    ]
+    return fmean(-10.0 * math.log10(error) for error in errors)
 
 
 def table(given: argparse.Namespace) -> None:
@@ -153,6 +178,27 @@ def table(given: argparse.Namespace) -> None:
         print(f"| {scene} | {lengths} | {row} |")
 
 
+def share(given: argparse.Namespace) -> None:
+    """Prints how much of what the code `long` gains over the mean colour the code `new` has."""
+    by_case: dict[tuple[str, int], dict[str, Row]] = defaultdict(dict)
+    for path in sorted(given.out.glob("*/row.json")):
+        row = json.loads(path.read_text())
+        by_case[row["scene"], row["seed"]][row["code"]] = row
+    titles = "scene | seed | commit | mean colour, dB | training s | PLY, dB | share | Gaussians"
+    print(f"| {titles} |\n{'|---' * 8}|")
+    for (scene, seed), codes in sorted(by_case.items()):
+        if not codes.keys() >= {"long", "new"}:
+            continue
+        short, long = codes["new"], codes["long"]
+        base = short["mean_colour"]
+        share = (short["ply"] - base) / (long["ply"] - base)
+        cells = [scene, str(seed), ", ".join(sorted({short["commit"], long["commit"]}))]
+        cells += [f"{base:.2f}", f"{short['seconds']:.1f}, {long['seconds']:.1f}"]
+        cells += [f"{short['ply']:.2f}, {long['ply']:.2f}", f"{share:.1%}"]
+        cells += [f"{short['primitives']:,}, {long['primitives']:,}"]
+        print(f"| {' | '.join(cells)} |")
+
+
 def _cells(own: list[Row]) -> Iterator[str]:
     yield ", ".join(sorted({row["commit"] for row in own}))
     yield f"{fmean(row['seconds'] for row in own):.1f}"
@@ -175,10 +221,14 @@ def main() -> None:
     runs.add_argument("--scene", action="append", type=Path, required=True)
     runs.add_argument("--seconds", nargs="+", required=True, metavar="S[:S]")
     runs.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5, 6])
-    runs.add_argument("--core", type=int, default=0)
+    runs.add_argument("--core", nargs="+", type=int, default=[0])
+    runs.add_argument("--max-size", type=int, default=400, metavar="PIXELS")
     tables = commands.add_parser("table", help="print what there is")
     tables.set_defaults(do=table)
     tables.add_argument("out", type=Path)
+    shares = commands.add_parser("share", help="print what short runs have of long ones")
+    shares.set_defaults(do=share)
+    shares.add_argument("out", type=Path)
     given = parser.parse_args()
     given.do(given)
 
