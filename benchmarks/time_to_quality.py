@@ -7,8 +7,8 @@ r"""The end of runs of so many seconds, by the code of several commits, in turns
 
 `30:10` gives the first code 30 and the second one 10 seconds. Files of both are drawn on the views
 that the last code held out, which the first one has to hold out, too. Runs have 400 px, or as many
-as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of a
-pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
+as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of
+a pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
 black: drawn by `crossgrad eval --ply` and, where `--max-size` is not 0, by `viewer.py`.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \
