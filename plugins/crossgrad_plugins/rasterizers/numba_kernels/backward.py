@@ -98,10 +98,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     start_tile,
 )
 
-#: Numbers of a patch, WIDE each: alpha (later the gradient by the exponent), the odds of
-#: alpha, and the column offsets.
-_ALPHA, _ODDS, _DX = 0, WIDE, 2 * WIDE
-_RESPONSE = 3 * WIDE
+#: Numbers of a patch, WIDE each: alpha (later the gradient by the exponent) and its odds.
+_ALPHA, _ODDS = 0, WIDE
+_RESPONSE = 2 * WIDE
 
 #: Entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
@@ -138,12 +137,11 @@ def _respond(
         # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
-        odds = odds_of(alpha, constants)
-        if capped is not None:
-            odds = where(power <= load_wide(constants, CAPPED), odds, load_wide(constants, FIXED))
         store(responses, at + _ALPHA, alpha)
-        store(responses, at + _ODDS, odds)
-        store(responses, at + _DX, dx)
+        if capped is not None:
+            odds = odds_of(alpha, constants)
+            odds = where(power <= load_wide(constants, CAPPED), odds, load_wide(constants, FIXED))
+            store(responses, at + _ODDS, odds)
         at += _RESPONSE
 
 
@@ -174,7 +172,10 @@ def _blend(
         patches &= patches - np.uint64(1)
         at = patch * STATE
         alpha = load_wide(responses, response + _ALPHA)
-        odds = load_wide(responses, response + _ODDS)
+        if capped is None:
+            odds = odds_of(alpha, constants)
+        else:
+            odds = load_wide(responses, response + _ODDS)
         v_red = load_wide(state, at + V_RED)
         v_green = load_wide(state, at + V_GREEN)
         v_blue = load_wide(state, at + V_BLUE)
@@ -200,6 +201,7 @@ def _moments(
     record: int,
     rows: NDArray[np.float32],
     base: int,
+    constants: NDArray[np.float32],
     absolute: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
@@ -215,13 +217,15 @@ def _moments(
     sum_abs_x = sum_abs_y = splat(np.float32(0.0))
     response = 0
     while patches != np.uint64(0):
-        row = base + row_of(lowest_bit(patches))
+        patch = lowest_bit(patches)
         patches &= patches - np.uint64(1)
+        row, column = base + row_of(patch), OFFSETS + column_of(patch) * WIDE
         first = load(responses, response + _ALPHA)
         second = load(responses, response + _ALPHA + LANES)
-        first_dx = load(responses, response + _DX)
-        second_dx = load(responses, response + _DX + LANES)
         response += _RESPONSE
+        centre = broadcast_four(rows, row + ROW_CENTRE)
+        first_dx = load(constants, column) - centre
+        second_dx = load(constants, column + LANES) - centre
         dy = broadcast_four(rows, row + ROW_DY)
         first_d, second_d = first * first_dx, second * second_dx
         s, sd = first + second, first_d + second_d
@@ -265,7 +269,7 @@ def _gather(
         patches, records, record, state, constants, v_depth, capped, responses
     )
     sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y = _moments(
-        patches, records, record, rows, base, absolute, responses
+        patches, records, record, rows, base, constants, absolute, responses
     )
     # In the order of the layout.
     red, green = halves_added(sum_red), halves_added(sum_green)
