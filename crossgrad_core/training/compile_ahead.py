@@ -58,9 +58,10 @@ def compile_all(loss: ComponentChoice) -> None:
     measured.backward()  # type: ignore[no-untyped-call]
     values, state = torch.zeros((8, 3)), AdamState()
     adam_step({"all": values}, {"all": torch.ones_like(values)}, state, {"all": 1e-3})
-    late, rows = Late(), torch.tensor([1, 4])
-    for _ in range(2):  # What is late is caught up with from the second step on.
-        grad = by_rows(rows, torch.ones((2, 3)), values.shape)
+    late = Late()
+    # One row of many, another one, which is late by then, and so many that all are taken.
+    for rows in ([1], [4], [1, 4, 6]):
+        grad = by_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
         late.step("rows", values, grad, state, counted("rows", values, state, 1e-3, Rule(), 1.0))
 
 

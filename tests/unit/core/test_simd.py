@@ -8,16 +8,18 @@ from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
     bits,
-    broadcast_two,
-    broadcast_two_wide,
-    even_lanes,
+    broadcast_four,
+    broadcast_four_wide,
+    first_half,
     fma,
     halves_added,
-    interleaved,
+    joined,
+    last_half,
     load,
     load_triples,
     load_wide,
-    odd_lanes,
+    picking,
+    reached_patches,
     splat,
     splat_wide,
     square_root,
@@ -25,6 +27,9 @@ from crossgrad_core.numerics.simd import (
     store_triples,
     where,
 )
+
+ORDER = [5, 31, 16, 0, 0, 7, 8, 30, 15, 17, 1, 2, 29, 3, 4, 6]
+turned = picking(ORDER)
 
 
 @kernel
@@ -34,14 +39,20 @@ def _turned(source, target):
 
 
 @kernel
-def _two(source, target):
-    store(target, 0, broadcast_two_wide(source, 3))
-    store(target, WIDE, broadcast_two(source, 4))
-    both = interleaved(load(source, LANES), load(source, 0))
+def _parts(source, target):
+    store(target, 0, broadcast_four_wide(source, 3))
+    store(target, WIDE, broadcast_four(source, 4))
+    both = joined(load(source, LANES), load(source, 0))
     store(target, WIDE + LANES, both)
-    store(target, 2 * WIDE + LANES, even_lanes(both))
-    store(target, 3 * WIDE, odd_lanes(both))
+    store(target, 2 * WIDE + LANES, first_half(both))
+    store(target, 3 * WIDE, last_half(both))
     store(target, 3 * WIDE + LANES, halves_added(load_wide(source, 0)))
+    store(target, 4 * WIDE, turned(both, load_wide(source, 0)))
+
+
+@kernel
+def _reached(first, last):
+    return reached_patches(load_wide(first, 0), load_wide(last, 0))
 
 
 @kernel
@@ -74,15 +85,30 @@ def test_triples_come_apart_and_together_again():
     assert target[[0, 1, -1]].tolist() == [-1, -1, -1]
 
 
-def test_two_vectors_by_turns():
+def test_parts_of_vectors():
     source = np.arange(WIDE, dtype=np.float32)
-    target = np.empty(4 * WIDE, np.float32)
-    _two(source, target)
+    target = np.empty(5 * WIDE, np.float32)
+    _parts(source, target)
     first, second = range(LANES, WIDE), range(LANES)
-    by_turns = [lane for both in zip(first, second, strict=True) for lane in both]
     sums = [a + b for a, b in zip(first, second, strict=True)]
-    expected = [*[3, 4] * LANES, *[4, 5] * (LANES // 2), *by_turns, *first, *second, *sums]
-    assert target.tolist() == expected
+    expected = [*[3, 4, 5, 6] * 4, *[4, 5, 6, 7] * 2, *first, *second, *first, *second, *sums]
+    both = [*first, *second, *range(WIDE)]
+    assert target.tolist() == [*expected, *[both[place] for place in ORDER]]
+
+
+def test_reached_patches_are_those_with_a_pixel():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        first = np.round(rng.normal(30, 30, WIDE)).astype(np.float32)
+        last = (first + np.round(rng.normal(6, 12, WIDE))).astype(np.float32)
+        wild = rng.random(WIDE) < 0.2
+        last[wild] = rng.choice(np.array([np.nan, np.inf, -np.inf, 1e30], np.float32), wild.sum())
+        expected = 0
+        for row in range(WIDE):
+            for x in range(64):
+                if first[row] <= x <= last[row]:
+                    expected |= 1 << (16 * (row // 4) + x // 4)
+        assert _reached(first, last) == expected
 
 
 @pytest.mark.parametrize("extreme", [0.0, 1e-40, 3e38, np.inf, np.nan])

@@ -169,7 +169,7 @@ def _find(
             if begin > end:
                 continue
             tile = (block + row) * tile_columns + begin
-            # Most rows have one tile or two, by chance: no branch between these.
+            # Most rows have one tile or two, nobody knows which: no branch between these.
             more = np.intp(end > begin)
             tile_of_slot[slot] = tile
             tile_of_slot[slot + more] = tile + more
