@@ -270,7 +270,10 @@ class RunConfig(BaseModel):
         "split, else, and where --max-gaussians is a number, free.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
-        None, ge=1, description="Steps between evaluations. Default: a tenth of the run."
+        None,
+        ge=1,
+        description="Steps between evaluations. Default: a tenth of the run, half-way between resets "
+        "of the opacities.",
     )
     eval_from: int = Field(0, ge=0, description="no evaluation before this step")
     save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(

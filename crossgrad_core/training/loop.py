@@ -184,7 +184,10 @@ def evaluates_after(setup: Setup, step: int) -> bool:
     """Whether the held-out views are evaluated after this step of a run that goes on."""
     every = setup.config.eval_every or max(1, _planned(setup) // 10)
     first = max(1, setup.config.eval_from)
-    return step % every == 0 and first <= step < setup.schedule.total
+    # Opacities are reset every tenth of the steps, too: right after that there is hardly a picture.
+    between = setup.config.eval_every is None and setup.schedule.reset_every is not None
+    shift = every // 2 if between else 0
+    return step % every == shift and first <= step < setup.schedule.total
 
 
 def _record(setup: Setup, state: TrainState, sink: Sink) -> None:

@@ -1,0 +1,25 @@
+"""When the held-out views are evaluated."""
+
+import pytest
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.loop import evaluates_after
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_usual_evaluations_are_far_from_resets_of_the_opacities(views):
+    config = RunConfig(steps=20_000, views=views, preset="inria")
+    setup = assemble(config, sample_scene(), "none")
+    resets = [step for step in range(1, 20_000) if setup.schedule.resets(step)]
+    found = [step for step in range(1, 20_000) if evaluates_after(setup, step)]
+    assert len(found) == 10 and len(resets) >= 4
+    assert not [(e, r) for e in found for r in resets if 0 <= e - r < 900]
+
+
+@pytest.mark.parametrize(("steps", "given"), [(20_000, {"eval_every": 2000}), (2000, {})])
+def test_else_they_are_at_multiples(steps, given):
+    setup = assemble(RunConfig(steps=steps, **given), sample_scene(), "none")
+    found = [step for step in range(1, steps + 1) if evaluates_after(setup, step)]
+    assert found == [step for step in range(steps // 10, steps, steps // 10)]
