@@ -180,13 +180,13 @@ def table(given: argparse.Namespace) -> None:
 
 def share(given: argparse.Namespace) -> None:
     """Prints how much of what the code `long` gains over the mean colour the code `new` has."""
-    by_case: dict[tuple[str, int], dict[str, Row]] = defaultdict(dict)
+    by_case: dict[tuple[str, str, int], dict[str, Row]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
-        by_case[row["scene"], row["seed"]][row["code"]] = row
+        by_case[row["scene"], row["lengths"], row["seed"]][row["code"]] = row
     titles = "scene | seed | commit | mean colour, dB | training s | PLY, dB | share | Gaussians"
     print(f"| {titles} |\n{'|---' * 8}|")
-    for (scene, seed), codes in sorted(by_case.items()):
+    for (scene, _, seed), codes in sorted(by_case.items()):
         if not codes.keys() >= {"long", "new"}:
             continue
         short, long = codes["new"], codes["long"]
@@ -204,8 +204,9 @@ def _cells(own: list[Row]) -> Iterator[str]:
     yield f"{fmean(row['seconds'] for row in own):.1f}"
     yield str(len(own))
     for name in ("ply", "viewer"):
-        values = [row[name] for row in own]
-        yield f"{fmean(values):.2f}" + (f" ± {stdev(values):.2f}" if len(values) > 1 else "")
+        values = [row[name] for row in own if name in row]
+        spread = f" ± {stdev(values):.2f}" if len(values) > 1 else ""
+        yield f"{fmean(values):.2f}{spread}" if values else "-"
     for name in ("steps", "primitives"):
         yield f"{fmean(row[name] for row in own):,.0f}"
 

@@ -272,8 +272,8 @@ class RunConfig(BaseModel):
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None,
         ge=1,
-        description="Steps between evaluations. Default: a tenth of the run, half-way between resets "
-        "of the opacities.",
+        description="Steps between evaluations. Default: a tenth of the run, half-way between "
+        "resets of the opacities.",
     )
     eval_from: int = Field(0, ge=0, description="no evaluation before this step")
     save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(

@@ -10,12 +10,16 @@ from typing import Any, Final
 TRIM_THRESHOLD: Final = -1
 TOP_PAD: Final = -2
 MMAP_THRESHOLD: Final = -3
-#: What stays when it is freed and what the heap grows by, bytes; and the largest array that is
-#: part of it, glibc's bound.
+#: What stays when it is freed, bytes; and the largest array that is part of it, glibc's bound.
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
-#: Bytes of a large page.
+#: What the heap grows by at first, so little that it is not given back at once, and later. The
+#: heaps of other threads are given back in such pieces only.
+FIRST: Final = KEPT - 2 * LARGEST
+LATER: Final = 16 << 20
+#: Bytes of a large page, and the advice to take them, which older headers may not have.
 LARGE_PAGE: Final = 2 << 20
+_HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 
 
 @cache
@@ -55,22 +59,19 @@ class _Heap:
         self._asked = library.sbrk(0)
 
     def keep(self) -> None:
-        """Keeps what is freed, and lets the heap grow in large pieces, for the first time now."""
-        for parameter, value in (
-            (TRIM_THRESHOLD, KEPT),
-            (MMAP_THRESHOLD, LARGEST),
-            (TOP_PAD, KEPT),
-        ):
-            self._library.mallopt(parameter, value)
-        # Memory that nothing is written to costs nothing.
+        """Keeps what is freed, and lets the heap grow: what is not written to costs nothing."""
+        self._library.mallopt(TRIM_THRESHOLD, KEPT)
+        self._library.mallopt(MMAP_THRESHOLD, LARGEST)
+        self._library.mallopt(TOP_PAD, FIRST)
         self._library.free(self._library.malloc(LARGEST - LARGE_PAGE))
+        self._library.mallopt(TOP_PAD, LATER)
 
     def use_large_pages(self) -> None:
         """Asks for them from where it ended at the last call."""
         end = self._library.sbrk(0)
         begin = -(-self._asked // LARGE_PAGE) * LARGE_PAGE
         if begin < end:
-            self._library.madvise(begin, end - begin, mmap.MADV_HUGEPAGE)
+            self._library.madvise(begin, end - begin, _HUGE)
         self._asked = end
 
 

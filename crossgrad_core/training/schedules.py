@@ -64,6 +64,9 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
+    if _growth(config, budgeted=densifier.budgeted) == "curve":
+        # They are there to hold back growth, which the curve does, and cost what is seen by few.
+        schedule = replace(schedule, reset_every=None)
     edits = _given(config, _EDITS)
     schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from")))
     # What the user sets stays, whatever the length.
@@ -86,7 +89,8 @@ def _curve_note(setup: Setup) -> tuple[str, ...]:
         return ()
     return (
         "growth follows a curve to the number of primitives that suits the length (--max-gaussians "
-        "auto); --growth free adds as many as density control asks for",
+        "auto), without resets of the opacities; --growth free adds as many as density control "
+        "asks for",
     )
 
 

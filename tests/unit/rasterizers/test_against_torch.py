@@ -101,6 +101,13 @@ CASES = {
     "one tile": lambda: case(40, (16, 16)),
     "one pixel more than a tile": lambda: case(40, (17, 17)),
     "no multiple of a tile": lambda: case(80, (37, 19)),
+    "three tiles in a row": lambda: case(80, (150, 20), sigmas=(0.5, 30.0)),
+    "three tiles in a row, antialiased": lambda: case(
+        80, (150, 20), sigmas=(0.5, 30.0), response="antialiased"
+    ),
+    "three tiles in a row, analytic": lambda: case(
+        80, (150, 20), sigmas=(0.5, 30.0), response="analytic"
+    ),
     "background": lambda: case(background=(0.3, 1.7, -0.4)),
     "degree 0": lambda: case(sh_degree=0),
     "degree 1": lambda: case(sh_degree=1),
@@ -319,7 +326,7 @@ def assert_same_counts(screen, fast, exact, unsettled):
 @given(
     seed=st.integers(0, 2**20),
     response=st.sampled_from(["plain", "antialiased", "analytic"]),
-    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    size=st.tuples(st.integers(1, 140), st.integers(1, 40)),
     sigmas=st.sampled_from([(1e-3, 0.5), (0.5, 5.0), (0.05, 100.0)]),
     density=st.floats(0.0, 1.0),
 )

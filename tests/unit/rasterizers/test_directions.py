@@ -11,7 +11,7 @@ from support.gaussians import posed_camera, random_gaussians, smooth_gaussians
 from crossgrad_core.registry.entries import build
 
 OUTPUTS = frozenset({"directions", "abs_gradient", "depth", "pixels"})
-CAMERA = posed_camera(40, 28, focal=40.0)
+CAMERA = posed_camera(80, 28, focal=40.0)
 
 
 def leaves(gaussians, dtype=torch.float64):

@@ -22,4 +22,4 @@ def test_usual_evaluations_are_far_from_resets_of_the_opacities(views):
 def test_else_they_are_at_multiples(steps, given):
     setup = assemble(RunConfig(steps=steps, **given), sample_scene(), "none")
     found = [step for step in range(1, steps + 1) if evaluates_after(setup, step)]
-    assert found == [step for step in range(steps // 10, steps, steps // 10)]
+    assert found == list(range(steps // 10, steps, steps // 10))

@@ -138,7 +138,7 @@ class Frame:
         options: The input.
         projected: Drawn Gaussians.
         lists: Tile lists.
-        masks: [E] uint64, segments that each entry was blended into.
+        masks: [E] uint64, patches that each entry was blended into.
     """
 
     image: Float32

@@ -77,13 +77,14 @@ from crossgrad_plugins.rasterizers.numba_kernels.patches import (
     place_of,
     row_of,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.records import SQUARE
 
 #: Entries whose reach is computed before any of them is blended: hides the latency of their
 #: memory reads and row extents, and is how often finished patches are looked for.
 BATCH = 16
 
 # Side of the squares that limits count, pixels; the patches of the first such column as bits.
-_SQUARE = 16
+_SQUARE = int(SQUARE)
 _ABREAST = np.uint64(
     sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)
 )

@@ -98,8 +98,7 @@ def mean_gradients(
 ) -> tuple[Lanes, Lanes]:
     """Blends into a patch; returns its pixels' gradients by the projected mean (x and y).
 
-    The gradients of plain records are in units of
-    2 log 2 px^-1, the others in px^-1.
+    The gradients of plain records are in units of 2 log 2 px^-1, the others in px^-1.
     """
     row = base + row_of(patch)
     offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)

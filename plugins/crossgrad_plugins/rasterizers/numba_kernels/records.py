@@ -220,9 +220,11 @@ def _radius(extent: float) -> int:
 
 @device
 def log2_of(value: float) -> float:
-    """Returns log2 of a normal positive number, error below 1e-13; any number below 2**-1000 else.
+    """Returns log2 of a normal positive number, error below 1e-13.
 
-    Loops that call it are vectorised, which those that call the C library are not.
+    It is at most -1000 for smaller ones, 0 and negative ones, and anything for NaN and infinity:
+    callers look before. Loops that call it are vectorised, which those that call the C library are
+    not.
     """
     raw = np.float64(value).view(np.int64)
     exponent = (raw >> _MANTISSA_BITS) - _BIAS

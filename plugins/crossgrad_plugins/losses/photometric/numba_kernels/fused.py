@@ -86,9 +86,9 @@ def _tile(
                 slot = DIFFERENCE + (row & (SLOTS - 1)) * STRIDE + 2 * HALO
                 absolute += sum_absolute(scratch, slot, CHANNELS * columns)
         ready = first - RADIUS
-        if with_gradient and ready + 1 >= top:
+        if with_gradient and ready >= top:
             sum_gradient_rows(scratch, ready, columns)
-            for row in range(max(ready, top), min(ready + 2, bottom)):
+            for row in range(ready, min(ready + 2, bottom)):
                 back = BACK + (row - ready) * 3 * STRIDE
                 gradient_row(scratch, row, columns, back, l1_weight, ssim_weight)
                 destination = (row * width + left) * CHANNELS

@@ -8,7 +8,7 @@ from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384
-#: Rows of a ring; a power of two, at least WINDOW and the two that follow.
+#: Rows of a ring; a power of two, more than WINDOW: those of two rows overlap.
 SLOTS = 16
 CHANNELS = 3
 #: Floats of the columns that a window reaches beyond its centre.

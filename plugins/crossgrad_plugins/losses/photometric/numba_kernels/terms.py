@@ -1,4 +1,4 @@
-"""SSIM, its derivatives and the gradient of the loss, one row of a tile at a time."""
+"""SSIM, its derivatives and the gradient of the loss, one or two rows of a tile at a time."""
 
 from typing import TypeAlias
 
