@@ -8,6 +8,7 @@ from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.schedule import (
+    REFERENCE,
     SHORTEST_RUN_WITH_EDITS,
     USUAL_EDITS,
     Counting,
@@ -64,8 +65,9 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
-    if _growth(config, budgeted=densifier.budgeted) == "curve":
-        # They are there to hold back growth, which the curve does, and cost what is seen by few.
+    led = _growth(config, budgeted=densifier.budgeted) == "curve"
+    if led and schedule.length < REFERENCE:
+        # They hold back growth, which the curve does, and with them goes what fills the far ground.
         schedule = replace(schedule, reset_every=None)
     edits = _given(config, _EDITS)
     schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from")))
@@ -87,10 +89,10 @@ def _curve_note(setup: Setup) -> tuple[str, ...]:
     """Says that growth follows the curve, where nobody asked for it."""
     if not setup.schedule.grows or setup.config.growth or growth_of(setup) == "free":
         return ()
+    resets = "" if setup.schedule.reset_every else ", without resets of the opacities"
     return (
         "growth follows a curve to the number of primitives that suits the length (--max-gaussians "
-        "auto), without resets of the opacities; --growth free adds as many as density control "
-        "asks for",
+        f"auto){resets}; --growth free adds as many as density control asks for",
     )
 
 

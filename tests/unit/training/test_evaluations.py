@@ -1,4 +1,4 @@
-"""When the held-out views are evaluated."""
+"""When the held-out views are evaluated, and opacities are reset."""
 
 import pytest
 
@@ -23,3 +23,20 @@ def test_else_they_are_at_multiples(steps, given):
     setup = assemble(RunConfig(steps=steps, **given), sample_scene(), "none")
     found = [step for step in range(1, steps + 1) if evaluates_after(setup, step)]
     assert found == list(range(steps // 10, steps, steps // 10))
+
+
+@pytest.mark.parametrize(
+    ("settings", "every"),
+    [
+        ({"steps": 20_000}, None),
+        ({"steps": 20_000, "growth": "free"}, 2000),
+        ({"steps": 20_000, "max_gaussians": 10**6}, 2000),
+        ({"steps": 20_000, "preset": "inria"}, 2000),
+        ({"steps": 20_000, "reset_every": 500}, 500),
+        ({"steps": 30_000}, 3000),
+        ({"steps": 9999, "growth": "free"}, None),
+    ],
+    ids=str,
+)
+def test_opacities_are_reset_where_growth_is_free_or_of_the_published_length(settings, every):
+    assert assemble(RunConfig(**settings), sample_scene(), "none").schedule.reset_every == every
