@@ -23,6 +23,7 @@ class Densifier(Component):
         tensors: Names of the parameter tensors that it needs a backbone to have.
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.
+        reset_options: Its options that count only in runs with resets.
         observes: Whether it gathers statistics of the views that the steps render.
         budgeted: Whether a run that names no bound leads its growth along the curve to the budget
             of its length, which is one of Gaussians.
@@ -33,6 +34,7 @@ class Densifier(Component):
     tensors: ClassVar[frozenset[str]] = frozenset()
     edits: ClassVar[bool] = True
     resets: ClassVar[bool] = True
+    reset_options: ClassVar[frozenset[str]] = frozenset()
     observes: ClassVar[bool] = True
     budgeted: ClassVar[bool] = False
 

@@ -51,6 +51,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     found = [
         *_of_components(config, setup),
         *_of_density_control(config, setup),
+        *_of_resets(config, setup),
         *_of_views(config, setup),
         *_of_the_schedule(config, setup),
         *_of_groups(config, setup),
@@ -95,8 +96,6 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
     for setting in _TIMES:
         if getattr(config, setting) is not None and not densifier.edits:
             yield setting, f"densifier {name} never edits"
-    if config.reset_every is not None and not densifier.resets:
-        yield "reset_every", f"densifier {name} resets no opacities"
     if config.growth == "curve" and not densifier.edits:
         yield "growth", f"densifier {name} never edits"
     # A number bounds the start of points, too.
@@ -104,6 +103,18 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
         yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
     elif not densifier.edits and config.max_gaussians and config.reading.init_file is not None:
         yield "max_gaussians", f"densifier {name} never edits, and a PLY is taken as it is"
+
+
+def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    densifier = setup.densifier
+    if config.reset_every is not None and not densifier.resets:
+        yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
+    if config.densifier is None or setup.schedule.reset_every is not None:
+        return
+    fields = type(densifier).model_fields
+    for option in sorted(densifier.reset_options & config.densifier.options.keys()):
+        if getattr(densifier, option) != fields[option].default:
+            yield f"densifier.{option}", "the run has no opacity resets; --set reset_every=N"
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

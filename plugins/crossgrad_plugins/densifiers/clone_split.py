@@ -94,6 +94,7 @@ class CloneSplit(Densifier):
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
+    reset_options = frozenset({"prune_scale", "reset_opacity"})
     budgeted = True
 
     split_scale: float = Field(0.01, gt=0, description="split above, clone below; scene extents")

@@ -79,6 +79,8 @@ IDLE = [
     ({"densifier": {"name": "none"}, "growth": "curve"}, "growth"),
     ({"densifier": {"name": "none"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
+    ({"densifier": {"name": "adc", "prune_scale": 0.3}}, "densifier.prune_scale"),
+    ({"densifier": {"name": "dc4gs", "reset_opacity": 0.3}}, "densifier.reset_opacity"),
     (
         {"densifier": {"name": "absgrad", "criterion": "gsplat", "abs_threshold": 1e-3}},
         "densifier.abs_threshold",
@@ -148,6 +150,7 @@ AT_WORK = [
     {"grouping": {"name": "gmm"}, "observers": [{"name": "diagnostics"}]},
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"densifier": {"name": "none"}, "max_gaussians": 10},
+    {"densifier": {"name": "adc", "prune_scale": 0.3}, "reset_every": 10},
     {"max_gaussians": "auto", "growth": "curve"},
     {"densifier": {"name": "adc"}, "growth": "curve"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
