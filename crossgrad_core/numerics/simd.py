@@ -22,6 +22,8 @@ from numba.core import types
 from numba.extending import intrinsic, models, overload, register_model
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jit import strict_device
+
 LANES = 8
 WIDE = 2 * LANES
 
@@ -68,12 +70,14 @@ def _floats(width: int) -> ir.Type:
     return ir.VectorType(_FLOAT, width)
 
 
-def _same(a: Any) -> ir.Type:
+def whole_numbers(a: Any) -> ir.Type:
     """Whole numbers, as many as a vector of LLVM has."""
     return ir.VectorType(_INT, a.type.count)
 
 
-_eight, _wide = _lanes(LANES), _lanes(WIDE)
+#: Numba type of a vector of sixteen numbers.
+SIXTEEN = _lanes(WIDE)
+_eight = _lanes(LANES)
 _triple = cast("Any", types).UniTuple(_eight, 3)
 
 
@@ -91,7 +95,7 @@ class _MaskModel(models.PrimitiveModel):
         )
 
 
-class _Site(NamedTuple):
+class Site(NamedTuple):
     """Where a function is called: Numba's context, LLVM's builder, the operands' Numba types."""
 
     context: Any
@@ -99,11 +103,11 @@ class _Site(NamedTuple):
     operands: tuple[Any, ...]
 
 
-def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
+def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
     """Makes a function for kernels.
 
     Args:
-        emit: Emits its instructions, given the site and the operands' LLVM values.
+        emit: Emits its instructions, given the `Site` and the operands' LLVM values.
         result: Numba type of the result; `_lanes` and `_mask` stand for a vector as wide as those
             among the operands.
         operands: Numba types of the operands, likewise; None stands for any array.
@@ -121,7 +125,7 @@ def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
         kinds = [typed(kind, other) for kind, other in zip(operands, given, strict=True)]
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emit(_Site(context, builder, signature.args), *args)
+            return emit(Site(context, builder, signature.args), *args)
 
         return typed(result, None)(*kinds), generate
 
@@ -139,7 +143,7 @@ def _function(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
 def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any, to: Any) -> None:
     """Gives a Python operator its meaning between two values of one kind."""
-    implementation = _function(emit, to, kind, kind)
+    implementation = emitted(emit, to, kind, kind)
 
     @overload(sign, strict=False)  # the annotations are no part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
@@ -161,7 +165,7 @@ _define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
     """Emits a call of an LLVM intrinsic; on vectors, where it does not say what results."""
 
-    def emit(at: _Site, *args: Any) -> Any:
+    def emit(at: Site, *args: Any) -> Any:
         full = name if result else f"{name}.v{args[0].type.count}f32"
         function = at.builder.module.globals.get(full)
         if function is None:
@@ -172,45 +176,45 @@ def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
     return emit
 
 
-def _element(at: _Site, array: Any, index: Any, kind: ir.Type) -> Any:
+def _element(at: Site, array: Any, index: Any, kind: ir.Type) -> Any:
     """Returns the address of an array's element; no check, no counting from the end."""
     data = at.context.make_array(at.operands[0])(at.context, at.builder, array).data
     return at.builder.bitcast(at.builder.gep(data, [index]), kind.as_pointer())
 
 
-def _shuffle(at: _Site, a: Any, b: Any, order: Sequence[int]) -> Any:
+def shuffled(at: Site, a: Any, b: Any, order: Sequence[int]) -> Any:
     """Picks lanes of `a` (from 0 on) and then of `b`."""
     places = ir.Constant(ir.VectorType(_INT, len(order)), list(order))
     return at.builder.shuffle_vector(a, b, places)
 
 
 def _splat(width: int) -> Callable[..., Any]:
-    def emit(at: _Site, value: Any) -> Any:
+    def emit(at: Site, value: Any) -> Any:
         empty = ir.Constant(_floats(width), ir.Undefined)
         single = at.builder.insert_element(empty, value, _INT(0))
-        return _shuffle(at, single, single, [0] * width)
+        return shuffled(at, single, single, [0] * width)
 
     return emit
 
 
 def _load(width: int) -> Callable[..., Any]:
-    def emit(at: _Site, array: Any, index: Any) -> Any:
+    def emit(at: Site, array: Any, index: Any) -> Any:
         return at.builder.load(_element(at, array, index, _floats(width)), align=_ALIGNMENT)
 
     return emit
 
 
 def _broadcast(width: int) -> Callable[..., Any]:
-    def emit(at: _Site, array: Any, index: Any) -> Any:
+    def emit(at: Site, array: Any, index: Any) -> Any:
         return _splat(width)(at, at.builder.load(_element(at, array, index, _FLOAT)))
 
     return emit
 
 
 def _broadcast_four(width: int) -> Callable[..., Any]:
-    def emit(at: _Site, array: Any, index: Any) -> Any:
+    def emit(at: Site, array: Any, index: Any) -> Any:
         four = at.builder.load(_element(at, array, index, _floats(4)), align=_ALIGNMENT)
-        return _shuffle(at, four, four, [0, 1, 2, 3] * (width // 4))
+        return shuffled(at, four, four, [0, 1, 2, 3] * (width // 4))
 
     return emit
 
@@ -221,108 +225,80 @@ def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
     Args:
         order: Sixteen numbers of lanes; those of the second vector count from 16 on.
     """
-    pick = _function(lambda at, a, b: _shuffle(at, a, b, order), _wide, _wide, _wide)
+    pick = emitted(lambda at, a, b: shuffled(at, a, b, order), SIXTEEN, SIXTEEN, SIXTEEN)
     return cast("Callable[[Lanes, Lanes], Lanes]", pick)
 
 
-def _halves_added(at: _Site, a: Any) -> Any:
-    low, high = (_shuffle(at, a, a, range(start, start + LANES)) for start in (0, LANES))
+def _halves_added(at: Site, a: Any) -> Any:
+    low, high = (shuffled(at, a, a, range(start, start + LANES)) for start in (0, LANES))
     return at.builder.fadd(low, high)
 
 
-def _store(at: _Site, array: Any, index: Any, value: Any) -> Any:
+def _store(at: Site, array: Any, index: Any, value: Any) -> Any:
     at.builder.store(value, _element(at, array, index, value.type), align=_ALIGNMENT)
     return at.context.get_dummy_value()
 
 
-def _load_triples(at: _Site, array: Any, index: Any) -> Any:
+def _load_triples(at: Site, array: Any, index: Any) -> Any:
     a, b, c = _parts(at, array, index)
     first, last = at.builder.load(a, align=_ALIGNMENT), at.builder.load(c, align=_ALIGNMENT)
-    two = _shuffle(at, first, at.builder.load(b, align=_ALIGNMENT), range(WIDE))
-    three = _shuffle(at, two, _shuffle(at, last, last, range(WIDE)), range(3 * LANES))
-    picked = [_shuffle(at, three, three, range(i, 3 * LANES, 3)) for i in range(3)]
+    two = shuffled(at, first, at.builder.load(b, align=_ALIGNMENT), range(WIDE))
+    three = shuffled(at, two, shuffled(at, last, last, range(WIDE)), range(3 * LANES))
+    picked = [shuffled(at, three, three, range(i, 3 * LANES, 3)) for i in range(3)]
     return at.context.make_tuple(at.builder, _triple, picked)
 
 
-def _store_triples(at: _Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> Any:
-    two, third = _shuffle(at, x, y, range(WIDE)), _shuffle(at, z, z, range(WIDE))
+def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> Any:
+    two, third = shuffled(at, x, y, range(WIDE)), shuffled(at, z, z, range(WIDE))
     mixed = [i + LANES * channel for i in range(LANES) for channel in range(3)]
     for part, address in enumerate(_parts(at, array, index)):
-        here = _shuffle(at, two, third, mixed[part * LANES : (part + 1) * LANES])
+        here = shuffled(at, two, third, mixed[part * LANES : (part + 1) * LANES])
         at.builder.store(here, address, align=_ALIGNMENT)
     return at.context.get_dummy_value()
 
 
-def _parts(at: _Site, array: Any, index: Any) -> list[Any]:
+def _parts(at: Site, array: Any, index: Any) -> list[Any]:
     """The addresses of three vectors of eight, one after the other."""
     places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(3)]
     return [_element(at, array, place, _floats(LANES)) for place in places]
 
 
-def _prefetch(at: _Site, array: Any, index: Any, *, write: int) -> Any:
+def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:
     address = _element(at, array, index, _BYTE)
     # Keep in all levels of the cache (3); data, not instructions (1).
     _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
     return at.context.get_dummy_value()
 
 
-def _negated_fma(at: _Site, a: Any, b: Any, c: Any) -> Any:
+def _negated_fma(at: Site, a: Any, b: Any, c: Any) -> Any:
     return _llvm("llvm.fmuladd")(at, at.builder.fneg(a), b, c)
 
 
-def _as_negative(at: _Site, a: Any) -> Any:
-    sign = ir.Constant(_same(a), [_SIGN_BIT] * a.type.count)
-    return at.builder.bitcast(at.builder.or_(at.builder.bitcast(a, _same(a)), sign), a.type)
+def _as_negative(at: Site, a: Any) -> Any:
+    sign = ir.Constant(whole_numbers(a), [_SIGN_BIT] * a.type.count)
+    return at.builder.bitcast(at.builder.or_(at.builder.bitcast(a, whole_numbers(a)), sign), a.type)
 
 
 def _pick(sign: str) -> Callable[..., Any]:
-    def emit(at: _Site, a: Any, b: Any) -> Any:
+    def emit(at: Site, a: Any, b: Any) -> Any:
         return at.builder.select(at.builder.fcmp_ordered(sign, a, b), a, b)
 
     return emit
 
 
-def _reached_patches(at: _Site, first: Any, last: Any) -> Any:
-    build, whole = at.builder, _same(first)
-
-    def number(kind: ir.Type, value: float) -> Any:
-        return ir.Constant(kind, [value] * WIDE)
-
-    zero, end = number(first.type, 0.0), number(first.type, 63.0)
-    inside = build.and_(
-        build.fcmp_ordered("<=", first, last),
-        build.and_(build.fcmp_ordered("<=", first, end), build.fcmp_ordered(">=", last, zero)),
-    )
-    low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
-    high = build.select(build.fcmp_ordered("<", last, end), last, end)
-    # Where nothing is inside there may be NaN, of which no whole number can be made.
-    columns = [
-        build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
-        for edge in (low, high)
-    ]
-    run = build.sub(
-        build.shl(number(whole, 2), columns[1]), build.shl(number(whole, 1), columns[0])
-    )
-    run = build.select(inside, run, number(whole, 0))
-    for distance in (1, 2):
-        run = build.or_(run, _shuffle(at, run, run, [lane ^ distance for lane in range(WIDE)]))
-    four = build.trunc(_shuffle(at, run, run, range(0, WIDE, 4)), ir.VectorType(ir.IntType(16), 4))
-    return build.bitcast(four, _LONG)
-
-
-def _bits(at: _Site, mask: Any) -> Any:
+def _bits(at: Site, mask: Any) -> Any:
     return at.builder.zext(at.builder.bitcast(mask, ir.IntType(mask.type.count)), _LONG)
 
 
-def _scale_by_power(at: _Site, value: Any, shifted: Any) -> Any:
-    whole = _same(value)
+def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
+    whole = whole_numbers(value)
     places = ir.Constant(whole, [_MANTISSA_BITS] * value.type.count)
     exponent = at.builder.shl(at.builder.bitcast(shifted, whole), places)
     scaled = at.builder.add(at.builder.bitcast(value, whole), exponent)
     return at.builder.bitcast(scaled, value.type)
 
 
-def _sums(at: _Site, *args: Any) -> Any:
+def _sums(at: Site, *args: Any) -> Any:
     rows = list(args)
     for width in (1, 2, 4):
         # Folds groups of `width` lanes onto their neighbours, two vectors into one.
@@ -331,14 +307,14 @@ def _sums(at: _Site, *args: Any) -> Any:
         high = [lane + width for lane in low]
         pairs = zip(rows[::2], rows[1::2], strict=True)
         rows = [
-            at.builder.fadd(_shuffle(at, a, b, low), _shuffle(at, a, b, high)) for a, b in pairs
+            at.builder.fadd(shuffled(at, a, b, low), shuffled(at, a, b, high)) for a, b in pairs
         ]
     return rows[0]
 
 
-def _total(at: _Site, a: Any) -> Any:
+def _total(at: Site, a: Any) -> Any:
     for width in (1, 2, 4):
-        a = at.builder.fadd(a, _shuffle(at, a, a, [lane ^ width for lane in range(LANES)]))
+        a = at.builder.fadd(a, shuffled(at, a, a, [lane ^ width for lane in range(LANES)]))
     return at.builder.extract_element(a, _INT(0))
 
 
@@ -350,112 +326,110 @@ _Array = NDArray[Any]
 _Three = tuple[Lanes, Lanes, Lanes]
 
 #: Returns a float32 number in all lanes.
-splat: Callable[[np.float32], Lanes] = _function(_splat(LANES), _eight, types.float32)
+splat: Callable[[np.float32], Lanes] = emitted(_splat(LANES), _eight, types.float32)
 #: Returns (0, 1, ..., 7).
-ramp: Callable[[], Lanes] = _function(_ramp(LANES), _eight)
+ramp: Callable[[], Lanes] = emitted(_ramp(LANES), _eight)
 #: Returns eight consecutive numbers of a flat float32 array, from an index on.
-load: Callable[[_Array, int], Lanes] = _function(_load(LANES), _eight, None, types.intp)
+load: Callable[[_Array, int], Lanes] = emitted(_load(LANES), _eight, None, types.intp)
 #: Returns one number of a flat float32 array in all lanes.
-broadcast: Callable[[_Array, int], Lanes] = _function(_broadcast(LANES), _eight, None, types.intp)
+broadcast: Callable[[_Array, int], Lanes] = emitted(_broadcast(LANES), _eight, None, types.intp)
 #: Returns four consecutive numbers of a flat float32 array, twice.
-broadcast_four: Callable[[_Array, int], Lanes] = _function(
+broadcast_four: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(LANES), _eight, None, types.intp
 )
 #: Returns a float32 number in sixteen lanes.
-splat_wide: Callable[[np.float32], Lanes] = _function(_splat(WIDE), _wide, types.float32)
+splat_wide: Callable[[np.float32], Lanes] = emitted(_splat(WIDE), SIXTEEN, types.float32)
 #: Returns (0, 1, ..., 15).
-ramp_wide: Callable[[], Lanes] = _function(_ramp(WIDE), _wide)
+ramp_wide: Callable[[], Lanes] = emitted(_ramp(WIDE), SIXTEEN)
 #: Returns sixteen consecutive numbers of a flat float32 array, from an index on.
-load_wide: Callable[[_Array, int], Lanes] = _function(_load(WIDE), _wide, None, types.intp)
+load_wide: Callable[[_Array, int], Lanes] = emitted(_load(WIDE), SIXTEEN, None, types.intp)
 #: Returns one number of a flat float32 array in sixteen lanes.
-broadcast_wide: Callable[[_Array, int], Lanes] = _function(
-    _broadcast(WIDE), _wide, None, types.intp
+broadcast_wide: Callable[[_Array, int], Lanes] = emitted(
+    _broadcast(WIDE), SIXTEEN, None, types.intp
 )
 #: Returns four consecutive numbers of a flat float32 array, four times.
-broadcast_four_wide: Callable[[_Array, int], Lanes] = _function(
-    _broadcast_four(WIDE), _wide, None, types.intp
+broadcast_four_wide: Callable[[_Array, int], Lanes] = emitted(
+    _broadcast_four(WIDE), SIXTEEN, None, types.intp
 )
 #: Returns the lanes of two vectors of eight, one vector after the other.
-joined: Callable[[Lanes, Lanes], Lanes] = _function(
-    lambda at, a, b: _shuffle(at, a, b, range(WIDE)), _wide, _eight, _eight
+joined: Callable[[Lanes, Lanes], Lanes] = emitted(
+    lambda at, a, b: shuffled(at, a, b, range(WIDE)), SIXTEEN, _eight, _eight
 )
 #: Returns the first eight of sixteen lanes.
-first_half: Callable[[Lanes], Lanes] = _function(
-    lambda at, a: _shuffle(at, a, a, range(LANES)), _eight, _wide
+first_half: Callable[[Lanes], Lanes] = emitted(
+    lambda at, a: shuffled(at, a, a, range(LANES)), _eight, SIXTEEN
 )
 #: Returns the last eight of sixteen lanes.
-last_half: Callable[[Lanes], Lanes] = _function(
-    lambda at, a: _shuffle(at, a, a, range(LANES, WIDE)), _eight, _wide
+last_half: Callable[[Lanes], Lanes] = emitted(
+    lambda at, a: shuffled(at, a, a, range(LANES, WIDE)), _eight, SIXTEEN
 )
 #: Returns the first eight of sixteen lanes plus the last eight.
-halves_added: Callable[[Lanes], Lanes] = _function(_halves_added, _eight, _wide)
+halves_added: Callable[[Lanes], Lanes] = emitted(_halves_added, _eight, SIXTEEN)
 #: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
 #: vectors, from a flat index on.
-load_triples: Callable[[_Array, int], _Three] = _function(_load_triples, _triple, None, types.intp)
+load_triples: Callable[[_Array, int], _Three] = emitted(_load_triples, _triple, None, types.intp)
 #: Writes eight consecutive triples likewise.
-store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = _function(
+store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = emitted(
     _store_triples, types.void, None, types.intp, _eight, _eight, _eight
 )
 #: Writes consecutive numbers to a flat float32 array, from an index on.
-store: Callable[[_Array, int, Lanes], None] = _function(
-    _store, types.void, None, types.intp, _lanes
-)
+store: Callable[[_Array, int, Lanes], None] = emitted(_store, types.void, None, types.intp, _lanes)
 #: Asks for the cache line of an element of a contiguous array (a flat index) to be brought near.
-prefetch: Callable[[_Array, int], None] = _function(
+prefetch: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=0), types.void, None, types.intp
 )
 #: As `prefetch`, for an element that will be written.
-prefetch_write: Callable[[_Array, int], None] = _function(
+prefetch_write: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
 )
 #: Returns a b + c, rounded once where the machine can.
-fma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
+fma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(
     _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
 #: Returns c - a b, rounded once where the machine can.
-fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = _function(
-    _negated_fma, _lanes, _lanes, _lanes, _lanes
-)
+fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(_negated_fma, _lanes, _lanes, _lanes, _lanes)
 #: Returns the square roots.
-square_root: Callable[[Lanes], Lanes] = _function(_llvm("llvm.sqrt"), _lanes, _lanes)
+square_root: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.sqrt"), _lanes, _lanes)
 #: Returns the smallest whole numbers that are not smaller.
-round_up: Callable[[Lanes], Lanes] = _function(_llvm("llvm.ceil"), _lanes, _lanes)
+round_up: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.ceil"), _lanes, _lanes)
 #: Returns the largest whole numbers that are not larger.
-round_down: Callable[[Lanes], Lanes] = _function(_llvm("llvm.floor"), _lanes, _lanes)
+round_down: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.floor"), _lanes, _lanes)
 #: Returns the absolute values.
-magnitude: Callable[[Lanes], Lanes] = _function(_llvm("llvm.fabs"), _lanes, _lanes)
+magnitude: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.fabs"), _lanes, _lanes)
 #: Returns minus the absolute values.
-as_negative: Callable[[Lanes], Lanes] = _function(_as_negative, _lanes, _lanes)
+as_negative: Callable[[Lanes], Lanes] = emitted(_as_negative, _lanes, _lanes)
 #: Returns the smaller of each two numbers, the second where they do not compare.
-smaller: Callable[[Lanes, Lanes], Lanes] = _function(_pick("<"), _lanes, _lanes, _lanes)
+smaller: Callable[[Lanes, Lanes], Lanes] = emitted(_pick("<"), _lanes, _lanes, _lanes)
 #: Returns the larger of each two numbers, the second where they do not compare.
-larger: Callable[[Lanes, Lanes], Lanes] = _function(_pick(">"), _lanes, _lanes, _lanes)
+larger: Callable[[Lanes, Lanes], Lanes] = emitted(_pick(">"), _lanes, _lanes, _lanes)
 #: Returns the first number where the mask is true and the second elsewhere.
-where: Callable[[Mask, Lanes, Lanes], Lanes] = _function(
+where: Callable[[Mask, Lanes, Lanes], Lanes] = emitted(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
 )
-#: Returns the patches of 4 x 4 pixels reached in sixteen rows, given the first and the last pixel
-#: of each (none where these do not compare): in bit 16 r + c the patch of columns 4 c to 4 c + 3 of
-#: rows 4 r to 4 r + 3. Pixels are counted from 0 to 63; others are left out.
-reached_patches: Callable[[Lanes, Lanes], np.uint64] = _function(
-    _reached_patches, types.uint64, _wide, _wide
-)
 #: Returns the mask as a number, lane 0 in the lowest bit.
-bits: Callable[[Mask], np.uint64] = _function(_bits, types.uint64, _mask)
+bits: Callable[[Mask], np.uint64] = emitted(_bits, types.uint64, _mask)
 #: Returns the position of the lowest set bit, 64 for zero.
-lowest_bit: Callable[[np.uint64], int] = _function(
+lowest_bit: Callable[[np.uint64], int] = emitted(
     lambda at, number: _llvm("llvm.cttz.i64", _LONG)(at, number, ir.IntType(1)(0)),
     *(types.int64, types.uint64),
 )
 #: Returns the number of set bits.
-count_bits: Callable[[np.uint64], int] = _function(
+count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
 #: Returns value * 2**n where the second vector is n + 1.5 * 2**23: its lowest bits then hold n.
-scale_by_power: Callable[[Lanes, Lanes], Lanes] = _function(_scale_by_power, _lanes, _lanes, _lanes)
+scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
 #: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
-sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = _function(
+sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = emitted(
     _sums, _eight, *([_eight] * LANES)
 )
 #: Returns the sum over the lanes, added in pairs.
-total: Callable[[Lanes], np.float32] = _function(_total, types.float32, _eight)
+total: Callable[[Lanes], np.float32] = emitted(_total, types.float32, _eight)
+
+
+@strict_device
+def aligned(count: int) -> NDArray[np.float32]:
+    """Returns room for so many numbers that begins a cache line: no vector lies across two."""
+    room = np.empty(count + WIDE, np.float32)
+    shift = (-(room.ctypes.data // room.itemsize)) % WIDE
+    return room[shift : shift + count]

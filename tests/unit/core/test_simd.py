@@ -19,7 +19,6 @@ from crossgrad_core.numerics.simd import (
     load_triples,
     load_wide,
     picking,
-    reached_patches,
     splat,
     splat_wide,
     square_root,
@@ -48,11 +47,6 @@ def _parts(source, target):
     store(target, 3 * WIDE, last_half(both))
     store(target, 3 * WIDE + LANES, halves_added(load_wide(source, 0)))
     store(target, 4 * WIDE, turned(both, load_wide(source, 0)))
-
-
-@kernel
-def _reached(first, last):
-    return reached_patches(load_wide(first, 0), load_wide(last, 0))
 
 
 @kernel
@@ -94,21 +88,6 @@ def test_parts_of_vectors():
     expected = [*[3, 4, 5, 6] * 4, *[4, 5, 6, 7] * 2, *first, *second, *first, *second, *sums]
     both = [*first, *second, *range(WIDE)]
     assert target.tolist() == [*expected, *[both[place] for place in ORDER]]
-
-
-def test_reached_patches_are_those_with_a_pixel():
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        first = np.round(rng.normal(30, 30, WIDE)).astype(np.float32)
-        last = (first + np.round(rng.normal(6, 12, WIDE))).astype(np.float32)
-        wild = rng.random(WIDE) < 0.2
-        last[wild] = rng.choice(np.array([np.nan, np.inf, -np.inf, 1e30], np.float32), wild.sum())
-        expected = 0
-        for row in range(WIDE):
-            for x in range(64):
-                if first[row] <= x <= last[row]:
-                    expected |= 1 << (16 * (row // 4) + x // 4)
-        assert _reached(first, last) == expected
 
 
 @pytest.mark.parametrize("extreme", [0.0, 1e-40, 3e38, np.inf, np.nan])

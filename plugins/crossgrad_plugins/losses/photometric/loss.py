@@ -77,7 +77,8 @@ class _FusedLoss(torch.autograd.Function):
     @override
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream, None, None, None
+        scaled = gradient if float(upstream) == 1.0 else gradient * upstream
+        return scaled, None, None, None
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

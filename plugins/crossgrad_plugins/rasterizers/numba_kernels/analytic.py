@@ -28,7 +28,6 @@ from crossgrad_core.numerics.simd import (
     larger,
     magnitude,
     ramp_wide,
-    reached_patches,
     round_down,
     round_up,
     smaller,
@@ -52,6 +51,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.reach import reached_patches
 
 LINEAR, CUBIC = 1.6, 0.07
 #: Smallest standard deviation along a main axis, px.

@@ -18,6 +18,7 @@ from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
     Lanes,
+    aligned,
     broadcast,
     broadcast_four,
     broadcast_four_wide,
@@ -86,7 +87,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.patches import aligned, column_of, row_of
+from crossgrad_plugins.rasterizers.numba_kernels.patches import column_of, row_of
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
     DEPTHS,
     STATE,

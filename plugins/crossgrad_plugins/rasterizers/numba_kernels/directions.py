@@ -14,6 +14,7 @@ from crossgrad_core.numerics.simd import (
     WIDE,
     Lanes,
     Mask,
+    aligned,
     broadcast,
     first_half,
     fma,
@@ -47,7 +48,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.patches import aligned, column_of, row_of
+from crossgrad_plugins.rasterizers.numba_kernels.patches import column_of, row_of
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_gradients import mean_gradients
 from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import DEPTHS, start_tile
 

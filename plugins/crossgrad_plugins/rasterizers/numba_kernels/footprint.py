@@ -8,7 +8,6 @@ from crossgrad_core.numerics.simd import (
     fma,
     fnma,
     ramp_wide,
-    reached_patches,
     round_down,
     round_up,
     splat_wide,
@@ -30,6 +29,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_WHOLE,
     WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.reach import reached_patches
 
 #: Row buffer of one Gaussian: centre of each row, its largest exponent, its dy.
 ROW_CENTRE = 0

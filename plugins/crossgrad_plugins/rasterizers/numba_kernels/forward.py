@@ -8,6 +8,7 @@ from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
     Lanes,
+    aligned,
     as_negative,
     bits,
     broadcast,
@@ -71,7 +72,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_WIDTH,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.patches import (
-    aligned,
     column_of,
     four_rows,
     place_of,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     WIDE,
+    aligned,
     bits,
     broadcast_four_wide,
     broadcast_wide,
@@ -58,7 +59,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     TILE_WIDTH,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.patches import (
-    aligned,
     column_of,
     place_of,
     row_of,

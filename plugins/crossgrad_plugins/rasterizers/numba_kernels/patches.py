@@ -1,7 +1,4 @@
-"""A tile's patches: their lanes as rows of pixels and back, where they lie, and room for states."""
-
-import numpy as np
-from numpy.typing import NDArray
+"""A tile's patches: their lanes as rows of pixels and back, and where they lie."""
 
 from crossgrad_core.numerics.simd import (
     LANES,
@@ -57,11 +54,3 @@ def four_rows(left: Lanes, right: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Returns the four rows of eight pixels of two patches side by side."""
     above, below = _first_rows(left, right), _last_rows(left, right)
     return first_half(above), last_half(above), first_half(below), last_half(below)
-
-
-@device
-def aligned(count: int) -> NDArray[np.float32]:
-    """Returns room for so many numbers that begins a cache line: no vector lies across two."""
-    room = np.empty(count + WIDE, np.float32)
-    shift = (-(room.ctypes.data // room.itemsize)) % WIDE
-    return room[shift : shift + count]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel, part
 from crossgrad_core.numerics.jobs import Jobs, share, take
+from crossgrad_core.numerics.simd import aligned
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     BACK,
     CHANNELS,
@@ -109,7 +110,8 @@ def _all_tiles(
     tile = take(jobs)
     if tile >= down * across:
         return
-    scratch = np.zeros(SCRATCH, np.float32)
+    scratch = aligned(SCRATCH)
+    scratch[:] = np.float32(0.0)
     while tile < down * across:
         top, left = tile // across * rows, tile % across * columns
         box = (top, min(height, top + rows), left, min(width, left + columns))

@@ -3,7 +3,7 @@
 Rows are kept interleaved, [column * 3 + channel]: a step of one column is three floats.
 """
 
-from crossgrad_core.numerics.simd import LANES
+from crossgrad_core.numerics.simd import WIDE
 from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW
 
 TILE_ROWS = 64
@@ -14,8 +14,8 @@ CHANNELS = 3
 #: Floats of the columns that a window reaches beyond its centre.
 HALO = CHANNELS * RADIUS
 # Room for a tile with twice the halo on both sides, and for vectors that start before its end.
-_ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * LANES
-STRIDE = _ROOM - _ROOM % LANES
+_ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
+STRIDE = _ROOM + -_ROOM % WIDE
 
 #: Ring of s - centre.
 SUM = 0

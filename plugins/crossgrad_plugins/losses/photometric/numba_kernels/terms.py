@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import part, sum_kernel
-from crossgrad_core.numerics.simd import LANES, fma, fnma, load, splat, store, where
+from crossgrad_core.numerics.simd import WIDE, fma, fnma, load_wide, splat_wide, store, where
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     BACK,
     BY_DIFFERENCE_VARIANCE,
@@ -41,7 +41,7 @@ _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 @part
 def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
     """Sums s, s^2, d and d^2 down the columns, around a row and around the next one."""
-    for j in range(0, CHANNELS * (columns + 4 * RADIUS), LANES):
+    for j in range(0, CHANNELS * (columns + 4 * RADIUS), WIDE):
         values, squares, next_values, next_squares = down_with_squares(scratch, SUM + j, row)
         store(scratch, PARTIAL + j, values)
         store(scratch, PARTIAL + STRIDE + j, squares)
@@ -61,10 +61,10 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
     The row's sums down the columns begin at element `partial`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE
-    zero, one, two = splat(_ZERO), splat(_ONE), splat(_TWO)
-    twice_c1, twice_c2 = splat(_TWICE_C1), splat(_TWICE_C2)
-    for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
-        keep = load(scratch, KEEP + slot + HALO + j)
+    zero, one, two = splat_wide(_ZERO), splat_wide(_ONE), splat_wide(_TWO)
+    twice_c1, twice_c2 = splat_wide(_TWICE_C1), splat_wide(_TWICE_C2)
+    for j in range(0, CHANNELS * (columns + 2 * RADIUS), WIDE):
+        keep = load_wide(scratch, KEEP + slot + HALO + j)
         local_s = across(scratch, partial + j)
         local_d = across(scratch, partial + 2 * STRIDE + j)
         variance_s = fnma(local_s, local_s, across(scratch, partial + STRIDE + j))
@@ -72,8 +72,8 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         # Rounding may take a variance of nothing slightly below zero.
         variance_s = where(zero < variance_s, variance_s, zero) + twice_c2
         variance_d = where(zero < variance_d, variance_d, zero)
-        mean_s = local_s + load(scratch, CENTRE_SUM + j)
-        mean_d = local_d + load(scratch, CENTRE_DIFFERENCE + j)
+        mean_s = local_s + load_wide(scratch, CENTRE_SUM + j)
+        mean_d = local_d + load_wide(scratch, CENTRE_DIFFERENCE + j)
         bright = fma(mean_s, mean_s, twice_c1)
         dark = mean_d * mean_d
         over_mean = one / (bright + dark)
@@ -109,7 +109,7 @@ def clear_row(scratch: _Floats, row: int, columns: int) -> None:
 @part
 def sum_gradient_rows(scratch: _Floats, row: int, columns: int) -> None:
     """Sums a, b and c down the columns, around a row and around the next one."""
-    for j in range(0, CHANNELS * (columns + 2 * RADIUS), LANES):
+    for j in range(0, CHANNELS * (columns + 2 * RADIUS), WIDE):
         this, below = down(scratch, BY_MEAN + j, row)
         store(scratch, BACK + j, this)
         store(scratch, BACK + 3 * STRIDE + j, below)
@@ -135,17 +135,17 @@ def gradient_row(
     The row's sums down the columns begin at element `back`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE + 2 * HALO
-    zero, plus, weight = splat(_ZERO), splat(l1_weight), splat(ssim_weight)
+    zero, plus, weight = splat_wide(_ZERO), splat_wide(l1_weight), splat_wide(ssim_weight)
     minus = zero - plus
-    for j in range(0, CHANNELS * columns, LANES):
-        s = load(scratch, SUM + slot + j)
-        d = load(scratch, DIFFERENCE + slot + j)
-        difference = d + load(scratch, CENTRE_DIFFERENCE + j)
+    for j in range(0, CHANNELS * columns, WIDE):
+        s = load_wide(scratch, SUM + slot + j)
+        d = load_wide(scratch, DIFFERENCE + slot + j)
+        difference = d + load_wide(scratch, CENTRE_DIFFERENCE + j)
         ssim = across(scratch, back + j)
         ssim = fma(s, across(scratch, back + STRIDE + j), ssim)
         ssim = fma(d, across(scratch, back + 2 * STRIDE + j), ssim)
         l1 = where(zero < difference, plus, where(zero < zero - difference, minus, zero))
-        keep = load(scratch, KEEP + slot + j)
+        keep = load_wide(scratch, KEEP + slot + j)
         store(scratch, LINE + j, where(zero < keep, fnma(ssim, weight, l1), zero))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import device
-from crossgrad_core.numerics.simd import Lanes, fma, load, splat
+from crossgrad_core.numerics.simd import Lanes, fma, load_wide, splat_wide
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import CHANNELS, SLOTS, STRIDE
 from crossgrad_plugins.losses.photometric.reference import RADIUS, gaussian_window
 
@@ -17,23 +17,23 @@ _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in gaussian_window().numpy()
 @device
 def across(array: _Floats, start: int) -> Lanes:
     """Window sum over eleven columns, the first of them at element `start`."""
-    total = load(array, start + 5 * CHANNELS) * splat(_W5)
-    pair = load(array, start + 4 * CHANNELS) + load(array, start + 6 * CHANNELS)
-    total = fma(pair, splat(_W4), total)
-    pair = load(array, start + 3 * CHANNELS) + load(array, start + 7 * CHANNELS)
-    total = fma(pair, splat(_W3), total)
-    pair = load(array, start + 2 * CHANNELS) + load(array, start + 8 * CHANNELS)
-    total = fma(pair, splat(_W2), total)
-    pair = load(array, start + CHANNELS) + load(array, start + 9 * CHANNELS)
-    total = fma(pair, splat(_W1), total)
-    pair = load(array, start) + load(array, start + 10 * CHANNELS)
-    return fma(pair, splat(_W0), total)
+    total = load_wide(array, start + 5 * CHANNELS) * splat_wide(_W5)
+    pair = load_wide(array, start + 4 * CHANNELS) + load_wide(array, start + 6 * CHANNELS)
+    total = fma(pair, splat_wide(_W4), total)
+    pair = load_wide(array, start + 3 * CHANNELS) + load_wide(array, start + 7 * CHANNELS)
+    total = fma(pair, splat_wide(_W3), total)
+    pair = load_wide(array, start + 2 * CHANNELS) + load_wide(array, start + 8 * CHANNELS)
+    total = fma(pair, splat_wide(_W2), total)
+    pair = load_wide(array, start + CHANNELS) + load_wide(array, start + 9 * CHANNELS)
+    total = fma(pair, splat_wide(_W1), total)
+    pair = load_wide(array, start) + load_wide(array, start + 10 * CHANNELS)
+    return fma(pair, splat_wide(_W0), total)
 
 
 @device
 def _tap(ring: _Floats, start: int, row: int) -> Lanes:
     """Column `start` of a row of the ring."""
-    return load(ring, start + (row & _LAST) * STRIDE)
+    return load_wide(ring, start + (row & _LAST) * STRIDE)
 
 
 @device
@@ -61,12 +61,12 @@ def _sum(
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
     """Window sum of eleven rows."""
-    total = middle * splat(_W5)
-    total = fma(e + f, splat(_W4), total)
-    total = fma(d + g, splat(_W3), total)
-    total = fma(c + h, splat(_W2), total)
-    total = fma(b + i, splat(_W1), total)
-    return fma(a + j, splat(_W0), total)
+    total = middle * splat_wide(_W5)
+    total = fma(e + f, splat_wide(_W4), total)
+    total = fma(d + g, splat_wide(_W3), total)
+    total = fma(c + h, splat_wide(_W2), total)
+    total = fma(b + i, splat_wide(_W1), total)
+    return fma(a + j, splat_wide(_W0), total)
 
 
 @device
@@ -75,12 +75,12 @@ def _sum_squares(
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
     """Window sum of the squares of eleven rows."""
-    total = middle * middle * splat(_W5)
-    total = fma(fma(e, e, f * f), splat(_W4), total)
-    total = fma(fma(d, d, g * g), splat(_W3), total)
-    total = fma(fma(c, c, h * h), splat(_W2), total)
-    total = fma(fma(b, b, i * i), splat(_W1), total)
-    return fma(fma(a, a, j * j), splat(_W0), total)
+    total = middle * middle * splat_wide(_W5)
+    total = fma(fma(e, e, f * f), splat_wide(_W4), total)
+    total = fma(fma(d, d, g * g), splat_wide(_W3), total)
+    total = fma(fma(c, c, h * h), splat_wide(_W2), total)
+    total = fma(fma(b, b, i * i), splat_wide(_W1), total)
+    return fma(fma(a, a, j * j), splat_wide(_W0), total)
 
 
 @device
