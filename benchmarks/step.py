@@ -5,6 +5,10 @@ one step of Adam, that of the colours by rows: of those drawn, which are brought
 Each timed step follows one of another view, turned by `--turn`, so that some rows are behind.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
+        [--sh-every N]
+
+With `--sh-every N` the bands above the first learn in one of N steps, and figures are means over N
+steps: of the medians of steps of either kind.
 """
 
 import argparse
@@ -67,18 +71,24 @@ def camera_of(case: dict[str, np.ndarray], degrees: float) -> Camera:
 class Trainer:
     """Parameters and the state of their optimizer."""
 
-    def __init__(self, case: dict[str, np.ndarray], max_alpha: float) -> None:
+    def __init__(self, case: dict[str, np.ndarray], max_alpha: float, sh_every: int) -> None:
         self.parameters = parameters_of(case)
         self.backbone = Vanilla()
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
-        self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
+        schedule = replace(Schedule.for_run(30_000), sh_every=sh_every)
+        self.phase = Phase(STEP, training=True, schedule=schedule)
         self.state, self.late = AdamState(), Late()
         # Rates of zero keep the case the same from repetition to repetition at the same cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
-    def step(self, camera: Camera, photo: Tensor) -> Iterator[str]:
+    def step(self, camera: Camera, photo: Tensor, *, rests: bool) -> Iterator[str]:
         """Takes a step; yields the name of each of its parts when it is done."""
-        gaussians = self.backbone.decode(self.parameters, camera, self.phase)
+        resting = {name for b in self.backbone.trained_blocks() if b.rests for name in b.tensors}
+        tensors = {
+            name: tensor.detach() if rests and name in resting else tensor
+            for name, tensor in self.parameters.items()
+        }
+        gaussians = self.backbone.decode(tensors, camera, self.phase)
         demand = OnDemand(frozenset(self.backbone.passed_on), self._bring)
         gaussians = replace(gaussians, on_demand=demand)
         render = self.rasterizer.render(gaussians, camera, torch.zeros(3))
@@ -99,6 +109,8 @@ class Trainer:
         by_rows = {name: gradients.pop(name) for name in self.backbone.passed_on.values()}
         adam_step(self.parameters, gradients, self.state, self.rates)
         for name, gradient in by_rows.items():
+            if gradient is None:
+                continue
             param = self.parameters[name]
             step = counted(name, param, self.state, 0.0, Rule(), 1.0)
             self.late.step(name, param, gradient, self.state, step)
@@ -114,28 +126,37 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--max-alpha", type=float, default=0.999)
     parser.add_argument("--turn", type=float, default=30.0, help="degrees between the two views")
+    parser.add_argument("--sh-every", type=int, default=1, metavar="N")
     arguments = parser.parse_args()
     threads = configure_threads(arguments.threads)
     with np.load(arguments.case) as file:
         case = dict(file)
-    trainer = Trainer(case, arguments.max_alpha)
+    trainer = Trainer(case, arguments.max_alpha, arguments.sh_every)
     views = camera_of(case, arguments.turn), camera_of(case, 0.0)
     shape = (views[0].height, views[0].width, 3)
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
-    marks: dict[str, list[float]] = {"render": [], "loss": [], "backward": [], "adam": []}
-    for repetition in range(2 * (arguments.reps + 2)):
+    every = arguments.sh_every
+    parts = ("render", "loss", "backward", "adam")
+    # Steps in which all bands learn, and those in which the higher ones rest.
+    marks: list[dict[str, list[float]]] = [{name: [] for name in parts} for _ in range(2)]
+    for repetition in range(2 * (arguments.reps + 2) * min(every, 2)):
+        rests = every > 1 and repetition // 2 % 2 == 1
         start = perf_counter()
-        for name in trainer.step(views[repetition % 2], photo):
+        for name in trainer.step(views[repetition % 2], photo, rests=rests):
             end = perf_counter()
-            if repetition >= 4 and repetition % 2:  # the first ones compile and warm up
-                marks[name].append(end - start)
+            # The first ones compile and warm up.
+            if repetition >= 4 * min(every, 2) and repetition % 2:
+                marks[rests][name].append(end - start)
             start = perf_counter()
-    steps = [sum(parts) for parts in zip(*marks.values(), strict=True)]
+    shares = [(1 / every, marks[0])] + [(1 - 1 / every, marks[1])] * (every > 1)
+    each = {name: sum(share * median(kind[name]) for share, kind in shares) for name in parts}
+    whole = [(share, [sum(s) for s in zip(*kind.values(), strict=True)]) for share, kind in shares]
     result = {
         "benchmark": "step",
         "case": arguments.case.name,
-        "seconds": median(steps),
-        **{f"{name}_seconds": median(values) for name, values in marks.items()},
+        "seconds": sum(share * median(steps) for share, steps in whole),
+        **{f"{name}_seconds": seconds for name, seconds in each.items()},
+        "sh_every": every,
         "reps": arguments.reps,
         "threads": threads,
         "peak_mib": peak_mib(),

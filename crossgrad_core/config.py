@@ -190,6 +190,9 @@ class RunConfig(BaseModel):
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
+    sh_every: int | None = Field(
+        None, ge=1, description="SH bands above the first learn in one of so many steps"
+    )
     density_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(
             "all",

@@ -64,7 +64,8 @@ class Vanilla(Backbone):
         )
         if self.sh_degree == 0:
             return rows
-        rest = Block("f_rest", ("f_rest",), True, "appearance", LearningRate(self.lr_f_rest))
+        rate = LearningRate(self.lr_f_rest)
+        rest = Block("f_rest", ("f_rest",), True, "appearance", rate, rests=True)
         return (*rows, rest)
 
     def _means_lr(self) -> LearningRate:

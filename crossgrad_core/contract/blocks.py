@@ -47,6 +47,8 @@ class Block:
         kind: Geometry, appearance or neutral (for `group` granularity and per-block dispatch).
         lr: Learning rate of all its tensors; 0 freezes the block: its tensors get no gradient,
             may be of any type, and take part in topology edits and checkpoints only.
+        rests: Whether its tensors are details of the colour, such as spherical harmonics of higher
+            degrees, that need not learn in every step (`Schedule.sh_every`).
     """
 
     name: str
@@ -54,6 +56,7 @@ class Block:
     per_primitive: bool
     kind: BlockKind
     lr: LearningRate
+    rests: bool = False
 
     @property
     def frozen(self) -> bool:

@@ -83,6 +83,7 @@ class Schedule:
         anchors_every: Interval of anchor growing.
         coarse_until: Backbones that train from coarse to fine have all levels from here on.
         sh_from: SH degree at the first step.
+        sh_every: Blocks that may rest learn in one of so many steps.
         counting: What is counted.
         pace: K of every step.
         edits_before: Edits before `densify_from` in a run whose length followed the clock.
@@ -102,6 +103,7 @@ class Schedule:
     anchors_every: int
     coarse_until: int
     sh_from: int = 0
+    sh_every: int = 1
     counting: Counting = IN_STEPS
     pace: Pace = ONE_BY_ONE
     edits_before: int = 0
@@ -254,6 +256,15 @@ class Schedule:
         """Active spherical-harmonics degree at a step."""
         return min(maximum, self.sh_from + self.counted(step) // self.sh_interval)
 
+    def rests(self, step: int) -> bool:
+        """Whether blocks that may rest do not learn in this step.
+
+        They learn in one of each `sh_every` steps, as if drawn by lot: where samplers go through
+        photos or regimes by turns, none is left out.
+        """
+        turn, place = divmod(step - 1, self.sh_every)
+        return place != _mixed(turn) * self.sh_every >> 32
+
     def densifies(self, step: int) -> bool:
         """Whether density control edits the primitives after this step."""
         edit = self.next_edit(self.counted(step - 1))
@@ -276,6 +287,13 @@ class Schedule:
         if every is None or not self.reaches(step, every):
             return False
         return self.counted(step) // every * every < self.densify_until
+
+
+def _mixed(number: int) -> int:
+    """A number of 32 bits that looks drawn by lot (the finalizer of MurmurHash3)."""
+    number = (number ^ number >> 16) * 0x85EBCA6B % 2**32
+    number = (number ^ number >> 13) * 0xC2B2AE35 % 2**32
+    return number ^ number >> 16
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:

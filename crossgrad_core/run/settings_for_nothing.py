@@ -137,6 +137,10 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.fewest_edits and not setup.schedule.fewest_edits:
         why = "are published or have times that were set are not made to fit"
         yield "fewest_edits", f"edits that count steps, {why}"
+    learns_less = (config.sh_every or 1) > 1
+    if learns_less and not any(block.rests for block in setup.trained_blocks):
+        name = setup.selection.names["backbone"]
+        yield "sh_every", f"backbone {name} has no SH bands above the first"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

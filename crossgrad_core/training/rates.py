@@ -16,6 +16,9 @@ SHORTNESS: Final = 0.45
 #: ... and never more than this: what a run of some 1,000 steps has.
 MOST: Final = 4.5
 
+#: Blocks that learn in one of n steps have n to this power times their rate then.
+RESTED: Final = 0.5
+
 
 def factor_of(config: RunConfig, schedule: Schedule) -> float:
     """What all rates of the backbone are multiplied by, given how long the run is to be."""
@@ -38,8 +41,9 @@ def notes_on(config: RunConfig, schedule: Schedule) -> tuple[str, ...]:
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
     """Name of each trained tensor -> its learning rate in a step."""
+    every = setup.schedule.sh_every
     return {
-        name: rate_at(setup, block.lr, step)
+        name: rate_at(setup, block.lr, step) * (every**RESTED if block.rests else 1.0)
         for block in setup.trained_blocks
         for name in block.tensors
     }

@@ -70,7 +70,7 @@ def schedule_of(
         # They hold back growth, which the curve does, and with them goes what fills the far ground.
         schedule = replace(schedule, reset_every=None)
     edits = _given(config, _EDITS)
-    schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from")))
+    schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from", "sh_every")))
     # What the user sets stays, whatever the length.
     return replace(schedule, fewest_edits=0) if edits else schedule
 

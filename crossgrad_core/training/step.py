@@ -175,7 +175,9 @@ def _optimize(
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
-    found = {name: tidy(g) for name, g in gradients.items()}
+    # Terms of regularisation may pull at what rests, too.
+    resting = setup.resting(state.step)
+    found = {name: tidy(g) for name, g in gradients.items() if name not in resting}
     waiting = set(setup.by_rows.values())
     by_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
     whole = {name: dense(g) for name, g in found.items() if name not in by_rows}

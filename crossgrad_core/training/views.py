@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.contexts import (
     Draw,
     PixelContext,
@@ -283,11 +284,13 @@ def _compare(
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
     """What a view sees; rows of some tensors are brought up to date when they are drawn."""
     phase = setup.phase(state.step, training=True)
-    gaussians = setup.backbone.decode(state.tensors, camera, phase)
-    names = {f: n for f, n in setup.by_rows.items() if getattr(gaussians, f) is state.tensors[n]}
+    tensors = _learning(setup, state)
+    gaussians = setup.backbone.decode(tensors, camera, phase)
+    names = {f: n for f, n in setup.by_rows.items() if getattr(gaussians, f) is tensors[n]}
     if names.keys() != {f for f in setup.by_rows if getattr(gaussians, f) is not None}:
         # It is not handed over as it is after all, and was read too early.
-        return setup.backbone.decode(state.parameters, camera, phase)
+        state.settle()
+        return setup.backbone.decode(tensors, camera, phase)
     if not names or not is_native([state.tensors[name] for name in names.values()]):
         return gaussians
 
@@ -296,6 +299,14 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
             state.late.catch_up(name, state.tensors[name], state.moments, rows)
 
     return replace(gaussians, on_demand=OnDemand(frozenset(names), bring))
+
+
+def _learning(setup: Setup, state: TrainState) -> Parameters:
+    """The parameters as they lie in memory; those that rest in this step need no gradient."""
+    resting = setup.resting(state.step)
+    if not resting:
+        return state.tensors
+    return {name: t.detach() if name in resting else t for name, t in state.tensors.items()}
 
 
 def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:

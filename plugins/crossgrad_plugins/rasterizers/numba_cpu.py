@@ -169,6 +169,7 @@ class _Draw(torch.autograd.Function):
             _optional(v_depth),
             absolute=call.absolute,
             directions=call.directions,
+            harmonics=ctx.needs_input_grad[1 + _INPUTS.index("sh_rest")],
         )
         call.screen.mean_gradient = torch.from_numpy(found.centres)
         if found.absolute is not None:

@@ -44,6 +44,16 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
     assert Schedule.for_run(30_000).sh_degree(step) == degree
 
 
+@pytest.mark.parametrize("every", range(1, 20))
+def test_what_may_rest_learns_in_one_of_each_n_steps_and_with_all_turns_of_a_sampler(every):
+    schedule = replace(Schedule.for_run(100 * every), sh_every=every)
+    learns = np.array([not schedule.rests(step) for step in range(1, 100 * every + 1)])
+    assert (learns.reshape(100, every).sum(axis=1) == 1).all()
+    for turns in (2, 3, 4, 8):
+        counts = np.bincount(np.flatnonzero(learns) % turns, minlength=turns)
+        assert counts.min() >= 0.4 * counts.mean()
+
+
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
 @pytest.mark.parametrize("total", [400, 600, 900, 1200, 1201, 1202, 2000, 30_000, 45_000])
 def test_edits_are_counted_without_looking_at_every_step(total, mode):

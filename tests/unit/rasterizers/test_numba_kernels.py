@@ -319,6 +319,24 @@ def test_harmonics_gradients_equal_difference_quotients(degree):
         assert getattr(found, name)[index] == pytest.approx(expected, rel=2e-2, abs=2e-3)
 
 
+@pytest.mark.parametrize("rows", [frozenset(), frozenset({"sh_dc", "sh_rest"})], ids=len)
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_what_nobody_asks_the_harmonics_changes_no_other_gradient(degree, rows):
+    size = (40, 30)
+    dc, rest = harmonics(200, 3)
+    base = cloud(200, size, seed=6)
+    given = replace(base, colors=None, dc=dc, rest=rest, degree=degree, by_rows=rows)
+    frame = forward(
+        replace(given, bring=lambda _: None), camera(*size), BLACK, DrawOptions(max_alpha=0.999)
+    )
+    v_image = weights(size)[0]
+    whole, some = backward(frame, v_image), backward(frame, v_image, harmonics=False)
+    assert some.rest is None and whole.rest.any() == (degree > 0)
+    for name in ("means", "quats", "scales", "opacities", "dc", "centres"):
+        assert getattr(whole, name).any()
+        np.testing.assert_array_equal(getattr(some, name), getattr(whole, name))
+
+
 @kernel
 def _logarithms(values, found):
     for k in range(len(values)):

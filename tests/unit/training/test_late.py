@@ -254,6 +254,8 @@ def everything(state):
         ({"average": 0.5}, ()),
         ({}, (Decay,)),
         ({"views": 2}, (PerView,)),
+        ({"sh_every": 3}, (Decay,)),
+        ({"sh_every": 3, "operator": "pcgrad", "views": 2}, (PerView,)),
     ],
     ids=str,
 )
@@ -271,7 +273,9 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.parametrize("settings", [{}, {"operator": "pcgrad", "views": 2}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"operator": "pcgrad", "views": 2}, {"sh_every": 3}], ids=str
+)
 @pytest.mark.parametrize("stop", [6, 13, 14])
 def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
     tmp_path, monkeypatch, stop, settings

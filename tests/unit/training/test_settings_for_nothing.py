@@ -81,6 +81,8 @@ IDLE = [
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "adc", "prune_scale": 0.3}}, "densifier.prune_scale"),
     ({"densifier": {"name": "dc4gs", "reset_opacity": 0.3}}, "densifier.reset_opacity"),
+    ({"backbone": {"name": "scaffold"}, "sh_every": 2}, "sh_every"),
+    ({"backbone": {"name": "vanilla", "sh_degree": 0}, "sh_every": 2}, "sh_every"),
     (
         {"densifier": {"name": "absgrad", "criterion": "gsplat", "abs_threshold": 1e-3}},
         "densifier.abs_threshold",
@@ -151,6 +153,8 @@ AT_WORK = [
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"densifier": {"name": "none"}, "max_gaussians": 10},
     {"densifier": {"name": "adc", "prune_scale": 0.3}, "reset_every": 10},
+    {"backbone": {"name": "vanilla", "sh_degree": 1}, "sh_every": 2},
+    {"backbone": {"name": "scaffold"}, "sh_every": 1},
     {"max_gaussians": "auto", "growth": "curve"},
     {"densifier": {"name": "adc"}, "growth": "curve"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},

@@ -92,6 +92,7 @@ def backward(
     *,
     absolute: bool = False,
     directions: bool = False,
+    harmonics: bool = True,
 ) -> GaussianGradients:
     """Returns the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
 
@@ -102,6 +103,7 @@ def backward(
         v_depth: [H, W] or None.
         absolute: Whether to compute the absolute gradients of the projected means.
         directions: Whether to bin the directions of the pixels' gradients.
+        harmonics: Whether to compute the gradients of the harmonics of higher degrees.
     """
     gaussians, options, projected, lists = (
         frame.gaussians,
@@ -139,7 +141,7 @@ def backward(
         # On the way to harmonics nobody reads those of Gaussians that were not drawn.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
-        rest=_room(frame, "sh_rest", gaussians.rest),
+        rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,
         centres=np.zeros((count, 2), np.float32),
         absolute=np.zeros((count, 2), np.float32) if absolute else None,
         directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
@@ -168,7 +170,8 @@ def backward(
         gradients.centres,
         np.empty((0, 2), np.float32) if gradients.absolute is None else gradients.absolute,
     )
-    if gradients.dc is not None and gradients.rest is not None and gaussians.rest is not None:
+    if gradients.dc is not None and gaussians.rest is not None:
+        nothing = np.empty((0, *gaussians.rest.shape[1:]), np.float32)
         share(
             unshade,
             gaussians.degree,
@@ -180,9 +183,9 @@ def backward(
             projected.records,
             gradients.colors,
             gradients.dc,
-            gradients.rest,
+            nothing if gradients.rest is None else gradients.rest,
             gradients.means,
-            ("sh_dc" in gaussians.by_rows, "sh_rest" in gaussians.by_rows),
+            ("sh_dc" in gaussians.by_rows, "sh_rest" in gaussians.by_rows, harmonics),
         )
     return gradients
 

@@ -1,4 +1,4 @@
-"""View-dependent colour by real spherical harmonics up to degree 3 (signs and order of 3DGS)."""
+"""View-dependent colour by real spherical harmonics up to degree 3."""
 
 import math
 
@@ -6,7 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, take
-from crossgrad_core.numerics.simd import prefetch
+from crossgrad_core.numerics.simd import WIDE, aligned, prefetch
+from crossgrad_plugins.rasterizers.numba_kernels.basis import (
+    BASIS,
+    C0,
+    TABLE,
+    WAYS,
+    basis_of,
+    normalize,
+    pull_ways,
+    put_way,
+    turned,
+)
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
@@ -15,41 +26,18 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     RED,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.third_degree import (
-    BASIS,
     FLOATS,
     HIGHER,
     pull,
+    spread,
     sum_up,
 )
 
 #: Floats of a cache line.
 _LINE = 16
-#: Gaussians whose basis functions are worked out, and whose coefficients are brought near, before
-#: any of them is used; and what there is of each: direction and inverse distance.
-_BLOCK, _WAY = 32, 4
-
-_C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
-_C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
-_C2_XY = 1.0925484305920792  # sqrt(15 / (4 pi))
-_C2_ZZ = 0.31539156525252005  # sqrt(5 / (16 pi))
-_C2_XX = 0.5462742152960396  # sqrt(15 / (16 pi))
-_C3_XXX = 0.5900435899266435  # sqrt(35 / (32 pi))
-_C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
-_C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
-_C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
-_C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
-
-
-@device
-def _direction(
-    means: NDArray[np.float32], i: int, eye: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
-    """Returns the unit vector from the camera to Gaussian i, and the inverse distance."""
-    x = np.float64(means[i, 0]) - eye[0]
-    y = np.float64(means[i, 1]) - eye[1]
-    z = np.float64(means[i, 2]) - eye[2]
-    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
+#: Gaussians whose basis functions are worked out before any of them is used; coefficients are asked
+#: for so many ahead.
+_BLOCK = WIDE
 
 
 @device
@@ -61,64 +49,23 @@ def _bring_near(rest: NDArray[np.float32], i: int) -> None:
 
 
 @device
-def _basis(degree: int, x: float, y: float, z: float, bases: NDArray[np.float32], row: int) -> None:
-    """Writes the basis functions of degrees 0 to `degree` for a unit direction to bases[row:]."""
-    bases[row] = _C0
-    if degree < 1:
-        return
-    bases[row + 1] = -_C1 * y
-    bases[row + 2] = _C1 * z
-    bases[row + 3] = -_C1 * x
-    if degree < 2:
-        return
-    xx, yy, zz = x * x, y * y, z * z
-    bases[row + 4] = _C2_XY * x * y
-    bases[row + 5] = -_C2_XY * y * z
-    bases[row + 6] = _C2_ZZ * (2.0 * zz - xx - yy)
-    bases[row + 7] = -_C2_XY * x * z
-    bases[row + 8] = _C2_XX * (xx - yy)
-    if degree < 3:
-        return
-    bases[row + 9] = -_C3_XXX * y * (3.0 * xx - yy)
-    bases[row + 10] = _C3_XYZ * x * y * z
-    bases[row + 11] = -_C3_XZZ * y * (4.0 * zz - xx - yy)
-    bases[row + 12] = _C3_ZZZ * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-    bases[row + 13] = -_C3_XZZ * x * (4.0 * zz - xx - yy)
-    bases[row + 14] = _C3_XXZ * z * (xx - yy)
-    bases[row + 15] = -_C3_XXX * x * (xx - 3.0 * yy)
-
-
-@device
-def _direction_gradient(
-    degree: int, x: float, y: float, z: float, v: NDArray[np.float32], at: int
-) -> tuple[float, float, float]:
-    """Returns the gradient of sum(v * basis) by x, y and z, taken as independent.
-
-    Those of degree 1 and higher are v[at + 1] and so on.
-    """
-    if degree < 1:
-        return 0.0, 0.0, 0.0
-    v_x, v_y, v_z = -_C1 * v[at + 3], -_C1 * v[at + 1], _C1 * v[at + 2]
-    if degree < 2:
-        return v_x, v_y, v_z
-    a, b, c = _C2_XY * v[at + 4], -_C2_XY * v[at + 5], -_C2_XY * v[at + 7]
-    d, e = 2.0 * _C2_XX * v[at + 8], 2.0 * _C2_ZZ * v[at + 6]
-    v_x += a * y + c * z + d * x - e * x
-    v_y += a * x + b * z - d * y - e * y
-    v_z += b * y + c * x + 2.0 * e * z
-    if degree < 3:
-        return v_x, v_y, v_z
-    xx, yy, zz = x * x, y * y, z * z
-    f, g, h = -_C3_XXX * v[at + 9], _C3_XYZ * v[at + 10], -_C3_XZZ * v[at + 11]
-    k, m, n = _C3_ZZZ * v[at + 12], -_C3_XZZ * v[at + 13], _C3_XXZ * v[at + 14]
-    p = -_C3_XXX * v[at + 15]
-    v_x += f * 6.0 * x * y + g * y * z - h * 2.0 * x * y - k * 6.0 * x * z
-    v_x += m * (4.0 * zz - 3.0 * xx - yy) + n * 2.0 * x * z + p * 3.0 * (xx - yy)
-    v_y += f * 3.0 * (xx - yy) + g * x * z + h * (4.0 * zz - xx - 3.0 * yy) - k * 6.0 * y * z
-    v_y += -m * 2.0 * x * y - n * 2.0 * y * z - p * 6.0 * x * y
-    v_z += g * x * y + h * 8.0 * y * z + k * (6.0 * zz - 3.0 * xx - 3.0 * yy)
-    v_z += m * 8.0 * x * z + n * (xx - yy)
-    return v_x, v_y, v_z
+def _look(
+    degree: int,
+    eye: NDArray[np.float64],
+    means: NDArray[np.float32],
+    owners: NDArray[np.int32],
+    first: int,
+    last: int,
+    ways: NDArray[np.float64],
+    table: NDArray[np.float32],
+    bases: NDArray[np.float32],
+) -> None:
+    """Writes unit vectors and inverse distances of a block, and a row of basis functions each."""
+    for j in range(last - first):
+        put_way(means, np.intp(owners[first + j]), eye, ways, j)
+    normalize(ways)
+    basis_of(degree, ways, table)
+    turned(table, bases)
 
 
 @kernel
@@ -150,19 +97,17 @@ def shade(
     """
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
-    bases = np.zeros(_BLOCK * BASIS, np.float32)
-    colours = np.empty(_BLOCK * BASIS, np.float32)
+    ways, table = np.ones(WAYS, np.float64), aligned(TABLE)
+    bases, colours = aligned(TABLE), aligned(TABLE)
+    table[:] = np.float32(0.0)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
         end = chunk * CHUNK + drawn[chunk]
         for first in range(chunk * CHUNK, end, _BLOCK):
             last = min(first + _BLOCK, end)
+            _look(degree, eye, means, owners, first, last, ways, table, bases)
             for j in range(first, last):
-                i = np.intp(owners[j])
-                _bring_near(rest, i)
-                x, y, z, _ = _direction(means, i, eye)
-                _basis(degree, x, y, z, bases, (j - first) * BASIS)
-            for j in range(first, last):
+                _bring_near(rest, np.intp(owners[min(j + _BLOCK, end - 1)]))
                 i, row = np.intp(owners[j]), (j - first) * BASIS
                 if whole:
                     sum_up(bases, row, rest, i * FLOATS, colours)
@@ -174,7 +119,7 @@ def shade(
             for j in range(first, last):
                 i, row = np.intp(owners[j]), (j - first) * BASIS
                 for channel in range(3):
-                    colour = 0.5 + _C0 * np.float64(dc[i, 0, channel])
+                    colour = 0.5 + C0 * np.float64(dc[i, 0, channel])
                     colour += np.float64(colours[row + channel])
                     if not math.isfinite(colour):
                         # Reaches no pixel.
@@ -198,7 +143,7 @@ def unshade(
     v_dc: NDArray[np.float32],
     v_rest: NDArray[np.float32],
     v_means: NDArray[np.float32],
-    rows: tuple[bool, bool],
+    wanted: tuple[bool, bool, bool],
 ) -> None:
     """Carries gradients of the colours on to coefficients and centres.
 
@@ -215,27 +160,24 @@ def unshade(
         v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
         v_rest: [N, B - 1, 3] likewise, active degrees only.
         v_means: [N, 3] added to.
-        rows: Whether `v_dc` and `v_rest` have a row for each record instead, in their order; such
-            rows are written whole, and need not be zero before.
+        wanted: Whether `v_dc` and `v_rest` have a row for each record instead, in their order (such
+            rows are written whole, and need not be zero before), and whether `v_rest` is written.
     """
-    dc_by_rows, rest_by_rows = rows
+    dc_by_rows, rest_by_rows, learns = wanted
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
-    bases = np.zeros(_BLOCK * BASIS, np.float32)
-    pulls = np.zeros(_BLOCK * BASIS, np.float32)
-    v_bases = np.zeros(_BLOCK * BASIS, np.float32)
-    ways = np.empty(_BLOCK * _WAY, np.float64)
+    ways, table = np.ones(WAYS, np.float64), aligned(TABLE)
+    bases, pulls, v_bases = aligned(TABLE), aligned(TABLE), aligned(TABLE)
+    table[:] = pulls[:] = v_bases[:] = np.float32(0.0)
     chunk = take(jobs)
     while chunk < drawn.shape[0]:
         before = drawn[:chunk].sum() - chunk * CHUNK
         end = chunk * CHUNK + drawn[chunk]
         for first in range(chunk * CHUNK, end, _BLOCK):
             last = min(first + _BLOCK, end)
+            _look(degree, eye, means, owners, first, last, ways, table, bases)
             for j in range(first, last):
-                i, row, way = np.intp(owners[j]), (j - first) * BASIS, (j - first) * _WAY
-                _bring_near(rest, i)
-                ways[way], ways[way + 1], ways[way + 2], ways[way + 3] = _direction(means, i, eye)
-                _basis(degree, ways[way], ways[way + 1], ways[way + 2], bases, row)
+                i, row = np.intp(owners[j]), (j - first) * BASIS
                 to_dc = before + j if dc_by_rows else i
                 seen = records[j * RECORD + LOG_OPACITY] > -math.inf
                 for channel in range(3):
@@ -243,30 +185,31 @@ def unshade(
                     free = seen and records[j * RECORD + RED + channel] > np.float32(0.0)
                     v = v_colors[i, channel] if free else np.float32(0.0)
                     pulls[row + channel] = v
-                    v_dc[to_dc, 0, channel] = _C0 * np.float64(v)
+                    v_dc[to_dc, 0, channel] = C0 * np.float64(v)
             for j in range(first, last):
+                _bring_near(rest, np.intp(owners[min(j + _BLOCK, end - 1)]))
                 i, row = np.intp(owners[j]), (j - first) * BASIS
                 to_rest = before + j if rest_by_rows else i
                 if whole:
-                    to = to_rest * FLOATS
-                    pull(bases, row, pulls, rest, i * FLOATS, v_rest, to, v_bases)
+                    if learns:
+                        spread(bases, row, pulls, v_rest, to_rest * FLOATS)
+                    pull(pulls, row, rest, i * FLOATS, v_bases)
                     continue
-                if rest_by_rows:
+                if learns and rest_by_rows:
                     v_rest[to_rest] = np.float32(0.0)
                 for k in range(1, count):
                     along = np.float32(0.0)
                     for channel in range(3):
-                        v_rest[to_rest, k - 1, channel] = pulls[row + channel] * bases[row + k]
+                        if learns:
+                            v_rest[to_rest, k - 1, channel] = pulls[row + channel] * bases[row + k]
                         along += pulls[row + channel] * rest[i, k - 1, channel]
                     v_bases[row + k - 1] = along
+            turned(v_bases, table)
+            pull_ways(degree, table, ways)
             for j in range(first, last):
                 if records[j * RECORD + LOG_OPACITY] == -math.inf:
                     continue
-                i, row, way = np.intp(owners[j]), (j - first) * BASIS, (j - first) * _WAY
-                x, y, z, inverse = ways[way], ways[way + 1], ways[way + 2], ways[way + 3]
-                v_x, v_y, v_z = _direction_gradient(degree, x, y, z, v_bases, row - 1)
-                along = x * v_x + y * v_y + z * v_z
-                v_means[i, 0] += (v_x - x * along) * inverse
-                v_means[i, 1] += (v_y - y * along) * inverse
-                v_means[i, 2] += (v_z - z * along) * inverse
+                i = np.intp(owners[j])
+                for axis in range(3):
+                    v_means[i, axis] += ways[j - first + axis * WIDE]
         chunk = take(jobs)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.simd import WIDE, fma, load_wide, picking, store
+from crossgrad_plugins.rasterizers.numba_kernels.basis import BASIS
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Basis functions of all degrees, those of the higher ones, and floats of their coefficients.
-BASIS = 16
+#: Basis functions of the higher degrees, and floats of their coefficients.
 HIGHER = BASIS - 1
 FLOATS = 3 * HIGHER
 
@@ -78,27 +78,21 @@ def sum_up(
 
 
 @device
-def pull(
+def spread(
     bases: NDArray[np.float32],
     row: int,
     pulls: NDArray[np.float32],
-    rest: NDArray[np.float32],
-    at: int,
     v_rest: NDArray[np.float32],
     to: int,
-    v_bases: NDArray[np.float32],
 ) -> None:
-    """Writes the gradients of the coefficients and of the basis functions of higher degrees.
+    """Writes the gradients of the coefficients.
 
     Args:
-        bases: As in `sum_up`, like `row`, `rest` and `at`.
+        bases: As in `sum_up`, like `row`.
         row: See `bases`.
         pulls: The gradients of the colour, from `row` on.
-        rest: Coefficients.
-        at: Where they begin.
         v_rest: Written from float `to` on.
         to: See `v_rest`.
-        v_bases: Written from `row` on: fifteen numbers, and one that does not count.
     """
     basis, three = load_wide(bases, row), load_wide(pulls, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
@@ -106,6 +100,27 @@ def pull(
     store(v_rest, to, _spread_first(basis, basis) * rgb)
     store(v_rest, to + _SECOND, _spread_second(basis, basis) * rgb)
     store(v_rest, to + _LAST, _spread_last(basis, basis) * rgb_last)
+
+
+@device
+def pull(
+    pulls: NDArray[np.float32],
+    row: int,
+    rest: NDArray[np.float32],
+    at: int,
+    v_bases: NDArray[np.float32],
+) -> None:
+    """Writes the gradients of the basis functions of higher degrees.
+
+    Args:
+        pulls: The gradients of the colour, from `row` on.
+        row: See `pulls`.
+        rest: Coefficients.
+        at: Where they begin.
+        v_bases: Written from `row` on: fifteen numbers, and one that does not count.
+    """
+    three = load_wide(pulls, row)
+    rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
     first = load_wide(rest, at) * rgb
     second = load_wide(rest, at + _SECOND) * rgb
     product = load_wide(rest, at + _LAST) * rgb_last

@@ -1,0 +1,169 @@
+"""Real spherical harmonics up to degree 3 of sixteen directions at once (signs and order of 3DGS).
+
+Loops over the directions without branches are vectorised by LLVM: each number of a direction has a
+row of sixteen. The kernels of coefficients want the numbers of one direction side by side instead,
+which is what `turned` is for.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.simd import WIDE, load_wide, picking, store
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+
+#: Numbers of sixteen directions: x, y, z and the inverse distance, each a row.
+WAYS = 4 * WIDE
+#: Basis functions of all degrees; numbers of those of sixteen directions.
+BASIS = 16
+TABLE = BASIS * WIDE
+
+_X, _Y, _Z, _INVERSE = 0, WIDE, 2 * WIDE, 3 * WIDE
+
+C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
+_C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
+_C2_XY = 1.0925484305920792  # sqrt(15 / (4 pi))
+_C2_ZZ = 0.31539156525252005  # sqrt(5 / (16 pi))
+_C2_XX = 0.5462742152960396  # sqrt(15 / (16 pi))
+_C3_XXX = 0.5900435899266435  # sqrt(35 / (32 pi))
+_C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
+_C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
+_C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
+_C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
+
+# Two rows change places in blocks of so many lanes: what becomes of the first and of the second.
+_first_1, _first_2, _first_4, _first_8 = (
+    picking([WIDE + lane - s if lane & s else lane for lane in range(WIDE)]) for s in (1, 2, 4, 8)
+)
+_second_1, _second_2, _second_4, _second_8 = (
+    picking([WIDE + lane if lane & s else lane + s for lane in range(WIDE)]) for s in (1, 2, 4, 8)
+)
+
+
+@device
+def put_way(
+    means: NDArray[np.float32], i: int, eye: NDArray[np.float64], ways: NDArray[np.float64], j: int
+) -> None:
+    """Writes the way from the camera to Gaussian i to number j of the rows of x, y and z."""
+    ways[j + _X] = np.float64(means[i, 0]) - eye[0]
+    ways[j + _Y] = np.float64(means[i, 1]) - eye[1]
+    ways[j + _Z] = np.float64(means[i, 2]) - eye[2]
+
+
+@device
+def normalize(ways: NDArray[np.float64]) -> None:
+    """Makes unit vectors of sixteen ways, and writes the inverse distances."""
+    for j in range(WIDE):
+        x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+        ways[j + _X], ways[j + _Y], ways[j + _Z] = x * inverse, y * inverse, z * inverse
+        ways[j + _INVERSE] = inverse
+
+
+@device
+def basis_of(degree: int, ways: NDArray[np.float64], table: NDArray[np.float32]) -> None:
+    """Writes the basis functions of degrees 0 to `degree` of sixteen unit vectors, a row each."""
+    for j in range(WIDE):
+        table[j] = C0
+    if degree < 1:
+        return
+    for j in range(WIDE):
+        x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
+        table[j + WIDE] = -_C1 * y
+        table[j + 2 * WIDE] = _C1 * z
+        table[j + 3 * WIDE] = -_C1 * x
+    if degree < 2:
+        return
+    for j in range(WIDE):
+        x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
+        xx, yy, zz = x * x, y * y, z * z
+        table[j + 4 * WIDE] = _C2_XY * x * y
+        table[j + 5 * WIDE] = -_C2_XY * y * z
+        table[j + 6 * WIDE] = _C2_ZZ * (2.0 * zz - xx - yy)
+        table[j + 7 * WIDE] = -_C2_XY * x * z
+        table[j + 8 * WIDE] = _C2_XX * (xx - yy)
+    if degree < 3:
+        return
+    for j in range(WIDE):
+        x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
+        xx, yy, zz = x * x, y * y, z * z
+        table[j + 9 * WIDE] = -_C3_XXX * y * (3.0 * xx - yy)
+        table[j + 10 * WIDE] = _C3_XYZ * x * y * z
+        table[j + 11 * WIDE] = -_C3_XZZ * y * (4.0 * zz - xx - yy)
+        table[j + 12 * WIDE] = _C3_ZZZ * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+        table[j + 13 * WIDE] = -_C3_XZZ * x * (4.0 * zz - xx - yy)
+        table[j + 14 * WIDE] = _C3_XXZ * z * (xx - yy)
+        table[j + 15 * WIDE] = -_C3_XXX * x * (xx - 3.0 * yy)
+
+
+@device
+def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) -> None:
+    """Replaces sixteen unit vectors by the gradients of sum(v * basis) by their ways.
+
+    Args:
+        degree: Active degree.
+        v: Gradients of the basis functions of degree 1 and higher, a row each.
+        ways: From `normalize`; x, y and z are replaced.
+    """
+    for j in range(WIDE):
+        x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
+        # By x, y and z, taken as independent.
+        v_x = v_y = v_z = 0.0
+        if degree >= 1:
+            v_x, v_y, v_z = -_C1 * v[j + 2 * WIDE], -_C1 * v[j], _C1 * v[j + WIDE]
+        if degree >= 2:
+            a, b, c = _C2_XY * v[j + 3 * WIDE], -_C2_XY * v[j + 4 * WIDE], -_C2_XY * v[j + 6 * WIDE]
+            d, e = 2.0 * _C2_XX * v[j + 7 * WIDE], 2.0 * _C2_ZZ * v[j + 5 * WIDE]
+            v_x += a * y + c * z + d * x - e * x
+            v_y += a * x + b * z - d * y - e * y
+            v_z += b * y + c * x + 2.0 * e * z
+        if degree >= 3:
+            xx, yy, zz = x * x, y * y, z * z
+            f, g, h = (
+                -_C3_XXX * v[j + 8 * WIDE],
+                _C3_XYZ * v[j + 9 * WIDE],
+                -_C3_XZZ * v[j + 10 * WIDE],
+            )
+            k, m, n = (
+                _C3_ZZZ * v[j + 11 * WIDE],
+                -_C3_XZZ * v[j + 12 * WIDE],
+                _C3_XXZ * v[j + 13 * WIDE],
+            )
+            p = -_C3_XXX * v[j + 14 * WIDE]
+            v_x += f * 6.0 * x * y + g * y * z - h * 2.0 * x * y - k * 6.0 * x * z
+            v_x += m * (4.0 * zz - 3.0 * xx - yy) + n * 2.0 * x * z + p * 3.0 * (xx - yy)
+            v_y += (
+                f * 3.0 * (xx - yy) + g * x * z + h * (4.0 * zz - xx - 3.0 * yy) - k * 6.0 * y * z
+            )
+            v_y += -m * 2.0 * x * y - n * 2.0 * y * z - p * 6.0 * x * y
+            v_z += g * x * y + h * 8.0 * y * z + k * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+            v_z += m * 8.0 * x * z + n * (xx - yy)
+        along = x * v_x + y * v_y + z * v_z
+        inverse = ways[j + _INVERSE]
+        ways[j + _X] = (v_x - x * along) * inverse
+        ways[j + _Y] = (v_y - y * along) * inverse
+        ways[j + _Z] = (v_z - z * along) * inverse
+
+
+@device
+def turned(source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
+    """Writes sixteen rows of sixteen numbers as columns."""
+    for r in range(0, WIDE, 2):
+        a, b = load_wide(source, r * WIDE), load_wide(source, (r + 1) * WIDE)
+        store(target, r * WIDE, _first_1(a, b))
+        store(target, (r + 1) * WIDE, _second_1(a, b))
+    for group in range(0, WIDE, 4):
+        for r in range(group, group + 2):
+            a, b = load_wide(target, r * WIDE), load_wide(target, (r + 2) * WIDE)
+            store(target, r * WIDE, _first_2(a, b))
+            store(target, (r + 2) * WIDE, _second_2(a, b))
+    for group in range(0, WIDE, 8):
+        for r in range(group, group + 4):
+            a, b = load_wide(target, r * WIDE), load_wide(target, (r + 4) * WIDE)
+            store(target, r * WIDE, _first_4(a, b))
+            store(target, (r + 4) * WIDE, _second_4(a, b))
+    for r in range(8):
+        a, b = load_wide(target, r * WIDE), load_wide(target, (r + 8) * WIDE)
+        store(target, r * WIDE, _first_8(a, b))
+        store(target, (r + 8) * WIDE, _second_8(a, b))

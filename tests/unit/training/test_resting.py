@@ -1,0 +1,90 @@
+"""Tensors that learn in some steps only: `sh_every`."""
+
+import pytest
+import torch
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.contexts import Regularized
+from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.rates import rates_at
+from crossgrad_core.training.start import first_state
+
+STEPS, EVERY = 12, 3
+
+
+class Decay:
+    """Pulls at the higher bands in every step."""
+
+    @hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is not None:
+            return None
+        return Regularized(1e-3 * context.parameters["f_rest"].square().sum())
+
+
+def setup_of(backbone="vanilla", **settings):
+    options = {"sh_degree": 3} if backbone == "vanilla" else {}
+    given = {
+        "steps": STEPS,
+        "sh_from": 3,
+        "backbone": ComponentChoice.model_validate({"name": backbone, **options}),
+        "densifier": ComponentChoice(name="none"),
+        **settings,
+    }
+    return assemble(RunConfig(**given), sample_scene(), "none")
+
+
+def changes(setup):
+    """Name of each trained tensor -> the steps that changed it; and the state at the end."""
+    state = first_state(setup)
+    found = {name: [] for block in setup.trained_blocks for name in block.tensors}
+    for step in range(1, STEPS + 1):
+        before = {name: state.parameters[name].detach().clone() for name in found}
+        timed_step(setup, state)
+        for name, steps in found.items():
+            if not torch.equal(before[name], state.parameters[name]):
+                steps.append(step)
+    return found, state
+
+
+@pytest.mark.parametrize("plugins", [(), (Decay,)], ids=["alone", "with a term"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"views_per_step": 2},
+        {"views_per_step": 2, "operator": ComponentChoice(name="pcgrad")},
+        {"views_per_step": 2, "backward": "joint"},
+        {"rasterizer": ComponentChoice(name="torch")},
+        {"preset": "inria"},
+        {"backbone": "mip"},
+    ],
+    ids=str,
+)
+def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(settings, plugins):
+    setup = setup_of(sh_every=EVERY, **settings)
+    for plugin in plugins:
+        setup.manager.register(plugin())
+    found, state = changes(setup)
+    # In the published order the last step has none of the optimizer.
+    last = STEPS - (settings.get("preset") == "inria")
+    due = [step for step in range(1, last + 1) if not setup.schedule.rests(step)]
+    assert found.pop("f_rest") == due
+    assert state.adam.steps["f_rest"] == len(due)
+    assert all(steps == list(range(1, last + 1)) for steps in found.values())
+
+
+def test_without_the_setting_all_learn_in_every_step_at_their_own_rate():
+    plain, every = setup_of(sh_every=1), setup_of(sh_every=EVERY)
+    assert changes(plain)[0]["f_rest"] == list(range(1, STEPS + 1))
+    ours, theirs = rates_at(every, 1), rates_at(plain, 1)
+    assert ours.pop("f_rest") == pytest.approx(theirs.pop("f_rest") * EVERY**0.5)
+    assert ours == theirs
+
+
+def test_backbones_without_harmonics_are_not_concerned():
+    setup = setup_of("scaffold", sh_every=EVERY)
+    assert not any(setup.resting(step) for step in range(1, STEPS + 1))
