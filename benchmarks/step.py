@@ -71,12 +71,11 @@ def camera_of(case: dict[str, np.ndarray], degrees: float) -> Camera:
 class Trainer:
     """Parameters and the state of their optimizer."""
 
-    def __init__(self, case: dict[str, np.ndarray], max_alpha: float, sh_every: int) -> None:
+    def __init__(self, case: dict[str, np.ndarray], max_alpha: float) -> None:
         self.parameters = parameters_of(case)
         self.backbone = Vanilla()
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
-        schedule = replace(Schedule.for_run(30_000), sh_every=sh_every)
-        self.phase = Phase(STEP, training=True, schedule=schedule)
+        self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
         self.state, self.late = AdamState(), Late()
         # Rates of zero keep the case the same from repetition to repetition at the same cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
@@ -131,7 +130,7 @@ def main() -> None:
     threads = configure_threads(arguments.threads)
     with np.load(arguments.case) as file:
         case = dict(file)
-    trainer = Trainer(case, arguments.max_alpha, arguments.sh_every)
+    trainer = Trainer(case, arguments.max_alpha)
     views = camera_of(case, arguments.turn), camera_of(case, 0.0)
     shape = (views[0].height, views[0].width, 3)
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
@@ -140,7 +139,8 @@ def main() -> None:
     # Steps in which all bands learn, and those in which the higher ones rest.
     marks: list[dict[str, list[float]]] = [{name: [] for name in parts} for _ in range(2)]
     for repetition in range(2 * (arguments.reps + 2) * min(every, 2)):
-        rests = every > 1 and repetition // 2 % 2 == 1
+        # One that rests follows one of the other view that learns, whose rows are behind.
+        rests = every > 1 and repetition % 4 == 3
         start = perf_counter()
         for name in trainer.step(views[repetition % 2], photo, rests=rests):
             end = perf_counter()

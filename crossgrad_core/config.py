@@ -191,7 +191,7 @@ class RunConfig(BaseModel):
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
     sh_every: int | None = Field(
-        None, ge=1, description="SH bands above the first learn in one of so many steps"
+        None, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
     )
     density_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(

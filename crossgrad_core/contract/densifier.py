@@ -23,7 +23,8 @@ class Densifier(Component):
         tensors: Names of the parameter tensors that it needs a backbone to have.
         edits: Whether it ever edits the set of primitives.
         resets: Whether it resets opacities when the schedule says so.
-        reset_options: Its options that count only in runs with resets.
+        reset_options: Its options that count only in runs with resets; methods that inherit them
+            and read them in other runs, too, name others.
         observes: Whether it gathers statistics of the views that the steps render.
         budgeted: Whether a run that names no bound leads its growth along the curve to the budget
             of its length, which is one of Gaussians.

@@ -8,7 +8,8 @@ vectors of sixteen, which take half the instructions where registers are that wi
 each elsewhere; all other functions take either. Operations are never reordered, and `fma` fuses on
 every machine that can, so the same expression in two kernels gives the same bits.
 
-Everything below exists only inside compiled kernels; `Lanes` and `Mask` are annotations.
+Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. `emitted` and what
+it takes make more functions, for kernels that need lanes which no function here gives.
 """
 # ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and it fixes the arguments.
 
@@ -70,8 +71,8 @@ def _floats(width: int) -> ir.Type:
     return ir.VectorType(_FLOAT, width)
 
 
-def whole_numbers(a: Any) -> ir.Type:
-    """Whole numbers, as many as a vector of LLVM has."""
+def whole_type(a: Any) -> ir.Type:
+    """The type of as many whole numbers as a vector of LLVM has."""
     return ir.VectorType(_INT, a.type.count)
 
 
@@ -108,8 +109,8 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
     Args:
         emit: Emits its instructions, given the `Site` and the operands' LLVM values.
-        result: Numba type of the result; `_lanes` and `_mask` stand for a vector as wide as those
-            among the operands.
+        result: Numba type of the result, such as `SIXTEEN`; `_lanes` and `_mask` stand for a vector
+            as wide as those among the operands.
         operands: Numba types of the operands, likewise; None stands for any array.
     """
 
@@ -275,8 +276,8 @@ def _negated_fma(at: Site, a: Any, b: Any, c: Any) -> Any:
 
 
 def _as_negative(at: Site, a: Any) -> Any:
-    sign = ir.Constant(whole_numbers(a), [_SIGN_BIT] * a.type.count)
-    return at.builder.bitcast(at.builder.or_(at.builder.bitcast(a, whole_numbers(a)), sign), a.type)
+    sign = ir.Constant(whole_type(a), [_SIGN_BIT] * a.type.count)
+    return at.builder.bitcast(at.builder.or_(at.builder.bitcast(a, whole_type(a)), sign), a.type)
 
 
 def _pick(sign: str) -> Callable[..., Any]:
@@ -291,7 +292,7 @@ def _bits(at: Site, mask: Any) -> Any:
 
 
 def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
-    whole = whole_numbers(value)
+    whole = whole_type(value)
     places = ir.Constant(whole, [_MANTISSA_BITS] * value.type.count)
     exponent = at.builder.shl(at.builder.bitcast(shifted, whole), places)
     scaled = at.builder.add(at.builder.bitcast(value, whole), exponent)

@@ -41,6 +41,7 @@ from crossgrad_core.run.session import Session, totals
 from crossgrad_core.run.settings_for_nothing import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
+    without_resets,
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.scene.photo_check import check_photos, fits
@@ -235,7 +236,8 @@ def _within(setup: Setup, seconds: float) -> Setup:
     config = setup.config.model_copy(update={**update, **given})
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
-    return replace(setup, notes=(*setup.notes, note, *notes_on_length(setup)))
+    idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
+    return replace(setup, notes=(*setup.notes, note, *notes_on_length(setup), *idle))
 
 
 @contextmanager

@@ -175,8 +175,9 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # The degree that a run started with is written down; where it is not, it was 0.
+    # What a run began with is written down; where it is not, it was that of the first versions.
     stored["sh_from"] = stored.get("sh_from") or 0
+    stored["sh_every"] = stored.get("sh_every") or 1
     config = parsed({**stored, **settings})
     if "device" not in settings:
         _check_device(config.device, folder)

@@ -46,6 +46,7 @@ def resolved(setup: Setup) -> RunConfig:
             "views_per_step": selection.views.setting,
             "steps": None if config.seconds else config.steps or setup.schedule.total,
             "events": setup.schedule.counting.unit,
+            "sh_every": setup.schedule.sh_every,
             "final_decay": _final_decay(config, setup),
             "average": average_of(config),
             "growth": growth_of(setup),

@@ -106,13 +106,20 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    densifier = setup.densifier
-    if config.reset_every is not None and not densifier.resets:
+    if config.reset_every is not None and not setup.densifier.resets:
         yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
+    # A run that follows the clock notes it once its length is known.
+    if not (config.seconds or config.planned_seconds):
+        yield from without_resets(config, setup)
+
+
+def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """Options of the densifier that do nothing because opacities are not reset, each with why."""
     if config.densifier is None or setup.schedule.reset_every is not None:
         return
+    densifier, given = setup.densifier, config.densifier.options
     fields = type(densifier).model_fields
-    for option in sorted(densifier.reset_options & config.densifier.options.keys()):
+    for option in sorted(densifier.reset_options & given.keys()):
         if getattr(densifier, option) != fields[option].default:
             yield f"densifier.{option}", "the run has no opacity resets; --set reset_every=N"
 
@@ -140,7 +147,7 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     learns_less = (config.sh_every or 1) > 1
     if learns_less and not any(block.rests for block in setup.trained_blocks):
         name = setup.selection.names["backbone"]
-        yield "sh_every", f"backbone {name} has no SH bands above the first"
+        yield "sh_every", f"backbone {name} trains no SH bands above the first"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

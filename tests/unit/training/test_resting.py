@@ -1,16 +1,24 @@
 """Tensors that learn in some steps only: `sh_every`."""
 
+from dataclasses import replace
+from typing import ClassVar
+
 import pytest
 import torch
 
+from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.contexts import Regularized
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rates import rates_at
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.rasterizers import numba_cpu
+from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
+from crossgrad_plugins.rasterizers.numba_kernels import frame
 
 STEPS, EVERY = 12, 3
 
@@ -75,6 +83,55 @@ def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(setting
     assert found.pop("f_rest") == due
     assert state.adam.steps["f_rest"] == len(due)
     assert all(steps == list(range(1, last + 1)) for steps in found.values())
+
+
+def test_what_rests_is_handed_over_without_a_gradient_and_the_rasterizer_leaves_it_out(monkeypatch):
+    setup = setup_of(sh_every=EVERY, views_per_step=2)
+    due = [step for step in range(1, STEPS + 1) if not setup.schedule.rests(step)]
+    decoded, worked_out = [], []
+    decode = Vanilla.decode
+
+    def watched(self, parameters, camera, phase):
+        needs = {name for name, tensor in parameters.items() if tensor.requires_grad}
+        if phase.training:
+            decoded.append((phase.step, "f_rest" in needs, needs - {"f_rest"}))
+        return decode(self, parameters, camera, phase)
+
+    def backward(*args, harmonics, **options):
+        worked_out.append(harmonics)
+        return frame.backward(*args, harmonics=harmonics, **options)
+
+    monkeypatch.setattr(Vanilla, "decode", watched)
+    monkeypatch.setattr(numba_cpu, "backward", backward)
+    changes(setup)
+    others = {"means", "scales", "quats", "opacities", "f_dc"}
+    steps = [step for step in range(1, STEPS + 1) for _ in range(2)]
+    assert decoded == [(step, step in due, others) for step in steps]
+    assert worked_out == [step in due for step in steps]
+
+
+class Together(NumbaRasterizer):
+    """Draws the views of a step in one call."""
+
+    together: ClassVar[bool] = True
+
+    def render_views(self, views, backgrounds, outputs=frozenset()):
+        pairs = zip(views, backgrounds, strict=True)
+        return [self.render(*view, background, outputs) for view, background in pairs]
+
+
+def test_views_that_are_drawn_together_give_the_same_parameters():
+    apart = setup_of(sh_every=EVERY, views_per_step=2)
+    selection = replace(apart.selection, rasterizer=Together())
+    ours, theirs = changes(replace(apart, selection=selection)), changes(apart)
+    assert ours[0] == theirs[0]
+    for name, tensor in theirs[1].parameters.items():
+        torch.testing.assert_close(ours[1].parameters[name], tensor)
+
+
+def test_a_run_writes_down_in_which_steps_its_bands_learn():
+    assert resolved(setup_of(sh_every=EVERY)).sh_every == EVERY
+    assert resolved(setup_of()).sh_every == 1
 
 
 def test_without_the_setting_all_learn_in_every_step_at_their_own_rate():

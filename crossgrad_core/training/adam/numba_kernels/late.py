@@ -15,6 +15,7 @@ from crossgrad_core.numerics.jit import device, kernel
 from crossgrad_core.numerics.jobs import Jobs, take
 from crossgrad_core.numerics.simd import (
     LANES,
+    WIDE,
     Lanes,
     bits,
     broadcast,
@@ -22,6 +23,7 @@ from crossgrad_core.numerics.simd import (
     fnma,
     larger,
     load,
+    load_wide,
     magnitude,
     prefetch_write,
     splat,
@@ -43,6 +45,9 @@ NUMBERS = 7
 #: Rows that one task works on, and short rows that lie side by side for a step.
 _ROWS = 1024
 _GATHERED = 128
+#: Elements that a step with all rows gathers at a time, in whole cache lines (sixteen rows of any
+#: width): with what they move they stay in the first-level cache.
+_AT_ONCE = 768
 #: Long rows that are taken together where they follow one another.
 _SIDE_BY_SIDE = 16
 #: Elements of a cache line, and rows that memory is asked for ahead of time.
@@ -291,14 +296,14 @@ def update_all(
         exp_avg_sq: [N * width].
         numbers: Of the step, as in `fused`.
     """
-    count, wide = param.size // width, width >= LANES
-    pulls = np.empty(_GATHERED * width, np.float32)
+    count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
+    pulls = np.empty(together * width, np.float32)
     task = take(jobs)
     while task * _ROWS < count:
         end = min(count, (task + 1) * _ROWS)
         place = np.searchsorted(rows, task * _ROWS)
-        for first in range(task * _ROWS, end, _GATHERED):
-            stop = min(first + _GATHERED, end)
+        for first in range(task * _ROWS, end, together):
+            stop = min(first + together, end)
             a, b, begin = first * width, stop * width, place
             while place < rows.size and rows[place] < stop:
                 place += 1
@@ -307,15 +312,21 @@ def update_all(
                 update(param[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 continue
             pulls[: b - a] = _ZERO
-            for k in range(begin, place):
-                at, to = k * width, (np.intp(rows[k]) - first) * width
-                if wide:
-                    for i in range(0, width - LANES, LANES):
-                        store(pulls, to + i, load(grad, at + i))
-                    store(pulls, to + width - LANES, load(grad, at + width - LANES))
-                    continue
-                for i in range(width):
-                    pulls[to + i] = grad[at + i]
+            k = begin
+            while k < place:
+                # Rows that follow one another are copied in one go.
+                run = 1
+                while k + run < place and rows[k + run] - rows[k] == run:
+                    run += 1
+                at, to, size = k * width, (np.intp(rows[k]) - first) * width, run * width
+                for i in range(0, size - WIDE + 1, WIDE):
+                    store(pulls, to + i, load_wide(grad, at + i))
+                if size >= WIDE:
+                    store(pulls, to + size - WIDE, load_wide(grad, at + size - WIDE))
+                else:
+                    for i in range(size):
+                        pulls[to + i] = grad[at + i]
+                k += run
             if place > begin or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
         task = take(jobs)

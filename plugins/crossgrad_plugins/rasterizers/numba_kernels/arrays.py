@@ -163,7 +163,8 @@ class GaussianGradients:
         opacities: [N].
         colors: [N, 3] by the RGB drawn (after the clamp of harmonics).
         dc: [N, 1, 3] or [R, 1, 3], those of the rows drawn; None without harmonics.
-        rest: [N, B - 1, 3] or [R, B - 1, 3], None without harmonics.
+        rest: [N, B - 1, 3] or [R, B - 1, 3], None without harmonics or where nobody
+            asked for it.
         centres: [N, 2] by the projected mean, per pixel.
         absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
         directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`, None unless asked for.

@@ -15,8 +15,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
 #: Numbers of sixteen directions: x, y, z and the inverse distance, each a row.
 WAYS = 4 * WIDE
-#: Basis functions of all degrees; numbers of those of sixteen directions.
-BASIS = 16
+#: Basis functions of all degrees, as many as a vector has numbers; those of sixteen directions.
+BASIS = WIDE
 TABLE = BASIS * WIDE
 
 _X, _Y, _Z, _INVERSE = 0, WIDE, 2 * WIDE, 3 * WIDE

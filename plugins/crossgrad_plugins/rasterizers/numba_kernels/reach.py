@@ -15,16 +15,16 @@ from crossgrad_core.numerics.simd import (
     Site,
     emitted,
     shuffled,
-    whole_numbers,
+    whole_type,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.layout import COLUMNS, SIDE, TILE_WIDTH
 
+# How bits are shifted and joined below is for patches of 4 x 4 pixels and sixteen columns of them.
 _LAST = float(TILE_WIDTH - 1)
-_BITS_OF_SIDE = SIDE.bit_length() - 1
 
 
 def _reached_patches(at: Site, first: Any, last: Any) -> Any:
-    build, whole = at.builder, whole_numbers(first)
+    build, whole = at.builder, whole_type(first)
 
     def number(kind: ir.Type, value: float) -> Any:
         return ir.Constant(kind, [value] * WIDE)
@@ -37,9 +37,8 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
     high = build.select(build.fcmp_ordered("<", last, end), last, end)
     # Where nothing is inside there may be NaN, of which no whole number can be made.
-    places = number(whole, _BITS_OF_SIDE)
     columns = [
-        build.lshr(build.fptosi(build.select(inside, edge, zero), whole), places)
+        build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
         for edge in (low, high)
     ]
     run = build.sub(

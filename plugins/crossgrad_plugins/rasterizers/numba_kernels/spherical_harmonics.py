@@ -158,7 +158,7 @@ def unshade(
         records: Flat records.
         v_colors: [N, 3] gradients of the clamped colours.
         v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
-        v_rest: [N, B - 1, 3] likewise, active degrees only.
+        v_rest: [N, B - 1, 3] likewise, active degrees only; no rows where it is not written.
         v_means: [N, 3] added to.
         wanted: Whether `v_dc` and `v_rest` have a row for each record instead, in their order (such
             rows are written whole, and need not be zero before), and whether `v_rest` is written.
