@@ -101,6 +101,18 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
 
 
+def test_a_run_in_seconds_notes_options_of_resets_that_it_has_none_for(scene, tmp_path):
+    out, densifier = tmp_path / "run", {"name": "adc", "prune_scale": 0.3}
+    run(scene, out, seconds=60.0, max_views=9, densifier=densifier)
+    line = "densifier.prune_scale does nothing: the run has no opacity resets"
+    assert line in (out / "log.txt").read_text()
+    given = {"seconds": 60.0, "max_views": 9, "reset_every": 4, "densifier": densifier}
+    run(scene, tmp_path / "resets", **given)
+    assert line not in (tmp_path / "resets/log.txt").read_text()
+    again = {**read_config(out), "out": str(tmp_path / "again")}
+    assert app.run(again, verbosity=-1) == 0
+
+
 def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0

@@ -26,6 +26,7 @@ from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 from crossgrad_plugins.compare.terminal import lines_of
+from crossgrad_plugins.compare.words import counted
 
 #: Where a comparison goes by default, beside the runs.
 FOLDER: Final = "compare"
@@ -60,7 +61,8 @@ def compare(
     check_free(folder)
     progress.tell("reading runs")
     comparison = compared(read_runs(places, skip_broken=skip_broken), options)
-    progress.tell(f"drawing {len(comparison.runs)} runs of {len(comparison.arms)} arms")
+    runs, arms = counted(len(comparison.runs), "run"), counted(len(comparison.arms), "arm")
+    progress.tell(f"drawing {runs} of {arms}")
     views = worst_views(comparison)
     pictured, unreadable = with_pictures(comparison, views)
     figures = drawn_figures(comparison)

@@ -224,7 +224,7 @@ def machines(comparison: Comparison) -> list[str]:
             if of.get(key) is not None
         )
         found[text] = found.get(text, 0) + 1
-    return [f"{text} ({count} runs)" for text, count in found.items()]
+    return [f"{text} ({words.counted(count, 'run')})" for text, count in found.items()]
 
 
 def dark_variables() -> dict[str, str]:

@@ -82,8 +82,9 @@ def support(contrast: Contrast) -> str:
     interval = found.narrow if equivalent else found.wide
     level = "90 %" if equivalent else "95 %"
     parts = [f"{level} interval {interval_text(contrast, interval)}"] if found.pairs > 1 else []
-    parts.append(f"{contrast.ahead} of {_count(found.pairs, 'pair')} in favour of {contrast.first}")
-    parts.append(_count(found.scenes, "scene"))
+    pairs = counted(found.pairs, "pair")
+    parts.append(f"{contrast.ahead} of {pairs} in favour of {contrast.first}")
+    parts.append(counted(found.scenes, "scene"))
     if contrast.verdict is Verdict.INCONCLUSIVE:
         parts.append(needed_text(contrast))
     return ", ".join(parts)
@@ -221,5 +222,6 @@ def _margin(contrast: Contrast) -> str:
     return f"{contrast.quantity.margin:g} {contrast.quantity.unit}".rstrip()
 
 
-def _count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """So many of them, in words."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

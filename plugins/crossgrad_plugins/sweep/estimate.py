@@ -11,6 +11,11 @@ from crossgrad_plugins.sweep.records import Record
 BESIDES = 12.0
 
 
+def runs(count: int) -> str:
+    """So many runs, in words."""
+    return f"{count} run{'' if count == 1 else 's'}"
+
+
 @dataclass(frozen=True)
 class Estimate:
     """How long some runs take, one after another.
@@ -30,8 +35,8 @@ class Estimate:
         if not self.seconds:
             return "their time is known once one has finished" if self.unknown else "nothing to do"
         known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
-        runs = "run" if self.unknown == 1 else "runs"
-        others = f" and {self.unknown} {runs} of which nothing is known yet" if self.unknown else ""
+        unknown = f" and {runs(self.unknown)} of which nothing is known yet"
+        others = unknown if self.unknown else ""
         return known + others
 
 
