@@ -169,15 +169,11 @@ class Setup:
         passed_on = self.backbone.passed_on
         return {field: name for field, name in passed_on.items() if name in trained}
 
-    @cached_property
-    def _may_rest(self) -> frozenset[str]:
-        """The tensors that need not learn in every step."""
-        blocks = (block for block in self.trained_blocks if block.rests)
-        return frozenset(name for block in blocks for name in block.tensors)
-
     def resting(self, step: int) -> frozenset[str]:
         """The tensors that do not learn in a step."""
-        return self._may_rest if self.schedule.rests(step) else frozenset()
+        rest = self.schedule.rests(step)
+        blocks = (block for block in self.trained_blocks if block.rests and rest)
+        return frozenset(name for block in blocks for name in block.tensors)
 
     @cached_property
     def densify_first(self) -> bool:
