@@ -25,8 +25,8 @@ from _machine import code, facts
 STEP = Path(__file__).with_name("step.py")
 #: Name -> environment of a process.
 WAYS = {
-    "as it is": {},
-    "passive": {"OMP_WAIT_POLICY": "PASSIVE"},
+    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as the command has it
+    "OpenMP's own": {},
     "spin 1,000": {"GOMP_SPINCOUNT": "1000"},
     "spin 10,000": {"GOMP_SPINCOUNT": "10000"},
     "spin 100,000": {"GOMP_SPINCOUNT": "100000"},
