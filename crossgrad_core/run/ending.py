@@ -1,10 +1,11 @@
 """A run from its first step to its last file: whatever ends it, what there is gets kept."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
+from typing import Final
 
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
@@ -12,7 +13,8 @@ from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceb
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
-from crossgrad_core.run.results.summary import Status
+from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.training.budget import Length
@@ -21,6 +23,9 @@ from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
+
+#: A run that ends more decibels below its best evaluation says so; less may be noise.
+WORSE: Final = 0.3
 
 
 @dataclass(frozen=True)
@@ -187,9 +192,21 @@ def last_words(course: Course) -> list[str]:
     if ending.traced:
         lines.append(f"the traceback is in {folder / LOG}")
     lines += _kept(course)
-    if ending.status != "finished":
-        lines.append(resume_line(folder))
-    return lines
+    if ending.status == "finished":
+        return [*lines, *overdone(read_metrics(folder))]
+    return [*lines, resume_line(folder)]
+
+
+def overdone(rows: Sequence[Row]) -> list[str]:
+    """Says that a run ended below its best evaluation, where the difference is no noise."""
+    best, last = best_of(rows), rows[-1].get("psnr") if rows else None
+    if best is None or last is None or not best["psnr"] - last > WORSE:
+        return []
+    return [
+        f"the last evaluation is {best['psnr'] - last:.2f} dB below that of step {best['step']:g}, "
+        f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
+        "may be enough (--max-views N, or --plan auto)"
+    ]
 
 
 def resume_line(folder: Path) -> str:

@@ -70,6 +70,16 @@ def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
     assert [row["psnr"] for row in late] == [row["psnr"] for row in often[2:]]
 
 
+@pytest.mark.parametrize(("margin", "told"), [(-100.0, True), (100.0, False)])
+def test_a_run_says_where_it_was_better(scene, tmp_path, monkeypatch, capsys, margin, told):
+    monkeypatch.setattr("crossgrad_core.run.ending.WORSE", margin)
+    settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 4, "eval_every": 2}
+    assert app.run(settings, verbosity=0) == 0
+    line = "dB below that of step"
+    assert (line in capsys.readouterr().err) == told
+    assert (line in (tmp_path / "run/log.txt").read_text()) == told
+
+
 @pytest.mark.parametrize(
     ("views", "length", "steps", "drawn"),
     [(1, 13, 13, 13), (2, 13, 6, 12), ("1..2@0.5", 13, 8, 12), (3, 12, 4, 12)],

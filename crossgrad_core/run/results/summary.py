@@ -116,7 +116,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "scene": summary.scene,
         **asdict(summary.totals),
         **_metrics(summary.result),
-        "best": _best(summary.rows),
+        "best": best_of(summary.rows),
         "ply": None if summary.ply is None else dict(summary.ply),
         "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
         "seed": summary.config.get("seed"),
@@ -144,7 +144,7 @@ def _definitions(figures: Sequence[Figure]) -> dict[str, str]:
     return {**stated, "renders": RENDERS}
 
 
-def _best(rows: Sequence[Row]) -> dict[str, Any] | None:
+def best_of(rows: Sequence[Row]) -> dict[str, Any] | None:
     """Step, training seconds and PSNR of the evaluation with the highest PSNR."""
     scored = [(psnr, row) for row in rows if (psnr := row.get("psnr")) is not None]
     valid = [(psnr, row) for psnr, row in scored if not math.isnan(psnr)]

@@ -1,0 +1,29 @@
+"""A run that ends below its best evaluation says so, and what to do."""
+
+from math import nan
+
+import pytest
+
+from crossgrad_core.run.ending import WORSE, overdone
+
+
+def rows_of(*figures):
+    return [
+        {"step": 100 * k, "train_seconds": 12.4 * k, "psnr": psnr, "ssim": 0.5}
+        for k, psnr in enumerate(figures, 1)
+    ]
+
+
+def test_what_was_better_is_told_with_its_step_and_time():
+    (line,) = overdone(rows_of(18.0, 19.07, 18.12))
+    assert line.startswith("the last evaluation is 0.95 dB below that of step 200, 19.07 dB after ")
+    assert "25 s of training" in line and "--max-views" in line
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [(), (19.0,), (18.0, 19.0), (19.0, 19.0 - WORSE + 1e-9), (None, None), (19.0, None), (nan, 9.0),
+     (19.0, nan)],
+)  # fmt: skip
+def test_ends_at_the_best_or_near_it_and_ends_without_figures_are_no_news(figures):
+    assert overdone(rows_of(*figures)) == []
