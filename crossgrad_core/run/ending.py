@@ -203,7 +203,7 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     if best is None or last is None or not best["psnr"] - last > WORSE:
         return []
     return [
-        f"the last evaluation is {best['psnr'] - last:.2f} dB below that of step {best['step']:g}, "
+        f"the last evaluation is {best['psnr'] - last:.2f} dB below that of step {best['step']:.0f}, "
         f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
         "may be enough (--max-views N, or --plan auto)"
     ]
