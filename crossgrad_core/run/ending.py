@@ -202,8 +202,9 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     best, last = best_of(rows), rows[-1].get("psnr") if rows else None
     if best is None or last is None or not best["psnr"] - last > WORSE:
         return []
+    gap, step = best["psnr"] - last, best["step"]
     return [
-        f"the last evaluation is {best['psnr'] - last:.2f} dB below that of step {best['step']:.0f}, "
+        f"the last evaluation is {gap:.2f} dB below that of step {step:.0f}, "
         f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
         "may be enough (--max-views N, or --plan auto)"
     ]
