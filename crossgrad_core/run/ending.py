@@ -24,7 +24,8 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
 
-#: A run that ends more decibels below its best evaluation says so; less may be noise.
+#: A run that ends so many decibels below its best evaluation says so; where few photos are held out
+#: single evaluations differ by less all the time.
 WORSE: Final = 0.3
 
 
@@ -198,7 +199,7 @@ def last_words(course: Course) -> list[str]:
 
 
 def overdone(rows: Sequence[Row]) -> list[str]:
-    """Says that a run ended below its best evaluation, where the difference is no noise."""
+    """Says that a run ended more than `WORSE` decibels below its best evaluation."""
     best, last = best_of(rows), rows[-1].get("psnr") if rows else None
     if best is None or last is None or not best["psnr"] - last > WORSE:
         return []
