@@ -29,7 +29,7 @@ from crossgrad_core.system.terminal import is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder, check_new
-from crossgrad_core.wording import did_you_mean, listed, plural, sentences, singular
+from crossgrad_core.wording import count, did_you_mean, listed, plural, sentences, singular
 
 if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
@@ -87,6 +87,7 @@ __all__ = [
     "chosen",
     "clear_half_written",
     "configured",
+    "count",
     "counting_of",
     "did_you_mean",
     "disk_errors",

@@ -23,6 +23,11 @@ def plural(word: str) -> str:
     return f"{word}es" if word.endswith("ss") else f"{word}s"
 
 
+def count(number: int, noun: str) -> str:
+    """`1 photo`, `2 photos`."""
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
 def listed(names: Iterable[str]) -> str:
     """Names as `a, b, c`; `none` where there are none."""
     return ", ".join(names) or "none"

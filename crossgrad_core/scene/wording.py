@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from crossgrad_core.wording import showable
+from crossgrad_core.wording import count, showable
+
+__all__ = ["count", "megapixels", "name_some"]
 
 _SHOWN = 3
 
@@ -11,11 +13,6 @@ def name_some(names: Sequence[str]) -> str:
     """The first few of many names, and how many more there are."""
     shown = showable(", ".join(names[:_SHOWN]).replace("\n", r"\n"))
     return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-
-
-def count(number: int, noun: str) -> str:
-    """`1 photo`, `2 photos`."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def megapixels(pixels: int) -> str:

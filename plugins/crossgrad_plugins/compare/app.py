@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import Progress, table_bytes
+from crossgrad_core.commands import Progress, count, table_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
@@ -26,7 +26,6 @@ from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 from crossgrad_plugins.compare.terminal import lines_of
-from crossgrad_plugins.compare.words import counted
 
 #: Where a comparison goes by default, beside the runs.
 FOLDER: Final = "compare"
@@ -61,7 +60,7 @@ def compare(
     check_free(folder)
     progress.tell("reading runs")
     comparison = compared(read_runs(places, skip_broken=skip_broken), options)
-    runs, arms = counted(len(comparison.runs), "run"), counted(len(comparison.arms), "arm")
+    runs, arms = count(len(comparison.runs), "run"), count(len(comparison.arms), "arm")
     progress.tell(f"drawing {runs} of {arms}")
     views = worst_views(comparison)
     pictured, unreadable = with_pictures(comparison, views)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from crossgrad_core.commands import count
 from crossgrad_plugins.compare import words
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
@@ -224,7 +225,7 @@ def machines(comparison: Comparison) -> list[str]:
             if of.get(key) is not None
         )
         found[text] = found.get(text, 0) + 1
-    return [f"{text} ({words.counted(count, 'run')})" for text, count in found.items()]
+    return [f"{text} ({count(runs, 'run')})" for text, runs in found.items()]
 
 
 def dark_variables() -> dict[str, str]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isinf, isnan
 
+from crossgrad_core.commands import count
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
 from crossgrad_plugins.compare.cost import COSTS
@@ -82,9 +83,9 @@ def support(contrast: Contrast) -> str:
     interval = found.narrow if equivalent else found.wide
     level = "90 %" if equivalent else "95 %"
     parts = [f"{level} interval {interval_text(contrast, interval)}"] if found.pairs > 1 else []
-    pairs = counted(found.pairs, "pair")
+    pairs = count(found.pairs, "pair")
     parts.append(f"{contrast.ahead} of {pairs} in favour of {contrast.first}")
-    parts.append(counted(found.scenes, "scene"))
+    parts.append(count(found.scenes, "scene"))
     if contrast.verdict is Verdict.INCONCLUSIVE:
         parts.append(needed_text(contrast))
     return ", ".join(parts)
@@ -220,8 +221,3 @@ def _size(contrast: Contrast) -> str:
 
 def _margin(contrast: Contrast) -> str:
     return f"{contrast.quantity.margin:g} {contrast.quantity.unit}".rstrip()
-
-
-def counted(number: int, noun: str) -> str:
-    """So many of them, in words."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -10,6 +10,7 @@ from crossgrad_core.commands import (
     UserError,
     check_file,
     check_folder,
+    count,
     exit_code,
     finish,
     listed,
@@ -19,7 +20,7 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.engines import Work, engine
-from crossgrad_plugins.sweep.estimate import estimated, runs
+from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, with_scenes
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.machine import Machine, divided
@@ -190,11 +191,11 @@ class Sweep:
         failed = [each for each in found if each.state == "failed"]
         left = [each for each in found if each.state not in {"finished", "failed"}]
         done = len(found) - len(failed) - len(left)
-        _say([f"{done} of {runs(len(found))} finished, results in {self.layout.out}"])
+        _say([f"{done} of {count(len(found), 'run')} finished, results in {self.layout.out}"])
         _say(f"failed: {each.job.title} ({each.job.id}): {each.error}" for each in failed)
         if left:
             are, them = ("is", "it") if len(left) == 1 else ("are", "them")
-            _say([f"{runs(len(left))} {are} left; the same command goes on with {them}"])
+            _say([f"{count(len(left), 'run')} {are} left; the same command goes on with {them}"])
         if failed:
             _say([f"what they printed is in {self.layout.output('ID')}; the same command tries "
                   "them again"])  # fmt: skip
@@ -206,7 +207,7 @@ class Sweep:
         jobs = {job.id: job for job in self.plan.jobs}
         time = estimated([each.job for each in left], jobs, read_records(self.layout.records))
         return (
-            f"{runs(len(jobs))}, {len(jobs) - len(left)} finished, {len(left)} to do, "
+            f"{count(len(jobs), 'run')}, {len(jobs) - len(left)} finished, {len(left)} to do, "
             f"{self.at_a_time} at a time: {time.text(self.at_a_time)}"
         )
 

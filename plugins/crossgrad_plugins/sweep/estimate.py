@@ -4,16 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean
 
+from crossgrad_core.commands import count
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.records import Record
 
 #: Seconds of a run besides its training, where none has told: libraries, scene, results.
 BESIDES = 12.0
-
-
-def runs(count: int) -> str:
-    """So many runs, in words."""
-    return f"{count} run{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,7 @@ class Estimate:
         if not self.seconds:
             return "their time is known once one has finished" if self.unknown else "nothing to do"
         known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
-        unknown = f" and {runs(self.unknown)} of which nothing is known yet"
+        unknown = f" and {count(self.unknown, 'run')} of which nothing is known yet"
         others = unknown if self.unknown else ""
         return known + others
 
