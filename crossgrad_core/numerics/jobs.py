@@ -2,15 +2,18 @@
 
 A kernel takes jobs until there are none left,
 
-    job = take(jobs)
+    job = take(jobs, count)
     while job < count:
         ...
-        job = take(jobs)
+        job = take(jobs, count)
 
 and `share` calls it on all threads at once. Numba's own `prange` divides the work into equal runs
 beforehand and waits for every thread; with a busy or a slow core that takes longer than one thread
 alone. Here a helper that did not get to run in time is simply not needed any more, and threads that
 have nothing to do sleep.
+
+A thread begins with a run of jobs of its own and goes on with those that others have left: what it
+wrote in one kernel, which its core still has at hand, it reads in the next one.
 
 What a job computes must not depend on who does it; then no bit depends on the threads.
 """
@@ -18,7 +21,7 @@ What a job computes must not depend on who does it; then no bit depends on the t
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, Concatenate, ParamSpec, cast
@@ -30,31 +33,62 @@ from numba.core import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.jit import device
 from crossgrad_core.system.cores import current_core, keep_off
 
 P = ParamSpec("P")
 Jobs = NDArray[np.int64]
 
 
-def _take(typing: Any, jobs: Any) -> Any:
+def _add(typing: Any, jobs: Any, place: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        counter = context.make_array(signature.args[0])(context, builder, args[0]).data
+        first = context.make_array(signature.args[0])(context, builder, args[0]).data
+        counter = builder.gep(first, [args[1]])
         return builder.atomic_rmw("add", counter, ir.IntType(64)(1), "monotonic")
 
-    return types.int64(jobs), generate
+    return types.int64(jobs, types.intp), generate
 
 
-#: Returns the number of the next job, counted from 0 on over all threads; only in kernels.
-take = cast("Callable[[Jobs], int]", intrinsic(_take))
+#: Adds 1 to a number that threads share; returns what it was.
+_next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
+
+
+@device
+def take(jobs: Jobs, count: int) -> int:
+    """Returns the number of a job that nobody has taken, or `count`; only in kernels.
+
+    Args:
+        jobs: From `share`.
+        count: Number of jobs, the same whenever a kernel asks.
+    """
+    threads = jobs[0]
+    mine = jobs.shape[0] - 1 - threads
+    for k in range(threads):
+        owner = (mine + k) % threads
+        begin, end = owner * count // threads, (owner + 1) * count // threads
+        if begin + jobs[1 + owner] < end:
+            job: int = begin + _next(jobs, 1 + owner)
+            if job < end:
+                return job
+    return count
+
+
+def _jobs(threads: int) -> list[Jobs]:
+    """For each thread the number of threads and of the jobs taken of each one's run.
+
+    They lie in the same memory; a thread knows its own number from the length of what it has.
+    """
+    room = np.zeros(2 * threads, np.int64)
+    room[0] = threads
+    return [room[: 1 + threads + each] for each in range(threads)]
 
 
 def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
-    jobs = np.zeros(1, np.int64)
-    count = numba.get_num_threads() - 1
-    call = partial(kernel, jobs, *args, **kwargs)
-    helpers = _helpers(os.getpid()).ask(call, count) if count else ()
-    call()
+    own, *others = _jobs(numba.get_num_threads())
+    calls = [partial(kernel, jobs, *args, **kwargs) for jobs in others]
+    helpers = _helpers(os.getpid()).ask(calls) if calls else ()
+    kernel(own, *args, **kwargs)
     for helper in helpers:
         if not helper.cancel():
             helper.result()
@@ -70,16 +104,18 @@ class _Helpers:
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        self._pool = ThreadPoolExecutor(most, "crossgrad-kernels", self._begin)
+        # One of each thread: the same jobs are to go to the same core.
+        self._pools: list[ThreadPoolExecutor] = []
 
-    def ask(self, call: Callable[[], None], count: int) -> list[Future[None]]:
-        """Asks so many helpers to make a call."""
+    def ask(self, calls: Sequence[Callable[[], None]]) -> list[Future[None]]:
+        """Asks as many helpers to make a call each."""
         core = current_core()
         if core != self._core:
             self._core = core
             keep_off(core, self._threads)
-        return [self._pool.submit(call) for _ in range(count)]
+        while len(self._pools) < len(calls):
+            self._pools.append(ThreadPoolExecutor(1, "crossgrad-kernels", self._begin))
+        return [pool.submit(call) for pool, call in zip(self._pools, calls, strict=False)]
 
     def _begin(self) -> None:
         self._threads.append(threading.get_native_id())
@@ -94,4 +130,5 @@ def _helpers(process: int) -> _Helpers:
 
 def alone(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Calls a kernel on this thread only, for work too small to wake others for; the same bits."""
-    kernel(np.zeros(1, np.int64), *args, **kwargs)
+    (jobs,) = _jobs(1)
+    kernel(jobs, *args, **kwargs)

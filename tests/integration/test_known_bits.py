@@ -8,6 +8,8 @@ on any of them.
 import pytest
 from support import known_bits
 
+from crossgrad_core.numerics import jobs
+
 
 @pytest.fixture(scope="module")
 def reference():
@@ -21,6 +23,15 @@ def reference():
 @pytest.mark.parametrize("name", known_bits.CASES)
 def test_bits_are_the_known_ones(name, reference, tmp_path):
     assert known_bits.made(name, tmp_path) == reference[name]
+
+
+@pytest.mark.parametrize("name", ["vanilla", "scaffold", "exposure"])
+def test_bits_do_not_depend_on_who_does_which_job(name, monkeypatch, tmp_path):
+    usual = known_bits.made(name, tmp_path / "usual")
+    of_threads = jobs._jobs
+    # As if the last of three threads did all of them, from its own ones on.
+    monkeypatch.setattr(jobs, "_jobs", lambda _: of_threads(3)[2:])
+    assert known_bits.made(name, tmp_path / "turned") == usual
 
 
 def test_every_known_processor_has_all_cases():

@@ -141,11 +141,12 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
         partial: [C, K, K], zero; what `summed` adds up.
     """
     compact = np.empty(partial.shape[1:])
-    c = take(jobs)
-    while c < table.shape[0]:
+    chunks = table.shape[0]
+    c = take(jobs, chunks)
+    while c < chunks:
         t, start = table[c, 0], table[c, 1]
         _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
-        c = take(jobs)
+        c = take(jobs, chunks)
 
 
 @strict_device
@@ -183,8 +184,9 @@ def spread_gramian(
     """
     views = addresses.size
     dense, compact = np.empty(views * CHUNK, np.float32), np.empty((views, views))
-    c = take(jobs)
-    while c < partial.shape[0]:
+    chunks = partial.shape[0]
+    c = take(jobs, chunks)
+    while c < chunks:
         length = min(CHUNK, size - c * CHUNK)
         if _spread(addresses, rows, width, c * CHUNK, length, dense):
             places = np.zeros(views, np.int64)
@@ -194,7 +196,7 @@ def spread_gramian(
             _chunk_gramian(places, 0, length, compact, partial[c])
             # Numba frees an array after the last line that names it, even if its address is held.
             dense[0] = np.float32(0.0)
-        c = take(jobs)
+        c = take(jobs, chunks)
 
 
 @strict_device
@@ -360,12 +362,13 @@ def combine(
         sizes: [T].
         table: From `chunk_table`.
     """
-    c = take(jobs)
-    while c < table.shape[0]:
+    chunks = table.shape[0]
+    c = take(jobs, chunks)
+    while c < chunks:
         t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
-        c = take(jobs)
+        c = take(jobs, chunks)
 
 
 @strict_kernel

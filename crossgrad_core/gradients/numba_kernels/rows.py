@@ -46,10 +46,11 @@ def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None
         out: [N, K, K] float64, zero.
     """
     count = out.shape[0]
-    task = take(jobs)
-    while task * ROWS < count:
+    tasks = (count + ROWS - 1) // ROWS
+    task = take(jobs, tasks)
+    while task < tasks:
         _gramian_task(addresses, widths, task * ROWS, min(task * ROWS + ROWS, count), out)
-        task = take(jobs)
+        task = take(jobs, tasks)
 
 
 @strict_device
@@ -83,11 +84,12 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
         width: Elements per row.
     """
     count = weights.shape[0]
-    task = take(jobs)
-    while task * ROWS < count:
+    tasks = (count + ROWS - 1) // ROWS
+    task = take(jobs, tasks)
+    while task < tasks:
         end = min(task * ROWS + ROWS, count)
         _combine_task(addresses, weights, out, width, task * ROWS, end)
-        task = take(jobs)
+        task = take(jobs, tasks)
 
 
 @strict_kernel

@@ -1,9 +1,12 @@
 """Adam on named tensors, in place, without building an optimizer object."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.adam import adam
 
@@ -15,6 +18,9 @@ from crossgrad_core.training.adam.coefficients import (
     Coefficients,
     Rule,
 )
+
+#: A tensor, its gradient, its moments and its step.
+Update: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Coefficients]
 
 
 @torch.no_grad()
@@ -47,14 +53,15 @@ def adam_step(
     Source: Kingma and Ba 2015, algorithm 1.
     """
     _check(params, grads, rule.betas)
+    updates = []
     for name, param in params.items():
         grad = grads.get(name)
         if grad is None:
             continue
         scale = 1.0 if scales is None else scales[name]
         step = counted(name, param, state, lrs[name], rule, scale)
-        update = update_on_gpu if param.is_cuda else update_tensor
-        update(param, grad, state.exp_avg[name], state.exp_avg_sq[name], step)
+        updates.append((param, grad, state.exp_avg[name], state.exp_avg_sq[name], step))
+    update_tensors(updates)
 
 
 def counted(
@@ -78,22 +85,37 @@ def counted(
     return replace(_coefficients(state.steps[name], lr, rule), scale=scale)
 
 
-def update_tensor(
-    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
-) -> None:
-    """Applies one step to a tensor and its moments: fused on the CPU in float32, else by torch."""
-    tensors = (param, exp_avg, exp_avg_sq)
-    on_cpu = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, grad))
-    if on_cpu and all(t.is_contiguous() for t in tensors):
-        from crossgrad_core.training.adam.numba_kernels.fused import update_arrays
+def update_tensors(updates: Iterable[Update]) -> None:
+    """Applies one step to tensors and their moments: fused on the CPU in float32, else by torch."""
+    fused = []
+    for update in updates:
+        param, grad, exp_avg, exp_avg_sq, _ = update
+        tensors = (param, exp_avg, exp_avg_sq)
+        on_cpu = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, grad))
+        if on_cpu and all(t.is_contiguous() for t in tensors):
+            fused.append(update)
+        elif param.is_cuda:
+            update_on_gpu(*update)
+        else:
+            update_reference(*update)
+    if fused:
+        _update_fused(fused)
 
-        flat = [t.detach().view(-1).numpy() for t in tensors]
-        update_arrays(flat[0], grad.detach().contiguous().view(-1).numpy(), flat[1], flat[2], step)
-        # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
-        for tensor in tensors:  # Older versions of torch take one at a time.
+
+def _update_fused(updates: Sequence[Update]) -> None:
+    from crossgrad_core.training.adam.numba_kernels.fused import Arrays, update_arrays
+
+    def flat(tensor: Tensor) -> NDArray[np.float32]:
+        array: NDArray[np.float32] = tensor.detach().contiguous().view(-1).numpy()
+        return array
+
+    update_arrays(
+        [Arrays(flat(p), flat(g), flat(m), flat(v), step) for p, g, m, v, step in updates]
+    )
+    # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
+    for param, _, exp_avg, exp_avg_sq, _ in updates:
+        for tensor in (param, exp_avg, exp_avg_sq):  # Older versions of torch take one at a time.
             torch.autograd.graph.increment_version(tensor)
-    else:
-        update_reference(param, grad, exp_avg, exp_avg_sq, step)
 
 
 def update_on_gpu(

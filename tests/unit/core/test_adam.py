@@ -11,7 +11,7 @@ from crossgrad_core.training.adam.adam import (
     adam_step,
     update_on_gpu,
     update_reference,
-    update_tensor,
+    update_tensors,
 )
 from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients, Rule
 
@@ -78,7 +78,7 @@ def test_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
     ours = [param.clone(), 0.3 * past, (0.5 * past).square()]
     theirs = [tensor.clone() for tensor in ours]
     for step in range(1, 4):
-        update_tensor(ours[0], grad, ours[1], ours[2], coefficients(step))
+        update_tensors([(ours[0], grad, ours[1], ours[2], coefficients(step))])
         update_reference(theirs[0], grad, theirs[1], theirs[2], coefficients(step))
     for mine, reference, tolerance in zip(ours, theirs, (1e-8, 0, 0), strict=True):
         assert torch.isfinite(mine).all()
@@ -218,7 +218,7 @@ def test_what_nothing_has_moved_yet_stays_and_all_else_does_not(last):
         tensors[last][2**16 + at] = 0.25
         param = torch.linspace(-2.0, 2.0, len(longer))
         ours, theirs = ([param.clone(), *(t.clone() for t in tensors.values())] for _ in range(2))
-        update_tensor(ours[0], ours[1], ours[2], ours[3], rule)
+        update_tensors([(ours[0], ours[1], ours[2], ours[3], rule)])
         update_reference(theirs[0], theirs[1], theirs[2], theirs[3], rule)
         for mine, other in zip(ours, theirs, strict=True):
             torch.testing.assert_close(mine, other, rtol=1e-6, atol=0.0)
@@ -232,5 +232,5 @@ def test_not_a_number_is_not_left_out():
     grad = torch.zeros(2**17)
     grad[100_000] = torch.nan
     tensors = [torch.ones(2**17), torch.zeros(2**17), torch.zeros(2**17)]
-    update_tensor(tensors[0], grad, tensors[1], tensors[2], coefficients())
+    update_tensors([(tensors[0], grad, tensors[1], tensors[2], coefficients())])
     assert [int(t.isnan().sum()) for t in tensors] == [1, 1, 1]

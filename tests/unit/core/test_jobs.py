@@ -15,10 +15,10 @@ from crossgrad_core.system import cores
 
 @kernel
 def mark(numbers, marks):
-    job = jobs.take(numbers)
+    job = jobs.take(numbers, marks.shape[0])
     while job < marks.shape[0]:
         marks[job] += 1
-        job = jobs.take(numbers)
+        job = jobs.take(numbers, marks.shape[0])
 
 
 @pytest.fixture(params=[1, 2])
@@ -37,6 +37,32 @@ def test_every_job_is_done_once(threads, run, count):
     marks = np.zeros(count, np.int64)
     run(mark, marks)
     assert (marks == 1).all()
+
+
+@kernel
+def taken(numbers, count, most):
+    found = np.empty(most, np.int64)
+    for place in range(most):
+        found[place] = jobs.take(numbers, count)
+    return found
+
+
+def test_a_thread_takes_its_own_jobs_first_and_then_those_that_others_have_left():
+    first, second, third = jobs._jobs(3)
+    assert list(taken(second, 10, 2)) == [3, 4]
+    assert list(taken(third, 10, 5)) == [6, 7, 8, 9, 0]
+    assert list(taken(first, 10, 2)) == [1, 2]
+    assert list(taken(second, 10, 3)) == [5, 10, 10]
+    assert list(taken(first, 10, 1)) == list(taken(third, 10, 1)) == [10]
+
+
+@pytest.mark.parametrize(("threads", "count"), [(1, 7), (4, 0), (4, 3), (5, 64)])
+def test_threads_that_come_in_any_order_take_every_job_once(threads, count):
+    draw = np.random.default_rng(threads * 100 + count)
+    numbers = jobs._jobs(threads)
+    found = [taken(numbers[draw.integers(threads)], count, 1)[0] for _ in range(count)]
+    assert sorted(found) == list(range(count))
+    assert all(taken(each, count, 1)[0] == count for each in numbers)
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import pytest
 
+from crossgrad_core.numerics import jobs
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import share
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
@@ -405,6 +406,23 @@ def test_bits_depend_neither_on_the_number_of_threads_nor_on_the_run(threads):
         again, gradients_again = run()
     finally:
         numba.set_num_threads(before)
+    np.testing.assert_array_equal(frame.image, again.image)
+    np.testing.assert_array_equal(frame.pixels, again.pixels)
+    same_bits(gradients, gradients_again)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 17])
+def test_bits_do_not_depend_on_who_does_which_job(threads, monkeypatch):
+    size = (150, 90)
+    gaussians, v_image = cloud(6000, size), weights(size)[0]
+    found = []
+    of_threads = jobs._jobs
+    for first in (0, threads - 1):
+        # As if one of the threads did all of them, from its own ones on.
+        monkeypatch.setattr(jobs, "_jobs", lambda _, first=first: [of_threads(threads)[first]])
+        frame = drawn(gaussians, camera(*size), **EVERYTHING)
+        found.append((frame, backward(frame, v_image, absolute=True, directions=True)))
+    (frame, gradients), (again, gradients_again) = found
     np.testing.assert_array_equal(frame.image, again.image)
     np.testing.assert_array_equal(frame.pixels, again.pixels)
     same_bits(gradients, gradients_again)

@@ -80,8 +80,9 @@ def gather(
         out_colors: [G, 3] written, raw.
     """
     anchors, slots = len(covariances), opacities.shape[1]
-    part = take(jobs)
-    while part * SHARE < anchors:
+    parts = (anchors + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             g, p = starts[a], rows[a]
@@ -97,7 +98,7 @@ def gather(
                     for c in range(4):
                         out_quats[g, c] = covariances[n, COVARIANCE * j + 3 + c]
                     g += 1
-        part = take(jobs)
+        part = take(jobs, parts)
 
 
 @kernel
@@ -149,8 +150,9 @@ def scatter(
     """
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
-    part = take(jobs)
-    while part * SHARE < anchors:
+    parts = (anchors + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             p = rows[a]
@@ -171,7 +173,7 @@ def scatter(
                     raw[n, rgb + c] = v_colors[g, c] * color * (_ONE - color)
                 for c in range(4):
                     raw[n, cov + 3 + c] = v_quats[g, c]
-        part = take(jobs)
+        part = take(jobs, parts)
 
 
 @kernel
@@ -189,8 +191,9 @@ def scatter_scales(
     raw: _Floats,
 ) -> None:
     """As `scatter` where only the scales have a gradient; `raw` [n, 7 k] is by covariances."""
-    part = take(jobs)
-    while part * SHARE < anchors:
+    parts = (anchors + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
             p = rows[a]
@@ -201,4 +204,4 @@ def scatter_scales(
                     by_log = v_scales[g, c] * shares[g, c] * spreads[a, 3 + c]
                     out_log_scales[p, 3 + c] += by_log
                     raw[n, cov + c] = by_log * (_ONE - shares[g, c])
-        part = take(jobs)
+        part = take(jobs, parts)

@@ -39,8 +39,9 @@ def in_frustum(
         inside: [P] written.
     """
     count = len(positions)
-    part = take(jobs)
-    while part * SHARE < count:
+    parts = (count + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for p in range(part * SHARE, min(count, (part + 1) * SHARE)):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
             depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
@@ -64,4 +65,4 @@ def in_frustum(
                 extent = reach * math.sqrt(variance * ratio * ratio + dilation)
                 passes = place + extent >= axes[k, 4] and place - extent <= axes[k, 5]
             inside[p] = passes
-        part = take(jobs)
+        part = take(jobs, parts)

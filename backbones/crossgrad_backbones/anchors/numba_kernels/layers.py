@@ -21,15 +21,16 @@ _ZERO = np.float32(0)
 def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
     """Writes [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
-    part = take(jobs)
-    while part * SHARE < anchors:
+    parts = (anchors + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for a in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             row = rows[a]
             for c in range(feature):
                 out[a, c] = features[row, c]
             for c in range(view):
                 out[a, feature + c] = views[a, c]
-        part = take(jobs)
+        part = take(jobs, parts)
 
 
 @kernel
@@ -47,11 +48,12 @@ def rectify_back(
         gradient: [n or more, H or 3 H].
     """
     width = gradient.shape[1]
-    part = take(jobs)
-    while part * SHARE < anchors:
+    parts = (anchors + SHARE - 1) // SHARE
+    part = take(jobs, parts)
+    while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             mine = gradient[n]
             theirs = hidden[first + n, column : column + width]
             for c in range(width):
                 mine[c] = mine[c] if theirs[c] > _ZERO else _ZERO
-        part = take(jobs)
+        part = take(jobs, parts)

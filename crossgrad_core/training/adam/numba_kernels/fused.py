@@ -1,12 +1,16 @@
 """Adam's update of one float32 tensor in a single pass over memory (Numba, CPU)."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+from numba import carray
 from numpy.typing import NDArray
 
+from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, share, take
+from crossgrad_core.numerics.jobs import Jobs, alone, share, take
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
@@ -57,20 +61,37 @@ def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
 
 @kernel
 def _update_chunks(
-    jobs: Jobs,
-    param: _Floats,
-    grad: _Floats,
-    exp_avg: _Floats,
-    exp_avg_sq: _Floats,
-    numbers: Numbers,
+    jobs: Jobs, addresses: NDArray[np.int64], sizes: NDArray[np.int64], numbers: _Floats
 ) -> None:
-    chunk = take(jobs)
-    while chunk * _CHUNK < len(param):
-        for a in range(chunk * _CHUNK, min(len(param), (chunk + 1) * _CHUNK), _RUN):
-            b = min(len(param), a + _RUN)
+    """Updates tensors, chunk by chunk through all of them.
+
+    Args:
+        jobs: From `share`.
+        addresses: [T, 4] of each tensor's values, gradient and moments.
+        sizes: [T] elements.
+        numbers: [T, 9] of each tensor's step.
+    """
+    chunks = 0
+    for size in sizes:
+        chunks += (size + _CHUNK - 1) // _CHUNK
+    job = take(jobs, chunks)
+    while job < chunks:
+        tensor, chunk = 0, job
+        while chunk * _CHUNK >= sizes[tensor]:
+            chunk -= (sizes[tensor] + _CHUNK - 1) // _CHUNK
+            tensor += 1
+        size = sizes[tensor]
+        param = carray(float32_pointer(addresses[tensor, 0]), size)
+        grad = carray(float32_pointer(addresses[tensor, 1]), size)
+        exp_avg = carray(float32_pointer(addresses[tensor, 2]), size)
+        exp_avg_sq = carray(float32_pointer(addresses[tensor, 3]), size)
+        n = numbers[tensor]
+        of_step = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
+        for a in range(chunk * _CHUNK, min(size, (chunk + 1) * _CHUNK), _RUN):
+            b = min(size, a + _RUN)
             if moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
-                update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], numbers)
-        chunk = take(jobs)
+                update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], of_step)
+        job = take(jobs, chunks)
 
 
 def numbers_of(step: Coefficients) -> Numbers:
@@ -88,17 +109,23 @@ def numbers_of(step: Coefficients) -> Numbers:
     )
 
 
-def update_arrays(
-    param: NDArray[np.float32],
-    grad: NDArray[np.float32],
-    exp_avg: NDArray[np.float32],
-    exp_avg_sq: NDArray[np.float32],
-    step: Coefficients,
-) -> None:
-    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
-    numbers = numbers_of(step)
+@dataclass(frozen=True)
+class Arrays:
+    """A tensor's values, its gradient, its moments, all flat and of one length, and its step."""
+
+    param: NDArray[np.float32]
+    grad: NDArray[np.float32]
+    exp_avg: NDArray[np.float32]
+    exp_avg_sq: NDArray[np.float32]
+    step: Coefficients
+
+
+def update_arrays(updates: Sequence[Arrays]) -> None:
+    """Applies a step to each tensor, in place on `param`, `exp_avg` and `exp_avg_sq`."""
+    arrays = [(each.param, each.grad, each.exp_avg, each.exp_avg_sq) for each in updates]
+    addresses = np.array([[one.ctypes.data for one in four] for four in arrays], np.int64)
+    sizes = np.array([each.param.size for each in updates], np.int64)
+    numbers = np.array([numbers_of(each.step) for each in updates], np.float32)
     # A single chunk is not worth waking other threads for.
-    if len(param) <= _CHUNK:
-        update(param, grad, exp_avg, exp_avg_sq, numbers)
-    else:
-        share(_update_chunks, param, grad, exp_avg, exp_avg_sq, numbers)
+    run = alone if sizes.sum() <= _CHUNK else share
+    run(_update_chunks, addresses.reshape(-1, 4), sizes, numbers.reshape(-1, 9))

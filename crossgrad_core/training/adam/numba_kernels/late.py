@@ -146,8 +146,9 @@ def catch_up(
     left = width % LANES
     # What is left over of a row is worked on here, the rest of the eight being zero.
     rest = np.zeros(3 * LANES, np.float32)
-    task = take(jobs)
-    while task * _ROWS < count:
+    tasks = (count + _ROWS - 1) // _ROWS
+    task = take(jobs, tasks)
+    while task < tasks:
         for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
             ahead = place + _AHEAD
             if not whole and ahead < count and done[rows[ahead]] - before < end:
@@ -179,7 +180,7 @@ def catch_up(
                     exp_avg[at + c] = rest[LANES + c]
                     exp_avg_sq[at + c] = rest[2 * LANES + c]
             done[i] = before + end
-        task = take(jobs)
+        task = take(jobs, tasks)
 
 
 @device
@@ -230,8 +231,9 @@ def update_rows(
     room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
     ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     end = width - width % LANES
-    task = take(jobs)
-    while task * _ROWS < rows.size:
+    tasks = (rows.size + _ROWS - 1) // _ROWS
+    task = take(jobs, tasks)
+    while task < tasks:
         last = min(rows.size, (task + 1) * _ROWS)
         for first in range(task * _ROWS, last, together):
             stop = min(first + together, last)
@@ -270,7 +272,7 @@ def update_rows(
                 for i in range(width):
                     param[at + i], exp_avg[at + i] = ps[to + i], ms[to + i]
                     exp_avg_sq[at + i] = vs[to + i]
-        task = take(jobs)
+        task = take(jobs, tasks)
 
 
 @kernel
@@ -298,8 +300,9 @@ def update_all(
     """
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
     pulls = np.empty(together * width, np.float32)
-    task = take(jobs)
-    while task * _ROWS < count:
+    tasks = (count + _ROWS - 1) // _ROWS
+    task = take(jobs, tasks)
+    while task < tasks:
         end = min(count, (task + 1) * _ROWS)
         place = np.searchsorted(rows, task * _ROWS)
         for first in range(task * _ROWS, end, together):
@@ -329,4 +332,4 @@ def update_all(
                 k += run
             if place > begin or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
-        task = take(jobs)
+        task = take(jobs, tasks)

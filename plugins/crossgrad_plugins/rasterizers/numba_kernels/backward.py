@@ -475,8 +475,9 @@ def differentiate(
         partials: [slots * PARTIAL] written for slots of entries with a mask.
         written: [slots] 1 written for these; zero before.
     """
-    tile = take(jobs)
-    while tile < starts.shape[0] - 1:
+    tiles = starts.shape[0] - 1
+    tile = take(jobs, tiles)
+    while tile < tiles:
         _backward(
             tile,
             starts,
@@ -495,4 +496,4 @@ def differentiate(
             partials,
             written,
         )
-        tile = take(jobs)
+        tile = take(jobs, tiles)

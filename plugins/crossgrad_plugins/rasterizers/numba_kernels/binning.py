@@ -42,6 +42,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_WHOLE,
     WIDTH,
 )
+from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 
 #: Parts into which the chunks are divided for counting; fixed, so as not to depend on the threads.
 PARTS = 16
@@ -194,8 +195,10 @@ def find_tiles(
     shelves: NDArray[np.int32],
     tile_of_slot: NDArray[np.int32],
     counts: NDArray[np.int32],
+    depths: NDArray[np.float64],
+    order: NDArray[np.int32],
 ) -> None:
-    """Finds the tiles that each footprint reaches.
+    """Finds the tiles that each footprint reaches, and the order of the records beside it.
 
     Args:
         jobs: From `share`.
@@ -207,12 +210,20 @@ def find_tiles(
         shelves: [N, SHELF] per record, completed.
         tile_of_slot: [slots] written.
         counts: [PARTS, T] written: entries per part and tile; zero before.
+        depths: [M] of the records drawn.
+        order: [M] the records drawn; ordered by depth.
     """
     chunks = drawn.shape[0]
     begins = np.empty(_GROUP * LANES, np.float32)
     ends = np.empty(_GROUP * LANES, np.float32)
-    part = take(jobs)
-    while part < PARTS:
+    job = take(jobs, PARTS + 1)
+    while job <= PARTS:
+        # To sort is one job, the longest one.
+        if job == 0:
+            order[:] = order_by_depth(depths, order)
+            job = take(jobs, PARTS + 1)
+            continue
+        part = job - 1
         for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
             last = chunk * CHUNK + drawn[chunk]
             for first in range(chunk * CHUNK, last, _GROUP):
@@ -237,7 +248,7 @@ def find_tiles(
                     )
                     shelves[j, FIRST_ROW] = boxes[j, 2]
                     shelves[j, LAST_ROW] = boxes[j, 3] - 1
-        part = take(jobs)
+        job = take(jobs, PARTS + 1)
 
 
 @kernel
@@ -292,8 +303,9 @@ def fill_tiles(
             back.
     """
     count = order.shape[0]
-    band = take(jobs)
-    while band < bands.shape[0] - 1:
+    last = bands.shape[0] - 1
+    band = take(jobs, last)
+    while band < last:
         first_tile, end_tile = bands[band] * tile_columns, bands[band + 1] * tile_columns
         positions = starts[first_tile:end_tile].copy()
         for rank in range(count):
@@ -311,4 +323,4 @@ def fill_tiles(
                     positions[tile - first_tile] = entry + 1
                     entries[entry, 0] = j
                     entries[entry, 1] = slot
-        band = take(jobs)
+        band = take(jobs, last)

@@ -225,8 +225,9 @@ def bin_directions(
     rows = np.empty(ROWS, np.float32)
     places = np.empty(LANES, np.float32)
     binned = np.empty(SUMS * LANES, np.float32)
-    tile = take(jobs)
-    while tile < starts.shape[0] - 1:
+    tiles = starts.shape[0] - 1
+    tile = take(jobs, tiles)
+    while tile < tiles:
         top = (tile // columns) * TILE_HEIGHT
         left = (tile % columns) * TILE_WIDTH
         start_tile(state, top, left, image, alpha, depth, v_image, v_alpha, v_depth)
@@ -260,4 +261,4 @@ def bin_directions(
                 found,
                 np.intp(entries[entry, 1]) * SUMS,
             )
-        tile = take(jobs)
+        tile = take(jobs, tiles)

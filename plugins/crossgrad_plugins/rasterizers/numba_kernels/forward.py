@@ -410,8 +410,9 @@ def composite(
         limits: [N, 2] first and last column of 16 pixels per record; None: no limits.
         masks: [E] patches per entry, written; zero before.
     """
-    tile = take(jobs)
-    while tile < starts.shape[0] - 1:
+    tiles = starts.shape[0] - 1
+    tile = take(jobs, tiles)
+    while tile < tiles:
         _composite(
             tile,
             starts,
@@ -427,4 +428,4 @@ def composite(
             limits,
             masks,
         )
-        tile = take(jobs)
+        tile = take(jobs, tiles)

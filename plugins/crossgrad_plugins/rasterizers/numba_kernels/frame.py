@@ -49,7 +49,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.marked import count_marked
 from crossgrad_plugins.rasterizers.numba_kernels.projection import listed, project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
-from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade, unshade
 
 
@@ -111,7 +110,7 @@ def backward(
         frame.projected,
         frame.lists,
     )
-    partials = np.empty((lists.slots + 1) * PARTIAL, np.float32)
+    partials = _lines((lists.slots + 1) * PARTIAL)
     partials[-PARTIAL:] = 0.0
     written = np.zeros(lists.slots, np.uint8)
     share(
@@ -296,6 +295,17 @@ def _analytic(options: DrawOptions) -> Float32 | None:
     return np.empty(0, np.float32) if options.response == "analytic" else None
 
 
+#: Numbers in a cache line.
+LINE = 16
+
+
+def _lines(count: int) -> Float32:
+    """Room for so many numbers that begins a cache line, as each record and each sum then does."""
+    room = np.empty(count + LINE, np.float32)
+    shift = -(room.ctypes.data // room.itemsize) % LINE
+    return room[shift : shift + count]
+
+
 def _dilation(options: DrawOptions) -> float:
     return 0.0 if options.response == "analytic" else options.dilation
 
@@ -308,7 +318,7 @@ def _project(
     projected = Projected(
         camera=pinhole(camera.viewmat, camera.intrinsics, camera.width, camera.height),
         radii=np.empty(count, np.int32),
-        records=np.empty(count * RECORD, np.float32),
+        records=_lines(count * RECORD),
         owners=np.empty(count, np.int32),
         drawn=np.empty(chunks, np.int64),
         limits=np.empty((count, 2), np.int32) if options.squares else None,
@@ -372,8 +382,7 @@ def _bin(
     rows = (camera.height + TILE_HEIGHT - 1) // TILE_HEIGHT
     if room.sum() > np.iinfo(np.int32).max:
         raise MemoryError(f"{room.sum()} pairs of a Gaussian and a tile are too many")
-    items, keys, slots = collect(projected.drawn, room, depths, shelves)
-    order = order_by_depth(keys, items)
+    order, keys, slots = collect(projected.drawn, room, depths, shelves)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
     share(
@@ -386,6 +395,8 @@ def _bin(
         shelves,
         tile_of_slot,
         counts,
+        keys,
+        order,
     )
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)

@@ -80,12 +80,13 @@ def longest_axes(
         axes: [2 N] flat, written per record: a / |a|^2 with a the projected axis, one standard
             deviation long, in pixels; 0 where it is seen end on.
     """
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             i = np.intp(owners[j])
             axes[2 * j], axes[2 * j + 1] = _axis(camera, means[i], quats[i], scales[i])
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)
 
 
 @kernel
@@ -113,8 +114,9 @@ def add_directions(
     """
     unit = 1.0 if analytic else _PLAIN_UNIT
     total = np.empty(SUMS, np.float32)
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             total[:] = np.float32(0.0)
             first = np.intp(shelves[j, FIRST_SLOT])
@@ -127,4 +129,4 @@ def add_directions(
                 for field in range(FIELDS):
                     value = np.float64(total[number * FIELDS + field])
                     directions[i, number, field] = value * unit if field in (2, 3) else value
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)

@@ -157,8 +157,9 @@ def count_marked(
     columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     state = aligned(PATCHES * WIDE)
     rows = np.empty(ROWS, np.float32)
-    tile = take(jobs)
-    while tile < starts.shape[0] - 1:
+    tiles = starts.shape[0] - 1
+    tile = take(jobs, tiles)
+    while tile < tiles:
         top, left = (tile // columns) * TILE_HEIGHT, (tile % columns) * TILE_WIDTH
         live = _start(state, marked, top, left)
         entry, stop = starts[tile], starts[tile + 1]
@@ -175,4 +176,4 @@ def count_marked(
                     reached, records, record, rows, state, constants, analytic
                 )
             entry += 1
-        tile = take(jobs)
+        tile = take(jobs, tiles)

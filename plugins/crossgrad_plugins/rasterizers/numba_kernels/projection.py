@@ -321,8 +321,9 @@ def project(
     flags = np.ones(BLOCK, np.uint8)
     chosen = np.empty(BLOCK, np.int64)
     picked = np.empty(11 * BLOCK, np.float32)
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         first = chunk * CHUNK
         end = first
         for begin in range(first, min(first + CHUNK, count), BLOCK):
@@ -370,4 +371,4 @@ def project(
             )
         drawn[chunk] = end - first
         room[chunk] = _give_slots(first, end, boxes, shelves)
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)

@@ -310,8 +310,9 @@ def unproject(
     sums = np.empty(PARTIAL, np.float32)
     block = np.empty(_ROWS * BLOCK, np.float64)
     numbers = np.empty(BLOCK, np.int64)
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         j = chunk * CHUNK
         end = j + drawn[chunk]
         while j < end:
@@ -346,4 +347,4 @@ def unproject(
                 v_centres,
                 v_absolute,
             )
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)

@@ -58,12 +58,13 @@ def count_pixels(
         counts: [slots] pixels per slot.
         pixels: [N] written for the Gaussians drawn; zero before.
     """
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             first = np.intp(shelves[j, FIRST_SLOT])
             total = 0
             for slot in range(first, first + shelves[j, SLOTS]):
                 total += counts[slot]
             pixels[owners[j]] = total
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)

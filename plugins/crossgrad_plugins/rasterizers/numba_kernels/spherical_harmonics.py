@@ -100,8 +100,9 @@ def shade(
     ways, table = np.ones(WAYS, np.float64), aligned(TABLE)
     bases, colours = aligned(TABLE), aligned(TABLE)
     table[:] = np.float32(0.0)
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         end = chunk * CHUNK + drawn[chunk]
         for first in range(chunk * CHUNK, end, _BLOCK):
             last = min(first + _BLOCK, end)
@@ -126,7 +127,7 @@ def shade(
                         records[j * RECORD + LOG_OPACITY] = -math.inf
                         radii[i] = 0
                     records[j * RECORD + RED + channel] = max(colour, 0.0)
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)
 
 
 @kernel
@@ -169,8 +170,9 @@ def unshade(
     ways, table = np.ones(WAYS, np.float64), aligned(TABLE)
     bases, pulls, v_bases = aligned(TABLE), aligned(TABLE), aligned(TABLE)
     table[:] = pulls[:] = v_bases[:] = np.float32(0.0)
-    chunk = take(jobs)
-    while chunk < drawn.shape[0]:
+    chunks = drawn.shape[0]
+    chunk = take(jobs, chunks)
+    while chunk < chunks:
         before = drawn[:chunk].sum() - chunk * CHUNK
         end = chunk * CHUNK + drawn[chunk]
         for first in range(chunk * CHUNK, end, _BLOCK):
@@ -212,4 +214,4 @@ def unshade(
                 i = np.intp(owners[j])
                 for axis in range(3):
                     v_means[i, axis] += ways[j - first + axis * WIDE]
-        chunk = take(jobs)
+        chunk = take(jobs, chunks)

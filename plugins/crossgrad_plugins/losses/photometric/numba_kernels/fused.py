@@ -107,12 +107,13 @@ def _all_tiles(
     """Runs every tile; their sums [rows of tiles, columns of tiles, 2] are written."""
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
-    tile = take(jobs)
-    if tile >= down * across:
+    tiles = down * across
+    tile = take(jobs, tiles)
+    if tile >= tiles:
         return
     scratch = aligned(SCRATCH)
     scratch[:] = np.float32(0.0)
-    while tile < down * across:
+    while tile < tiles:
         top, left = tile // across * rows, tile % across * columns
         box = (top, min(height, top + rows), left, min(width, left + columns))
         if box[0] < box[1] and box[2] < box[3]:
@@ -122,7 +123,7 @@ def _all_tiles(
             )  # fmt: skip
             sums[tile // across, tile % across, 0] = absolute
             sums[tile // across, tile % across, 1] = dissimilarity
-        tile = take(jobs)
+        tile = take(jobs, tiles)
 
 
 def loss_terms(
