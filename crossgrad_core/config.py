@@ -206,6 +206,13 @@ class RunConfig(BaseModel):
         description="Multiplies all learning rates of the backbone. Default: 1 from 30,000 steps "
         "on and with --preset inria, more in shorter runs.",
     )
+    beta2: float | None = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="decay of Adam's second moment; less than 0.999 in runs that show a photo few "
+        "times",
+    )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",
         description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "

@@ -209,7 +209,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         *_linear_note(setup),
         *idle_note(setup),
         *at_the_end(config),
-        *of_rates(config, setup.schedule),
+        *of_rates(config, setup.schedule, len(scene.train_views)),
         *timed,
     )
     return replace(setup, notes=(*setup.notes, *added))

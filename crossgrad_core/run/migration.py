@@ -11,6 +11,7 @@ from crossgrad_core.defaults import BARE_START, METRICS_OF_0_1
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
 from crossgrad_core.system.version import VERSION
+from crossgrad_core.training.adam.coefficients import BETAS
 
 #: The key that says which version wrote a configuration, and the version of this one.
 KEY: Final = "crossgrad"
@@ -58,6 +59,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         # and ends as it did.
         rest.setdefault("events", "steps")
         rest.setdefault("rate_factor", 1.0)
+        rest.setdefault("beta2", BETAS[1])
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)

@@ -6,7 +6,7 @@ from typing import Final
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate
 from crossgrad_core.contract.schedule import REFERENCE, Schedule
-from crossgrad_core.training.adam.coefficients import Rule
+from crossgrad_core.training.adam.coefficients import BETAS, Rule
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import faded
 
@@ -16,27 +16,82 @@ SHORTNESS: Final = 0.45
 #: ... and never more than this: what a run of some 1,000 steps has.
 MOST: Final = 4.5
 
+#: A run that shows a training photo fewer times than this, in the mean, is in a hurry.
+HURRY: Final = 40
+#: Its rates fall with this power of the length, and from here.
+HURRIED_SHORTNESS: Final = 0.65
+HURRIED_MOST: Final = 6.3
+#: The second moment of Adam averages over the last steps, of such a run over this part of its
+#: steps, though not over fewer than so many: gradients of the first steps are much larger than
+#: later ones, which they would hold back for the 1,000 steps of the published average.
+#: All measured by us (docs/schedules.md).
+MEMORY, LEAST_MEMORY = 1 / 50, 50
+
 #: Blocks that learn in one of n steps have n to this power times their rate then.
 RESTED: Final = 0.5
 
 
-def factor_of(config: RunConfig, schedule: Schedule) -> float:
-    """What all rates of the backbone are multiplied by, given how long the run is to be."""
+def in_a_hurry(config: RunConfig, schedule: Schedule, photos: int) -> bool:
+    """Whether a run ends long before it has learnt its photos by heart, and has rules of its own.
+
+    Not where the decay of the second moment is given.
+    """
+    short = schedule.length < min(REFERENCE, HURRY * photos)
+    return short and config.beta2 is None and config.preset != "inria"
+
+
+def factor_of(config: RunConfig, schedule: Schedule, photos: int) -> float:
+    """What all rates of the backbone are multiplied by, given how long the run is to be.
+
+    Args:
+        config: The run's.
+        schedule: Its schedule.
+        photos: Its training photos.
+    """
     if config.rate_factor is not None or config.preset == "inria":
         return config.rate_factor or 1.0
-    steps = schedule.total if schedule.mode == "scaled" else schedule.step_of(schedule.length)
-    return min(max(1.0, float((REFERENCE / steps) ** SHORTNESS)), MOST)
+    hurried = in_a_hurry(config, schedule, photos)
+    power, most = (HURRIED_SHORTNESS, HURRIED_MOST) if hurried else (SHORTNESS, MOST)
+    return min(max(1.0, float((REFERENCE / _steps(schedule)) ** power)), most)
 
 
-def notes_on(config: RunConfig, schedule: Schedule) -> tuple[str, ...]:
-    """That the rates are larger than the published ones, where the run asked for none."""
-    factor = factor_of(config, schedule)
+def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float, float]:
+    """The decay of Adam's moments, for one view per step; arguments as of `factor_of`."""
+    first, second = BETAS
+    if config.beta2 is not None:
+        return first, config.beta2
+    if not in_a_hurry(config, schedule, photos):
+        return BETAS
+    return first, min(second, 1.0 - 1.0 / max(LEAST_MEMORY, MEMORY * _steps(schedule)))
+
+
+def _steps(schedule: Schedule) -> int:
+    return schedule.total if schedule.mode == "scaled" else schedule.step_of(schedule.length)
+
+
+def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, ...]:
+    """How rates and Adam differ from what is published, where the run asked for nothing."""
     # The length of a run within a budget is not known yet.
     known = config.seconds is None or schedule.mode == "absolute"
-    if config.rate_factor is not None or config.preset == "inria" or (known and factor == 1.0):
+    if config.preset == "inria":
         return ()
-    told = f"{factor:.3g}" if known else f"({REFERENCE:,} / steps)^{SHORTNESS}, at most {MOST}"
-    return (f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times {told}",)
+    notes = []
+    factor, hurried = factor_of(config, schedule, photos), in_a_hurry(config, schedule, photos)
+    if config.rate_factor is None and not (known and factor == 1.0):
+        usual = f"({REFERENCE:,} / steps)^{SHORTNESS}, at most {MOST}"
+        told = f"{factor:.3g}" if known else usual
+        notes.append(
+            f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times {told}"
+        )
+    views = f"fewer than {HURRY} views of each training photo"
+    if known and hurried:
+        memory = 1.0 / (1.0 - betas_of(config, schedule, photos)[1])
+        notes.append(f"Adam's second moment averages over {memory:,.0f} steps: {views}")
+    if not known and config.beta2 is None and photos:
+        quick = f"^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, and Adam's second moment averages "
+        quick += f"over a {1 / MEMORY:.0f}th of the steps, {LEAST_MEMORY} at least"
+        notes.append(f"in a run of {views} rates are times {quick}")
+    return tuple(notes)
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
@@ -58,7 +113,8 @@ def means_rate_at(setup: Setup, step: int) -> float:
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     """A learning rate of the backbone in a step: of the schedule, times what the run asks for."""
     config, schedule = setup.config, setup.schedule
-    factor = factor_of(config, schedule) * faded(config, rate, step=step, total=schedule.total)
+    factor = factor_of(config, schedule, len(setup.train_views))
+    factor *= faded(config, rate, step=step, total=schedule.total)
     if config.batch_rule == "sqrt":
         factor *= sqrt(schedule.pace.at(step))
     return rate.at(schedule.progress(step)) * factor
@@ -66,8 +122,9 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
 
 def rule_at(setup: Setup, step: int) -> Rule:
     """How Adam averages in a step."""
+    betas = betas_of(setup.config, setup.schedule, len(setup.train_views))
     if setup.config.batch_rule == "none":
-        return Rule()
+        return Rule(betas)
     pace = setup.schedule.pace
     views = pace.at(step)
-    return Rule.for_views(views, pace.views(step) / (step * views))
+    return Rule.for_views(views, pace.views(step) / (step * views), betas)

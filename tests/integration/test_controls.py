@@ -14,10 +14,11 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.opening import parsed
 from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import rates
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.coefficients import BETAS, EPS, Rule
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
+from crossgrad_core.training.rates import factor_of, means_rate_at, rates_at, rule_at
 from crossgrad_core.training.rngs import STREAMS
 from crossgrad_core.training.start import first_state
 
@@ -40,7 +41,7 @@ def trained(number, *plugins, **settings):
 @pytest.mark.parametrize("step", [1, 20, 40])
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
     plain, doubled = (
-        assembled(backbone={"name": backbone}, rate_factor=factor, final_decay=0.0)
+        assembled(backbone={"name": backbone}, rate_factor=factor, final_decay=0.0, beta2=0.999)
         for factor in (1.0, 2.0)
     )
     rates = {
@@ -62,7 +63,8 @@ EIGHTH = 8.0**0.45
         ({"steps": 3_750}, EIGHTH),
         ({"steps": 30_000}, 1.0),
         ({"steps": 100_000}, 1.0),
-        ({"steps": 5}, 4.5),
+        ({"steps": 5}, 6.3),
+        ({"steps": 5, "beta2": 0.999}, 4.5),
         ({"steps": 1_000}, 4.5),
         ({"steps": 3_750, "views": 2}, EIGHTH),
         ({"max_views": 7_500, "views": 2, "steps": None}, EIGHTH),
@@ -82,10 +84,47 @@ def test_a_shorter_run_has_larger_rates(settings, factor):
     assert all(note.endswith(f" times {factor:.3g}") for note in told)
 
 
+#: Views of a run that shows each of the nine training photos forty times.
+PASSES = 360
+
+
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize(
+    ("length", "settings", "beta2"),
+    [
+        (PASSES - 2, {}, 0.98),
+        (PASSES, {}, 0.999),
+        (PASSES - 2, {"beta2": 0.9}, 0.9),
+        (PASSES, {"beta2": 0.0}, 0.0),
+        (PASSES - 2, {"preset": "inria"}, 0.999),
+        (PASSES - 2, {"schedule": "absolute"}, 0.999),
+        (PASSES - 2, {"rate_factor": 1.0}, 0.98),
+    ],
+)
+def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, beta2, views):
+    setup = assembled(max_views=length, steps=None, views=views, **settings)
+    assert len(setup.train_views) == 9
+    assert all(rule_at(setup, step) == Rule((0.9, beta2)) for step in (1, length // views))
+    told = [note for note in setup.notes if "second moment" in note]
+    assert len(told) == (beta2 == 0.98)
+    assert all(" over 50 steps: fewer than 40 views " in note for note in told)
+
+
+def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(monkeypatch):
+    monkeypatch.setattr(rates, "HURRY", 10_000)
+    for steps, memory in ((2_000, 50), (5_000, 100), (29_999, 599.98), (30_000, 1_000)):
+        setup = assembled(steps=steps)
+        assert rule_at(setup, 1).betas[1] == pytest.approx(1 - 1 / memory, abs=1e-12)
+        assert factor_of(setup.config, setup.schedule, 9) == pytest.approx(
+            min(6.3, (30_000 / steps) ** 0.65)
+        )
+
+
 def test_where_the_clock_decides_the_rates_follow_its_plan():
     setup = assembled(steps=None, seconds=60.0)
-    (note,) = (note for note in setup.notes if "learning rates" in note)
+    note, hurried = (note for note in setup.notes if "rates" in note and "times" in note)
     assert note.endswith(" times (30,000 / steps)^0.45, at most 4.5")
+    assert hurried.startswith("in a run of fewer than 40 views of each training photo ")
     shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
     published, planned = (rates_at(each, 1)["opacities"] for each in (setup, shorter))
     assert planned == pytest.approx(EIGHTH * published)
@@ -102,7 +141,9 @@ def test_a_first_step_goes_as_much_farther():
 
 @pytest.mark.parametrize("views", [2, 4, 10])
 def test_the_batch_rule_follows_the_views(views):
-    setup, plain = (assembled(views=views, batch_rule=rule) for rule in ("sqrt", "none"))
+    setup, plain = (
+        assembled(views=views, batch_rule=rule, beta2=0.999) for rule in ("sqrt", "none")
+    )
     for step in (1, 7, 40):
         rule = rule_at(setup, step)
         assert rule.betas == pytest.approx([1 - views * (1 - beta) for beta in BETAS], abs=1e-15)

@@ -44,7 +44,7 @@ class Rule:
     age: float = 1.0
 
     @classmethod
-    def for_views(cls, views: int, age: float = 1.0) -> "Rule":
+    def for_views(cls, views: int, age: float = 1.0, betas: tuple[float, float] = BETAS) -> "Rule":
         """The batch rule: moments forget as much per view as with one view per step.
 
         Learning rates times sqrt(K) belong to it.
@@ -53,10 +53,11 @@ class Rule:
             views: K, at most `MOST_VIEWS`.
             age: Steps of K views that draw as many as the run has, over its steps; not 1 where K
                 changed.
+            betas: With one view per step.
 
         Source: gsplat; Malladi et al. 2022 (square-root scaling), K views for K batches.
         """
-        first, second = (max(0.0, 1.0 - views * (1.0 - beta)) for beta in BETAS)
+        first, second = (max(0.0, 1.0 - views * (1.0 - beta)) for beta in betas)
         return cls((first, second), EPS / sqrt(views), age)
 
 
