@@ -16,12 +16,11 @@ import numpy as np
 import torch
 from _machine import facts
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.gradients.by_rows import by_rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
-from crossgrad_core.training.adam.coefficients import Rule
 
 #: Rows that are drawn together, choices of rows that take turns, and shares.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
@@ -43,7 +42,7 @@ def milliseconds(count: int, share: float, most: float, reps: int) -> float:
         own = rep % CHOICES
         start = perf_counter()
         rows_late.catch_up("x", param, state, rows[own].to(torch.int32))
-        step = counted("x", param, state, 1e-3, Rule(), 1.0)
+        step = counted("x", param, state, 1e-3, AdamRule(), 1.0)
         rows_late.step("x", param, by_rows(rows[own], values[own], param.shape), state, step)
         times.append(perf_counter() - start)
     return 1e3 * median(times[CHOICES:])

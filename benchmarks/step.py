@@ -26,14 +26,13 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.gaussians import OnDemand
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.numerics.spherical import SH_C0
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step, counted
-from crossgrad_core.training.adam.coefficients import Rule
 from crossgrad_core.training.adam.late import Late
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
@@ -111,7 +110,7 @@ class Trainer:
             if gradient is None:
                 continue
             param = self.parameters[name]
-            step = counted(name, param, self.state, 0.0, Rule(), 1.0)
+            step = counted(name, param, self.state, 0.0, AdamRule(), 1.0)
             self.late.step(name, param, gradient, self.state, step)
         for tensor in self.parameters.values():
             tensor.grad = None

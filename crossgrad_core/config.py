@@ -208,10 +208,10 @@ class RunConfig(BaseModel):
     )
     beta2: float | None = Field(
         None,
-        ge=0,
+        ge=0.9,
         lt=1,
-        description="decay of Adam's second moment; less than 0.999 in runs that show a photo few "
-        "times",
+        description="decay of Adam's second moment; where it is given, rates are those of runs "
+        "that show photos often",
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",

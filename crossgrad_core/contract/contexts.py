@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
 from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
 from crossgrad_core.contract.gradients import Gradients, SeparateGradients
@@ -19,7 +20,6 @@ from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import Edit
 
 if TYPE_CHECKING:
-    from crossgrad_core.contract.adam_state import AdamState
     from crossgrad_core.contract.backbone import Backbone
     from crossgrad_core.contract.loss import Loss
     from crossgrad_core.contract.rasterizer import Rasterizer
@@ -441,6 +441,7 @@ class Model:
         rasterizer: The rasterizer.
         parameters: The parameters.
         adam: The optimizer's moments.
+        rule: How Adam averages in the next step.
         background: [3] RGB that evaluated views are drawn over.
         loss: The photometric loss.
         groups: Group label of each training view, or None.
@@ -454,11 +455,12 @@ class Model:
     backbone: "Backbone"
     rasterizer: "Rasterizer"
     parameters: Parameters
-    adam: "AdamState"
+    adam: AdamState
     background: Tensor
     loss: "Loss"
     groups: tuple[str, ...] | None
     exposed: ExposedBy = field(default=unexposed)
+    rule: AdamRule = field(default=AdamRule())
     render: RenderOnRequest = field(default=no_renders)
 
 

@@ -22,7 +22,7 @@ What a job computes must not depend on who does it; then no bit depends on the t
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, partial
 from typing import Any, Concatenate, ParamSpec, cast
 
@@ -87,11 +87,15 @@ def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs:
     """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
     own, *others = _jobs(numba.get_num_threads())
     calls = [partial(kernel, jobs, *args, **kwargs) for jobs in others]
-    helpers = _helpers(os.getpid()).ask(calls) if calls else ()
-    kernel(own, *args, **kwargs)
-    for helper in helpers:
-        if not helper.cancel():
-            helper.result()
+    helpers = _helpers(os.getpid()).ask(calls) if calls else []
+    try:
+        kernel(own, *args, **kwargs)
+    finally:
+        # Whatever happens, nobody works on the arrays any more when this returns.
+        at_work = [helper for helper in helpers if not helper.cancel()]
+        wait(at_work)
+    for helper in at_work:
+        helper.result()
 
 
 class _Helpers:
@@ -104,7 +108,7 @@ class _Helpers:
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        # One of each thread: the same jobs are to go to the same core.
+        # One for each thread: the same jobs are to go to the same core.
         self._pools: list[ThreadPoolExecutor] = []
 
     def ask(self, calls: Sequence[Callable[[], None]]) -> list[Future[None]]:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import torch
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.adam_state import MOST_VIEWS
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.densifier import Densifier
@@ -45,7 +46,6 @@ from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_views import operator_of, usual_views
-from crossgrad_core.training.adam.coefficients import MOST_VIEWS
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import notes_on as of_rates

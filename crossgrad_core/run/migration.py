@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from crossgrad_core.contract.adam_state import BETAS
 from crossgrad_core.defaults import BARE_START, METRICS_OF_0_1
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.training.adam.coefficients import BETAS
 
 #: The key that says which version wrote a configuration, and the version of this one.
 KEY: Final = "crossgrad"

@@ -25,7 +25,6 @@ from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
-from crossgrad_core.training.adam.coefficients import BETAS
 from crossgrad_core.training.budget import caught_up
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state
@@ -179,7 +178,6 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     # What a run began with is written down; where it is not, it was that of the first versions.
     stored["sh_from"] = stored.get("sh_from") or 0
     stored["sh_every"] = stored.get("sh_every") or 1
-    stored.setdefault("beta2", BETAS[1])
     config = parsed({**stored, **settings})
     if "device" not in settings:
         _check_device(config.device, folder)

@@ -13,14 +13,13 @@ from contextlib import contextmanager
 import torch
 
 from crossgrad_core.config import ComponentChoice
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.gradients.by_rows import by_rows
 from crossgrad_core.numerics.kernel_cache import told_of_missing
 from crossgrad_core.registry.entries import build
 from crossgrad_core.system.cores import available_cores
 from crossgrad_core.training.adam.adam import adam_step, counted
-from crossgrad_core.training.adam.coefficients import Rule
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.setup import Setup
 
@@ -62,7 +61,9 @@ def compile_all(loss: ComponentChoice) -> None:
     # One row of many, another one, which is late by then, and so many that all are taken.
     for rows in ([1], [4], [1, 4, 6]):
         grad = by_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
-        late.step("rows", values, grad, state, counted("rows", values, state, 1e-3, Rule(), 1.0))
+        late.step(
+            "rows", values, grad, state, counted("rows", values, state, 1e-3, AdamRule(), 1.0)
+        )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.training.room import Beginning, began_with, most_after
+from crossgrad_core.training.room import most_after, started_with
 from crossgrad_core.training.schedules import growth_of, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -24,17 +24,17 @@ class Crowd:
     """The primitives of a run.
 
     Attributes:
-        began: What it began with.
+        start: How many it began with.
         present: How many there are.
     """
 
-    began: Beginning
+    start: int
     present: int
 
     @classmethod
     def of(cls, setup: Setup, state: TrainState) -> "Crowd":
         """Those of a run that has reached this state."""
-        return cls(began_with(setup, state), state.primitives(setup))
+        return cls(started_with(setup, state), state.primitives(setup))
 
 
 def cost_of_run(setup: Setup, crowd: Crowd, steps: int) -> float:
@@ -83,6 +83,6 @@ def _along_curve(setup: Setup, crowd: Crowd, schedule: Schedule, step: int) -> f
     cost, at, count = 0.0, step, crowd.present
     for edit in schedule.edit_steps(step):
         cost += (edit - at) * (empty + count)
-        at, count = edit, max(count, most_after(setup, schedule, edit, crowd.began))
+        at, count = edit, max(count, most_after(setup, schedule, edit, crowd.start))
     cost += (schedule.total - at) * (empty + count)
     return cost / ((schedule.total - step) * (empty + crowd.present))

@@ -5,6 +5,7 @@ from functools import partial
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.photo_parameters import exposed
+from crossgrad_core.training.rates import rule_at
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import eval_background
@@ -22,6 +23,7 @@ def model_of(setup: Setup, state: TrainState) -> Model:
         background=eval_background(setup),
         loss=setup.loss,
         exposed=partial(exposed, setup, state),
+        rule=rule_at(setup, state.step + 1),
         render=OnRequest(setup, state, counted=False),
         groups=setup.groups,
     )

@@ -4,9 +4,9 @@ from math import sqrt
 from typing import Final
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.adam_state import BETAS, AdamRule
 from crossgrad_core.contract.blocks import LearningRate
 from crossgrad_core.contract.schedule import REFERENCE, Schedule
-from crossgrad_core.training.adam.coefficients import BETAS, Rule
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import faded
 
@@ -32,66 +32,99 @@ RESTED: Final = 0.5
 
 
 def in_a_hurry(config: RunConfig, schedule: Schedule, photos: int) -> bool:
-    """Whether a run ends long before it has learnt its photos by heart, and has rules of its own.
+    """Whether a run was planned to end long before it has learnt its photos by heart.
 
-    Not where the decay of the second moment is given.
-    """
-    short = schedule.length < min(REFERENCE, HURRY * photos)
-    return short and config.beta2 is None and config.preset != "inria"
-
-
-def factor_of(config: RunConfig, schedule: Schedule, photos: int) -> float:
-    """What all rates of the backbone are multiplied by, given how long the run is to be.
+    Then it has rules of its own, which stay if the clock makes it longer or shorter; not where the
+    decay of the second moment is given.
 
     Args:
         config: The run's.
         schedule: Its schedule.
-        photos: Its training photos.
+        photos: Number of its training photos.
     """
+    if config.beta2 is not None or config.preset == "inria":
+        return False
+    views = schedule.pace.views(_planned(config, schedule))
+    return views < min(REFERENCE, HURRY * photos)
+
+
+def factor_of(config: RunConfig, schedule: Schedule, photos: int) -> float:
+    """What all rates of the backbone are multiplied by; arguments as of `in_a_hurry`."""
     if config.rate_factor is not None or config.preset == "inria":
         return config.rate_factor or 1.0
     hurried = in_a_hurry(config, schedule, photos)
     power, most = (HURRIED_SHORTNESS, HURRIED_MOST) if hurried else (SHORTNESS, MOST)
-    return min(max(1.0, float((REFERENCE / _steps(schedule)) ** power)), most)
+    return min(max(1.0, float((REFERENCE / _length(schedule)) ** power)), most)
 
 
 def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float, float]:
-    """The decay of Adam's moments, for one view per step; arguments as of `factor_of`."""
+    """The decay of Adam's moments in a run; arguments as of `in_a_hurry`.
+
+    Under the batch rule those for one view per step.
+    """
     first, second = BETAS
     if config.beta2 is not None:
         return first, config.beta2
     if not in_a_hurry(config, schedule, photos):
         return BETAS
-    return first, min(second, 1.0 - 1.0 / max(LEAST_MEMORY, MEMORY * _steps(schedule)))
+    steps = _planned(config, schedule)
+    memory = max(LEAST_MEMORY, MEMORY * steps)
+    if config.batch_rule == "sqrt":
+        # K times as fast with K views per step; the floor is one of steps all the same.
+        memory *= schedule.pace.views(steps) / steps
+    return first, min(second, 1.0 - 1.0 / memory)
 
 
-def _steps(schedule: Schedule) -> int:
+def _length(schedule: Schedule) -> int:
+    """Steps of the run as its schedule has it now, which the clock may change."""
     return schedule.total if schedule.mode == "scaled" else schedule.step_of(schedule.length)
+
+
+def _planned(config: RunConfig, schedule: Schedule) -> int:
+    """Steps of the run as it was planned."""
+    return (schedule.mode == "scaled" and config.steps) or _length(schedule)
 
 
 def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, ...]:
     """How rates and Adam differ from what is published, where the run asked for nothing."""
-    # The length of a run within a budget is not known yet.
-    known = config.seconds is None or schedule.mode == "absolute"
     if config.preset == "inria":
         return ()
     notes = []
-    factor, hurried = factor_of(config, schedule, photos), in_a_hurry(config, schedule, photos)
-    if config.rate_factor is None and not (known and factor == 1.0):
-        usual = f"({REFERENCE:,} / steps)^{SHORTNESS}, at most {MOST}"
-        told = f"{factor:.3g}" if known else usual
-        notes.append(
-            f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times {told}"
-        )
-    views = f"fewer than {HURRY} views of each training photo"
-    if known and hurried:
-        memory = 1.0 / (1.0 - betas_of(config, schedule, photos)[1])
-        notes.append(f"Adam's second moment averages over {memory:,.0f} steps: {views}")
-    if not known and config.beta2 is None and photos:
-        quick = f"^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, and Adam's second moment averages "
-        quick += f"over a {1 / MEMORY:.0f}th of the steps, {LEAST_MEMORY} at least"
-        notes.append(f"in a run of {views} rates are times {quick}")
+    published = f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times"
+    # The length of a run within a budget is not known yet.
+    if config.seconds is not None and schedule.mode != "absolute":
+        ratio = f"({REFERENCE:,} / steps)"
+        if config.rate_factor is None:
+            notes.append(f"{published} {ratio}^{SHORTNESS}, at most {MOST}")
+        if config.beta2 is None and photos:
+            rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
+            memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
+            notes.append(
+                f"if these are fewer than {HURRY} views of each training photo: "
+                f"{rates if config.rate_factor is None else ''}{memory}, {LEAST_MEMORY} at least"
+            )
+        return tuple(notes)
+    factor = factor_of(config, schedule, photos)
+    if config.rate_factor is None and factor != 1.0:
+        notes.append(f"{published} {factor:.3g}")
+    if in_a_hurry(config, schedule, photos):
+        notes.append(_hurry_note(config, schedule))
     return tuple(notes)
+
+
+def note_on_plan(setup: Setup) -> tuple[str, ...]:
+    """Which rules a run within a budget has, once its length is planned."""
+    config, schedule = setup.config, setup.schedule
+    hurried = in_a_hurry(config, schedule, len(setup.train_views))
+    return (_hurry_note(config, schedule),) if hurried else ()
+
+
+def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
+    memory = max(LEAST_MEMORY, MEMORY * _planned(config, schedule))
+    return (
+        f"fewer than {HURRY} views of each training photo: Adam's second moment averages over "
+        f"{memory:,.0f} steps (--set beta2=0.999 has what longer runs have)"
+    )
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
@@ -120,11 +153,11 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     return rate.at(schedule.progress(step)) * factor
 
 
-def rule_at(setup: Setup, step: int) -> Rule:
+def rule_at(setup: Setup, step: int) -> AdamRule:
     """How Adam averages in a step."""
     betas = betas_of(setup.config, setup.schedule, len(setup.train_views))
     if setup.config.batch_rule == "none":
-        return Rule(betas)
+        return AdamRule(betas)
     pace = setup.schedule.pace
     views = pace.at(step)
-    return Rule.for_views(views, pace.views(step) / (step * views), betas)
+    return AdamRule.for_views(views, pace.views(step) / (step * views), betas)

@@ -1,13 +1,10 @@
 """How many primitives density control may add: a budget, a curve that leads to it, the memory."""
 
 import sys
-from collections.abc import Iterable
-from dataclasses import dataclass
 from math import exp, log
 from typing import Literal, cast
 
 from crossgrad_core.config import AUTO
-from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.schedule import REFERENCE, Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
@@ -22,9 +19,6 @@ STATE = "budget"
 #: The budget of runs of so many views, and the power of the length with which that of longer ones
 #: grows at first: to 100,000 at 10,000 views. Source: measured by metal-gauss.
 SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
-#: Pixels of all training photos together for each primitive of that budget, where they are many.
-#: Measured by us (docs/schedules.md).
-PIXELS = 500
 #: Where a run begins with few primitives, so many times as many are enough, though not fewer than
 #: that: a short run has no time to place more. Measured by us (docs/schedules.md).
 GROWN, LEAST_BUDGET = 2, 10_000
@@ -44,47 +38,29 @@ def _most(setup: Setup, state: TrainState) -> int:
     given = bound_of(setup)
     if growth_of(setup) == "free" and given != AUTO:
         return given or sys.maxsize
-    began = began_with(setup, state)
-    state.states.setdefault(STATE, PluginState({"start": began.primitives, "pixels": began.pixels}))
-    return most_after(setup, setup.schedule, state.step, began)
+    start = started_with(setup, state)
+    state.states.setdefault(STATE, PluginState({"start": start}))
+    return most_after(setup, setup.schedule, state.step, start)
 
 
-@dataclass(frozen=True)
-class Beginning:
-    """The primitives at the start of a run, and the pixels of its training photos together."""
-
-    primitives: int
-    pixels: int = 0
-
-
-def began_with(setup: Setup, state: TrainState) -> Beginning:
-    """What growth in a run depends on."""
+def started_with(setup: Setup, state: TrainState) -> int:
+    """The number of primitives at the start of a run, where growth depends on it."""
     kept = state.states.get(STATE)
-    if kept is None:
-        # Nothing is added before the first edit: what is there until then is the start.
-        return Beginning(state.primitives(setup), pixels_of(setup.train_views))
-    # Runs of earlier versions did not look at the photos, and go on like that.
-    start, pixels = kept.values["start"], kept.values.get("pixels", 0)
-    return Beginning(cast("int", start), cast("int", pixels))
+    # Nothing is added before the first edit: what is there until then is the start.
+    return state.primitives(setup) if kept is None else cast("int", kept.values["start"])
 
 
-def pixels_of(views: Iterable[View]) -> int:
-    """The pixels of all photos together, in the size that they are trained in."""
-    return sum(view.camera.width * view.camera.height for view in views)
-
-
-def most_after(setup: Setup, schedule: Schedule, step: int, began: Beginning) -> int:
-    """The most primitives that there may be after an edit.
+def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
+    """The most primitives that there may be after an edit in a run that began with `start`.
 
     Args:
         setup: The run; its growth follows the curve, or its budget is `auto`.
         schedule: Its schedule.
         step: The step of the edit.
-        began: What it began with.
+        start: Primitives at the start.
     """
-    start, length = began.primitives, schedule.length
     given = bound_of(setup)
-    budget = usual_budget(start, length, began.pixels) if given == AUTO else given or sys.maxsize
+    budget = usual_budget(start, schedule.length) if given == AUTO else given or sys.maxsize
     if growth_of(setup) == "free" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
@@ -97,19 +73,15 @@ def bound_of(setup: Setup) -> int | Literal["auto"] | None:
     return AUTO if given is None and growth_of(setup) == "curve" else given
 
 
-def usual_budget(start: int, length: int, pixels: int) -> int:
-    """The budget of a run; none any more at the published length, whose rules know none.
+def usual_budget(start: int, length: int) -> int:
+    """The budget of a run that began with `start` primitives and has `length` views.
 
-    Args:
-        start: Primitives at the start.
-        length: Views of the run.
-        pixels: Those of all training photos together.
+    It has no bound any more at the published length, whose rules know none.
     """
     if length >= REFERENCE:
         return sys.maxsize
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
-    worth = max(SHORT_BUDGET, pixels // PIXELS)
-    enough = min(worth, max(LEAST_BUDGET, GROWN * start))
+    enough = min(SHORT_BUDGET, max(LEAST_BUDGET, GROWN * start))
     return round(max(enough, start) * stretch / (1.0 - length / REFERENCE))
 
 

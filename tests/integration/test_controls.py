@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import BETAS, EPS, AdamRule, AdamState
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run.assemble import assemble
@@ -16,9 +16,14 @@ from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import rates
 from crossgrad_core.training.adam.adam import adam_step
-from crossgrad_core.training.adam.coefficients import BETAS, EPS, Rule
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.rates import factor_of, means_rate_at, rates_at, rule_at
+from crossgrad_core.training.rates import (
+    factor_of,
+    means_rate_at,
+    note_on_plan,
+    rates_at,
+    rule_at,
+)
 from crossgrad_core.training.rngs import STREAMS
 from crossgrad_core.training.start import first_state
 
@@ -44,13 +49,13 @@ def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
         assembled(backbone={"name": backbone}, rate_factor=factor, final_decay=0.0, beta2=0.999)
         for factor in (1.0, 2.0)
     )
-    rates = {
+    published = {
         name: block.lr.at(step / 40) for block in plain.trained_blocks for name in block.tensors
     }
-    assert rates_at(plain, step) == rates and len(rates) >= 5
-    assert rates_at(doubled, step) == {name: 2.0 * rate for name, rate in rates.items()}
+    assert rates_at(plain, step) == published and len(published) >= 5
+    assert rates_at(doubled, step) == {name: 2.0 * rate for name, rate in published.items()}
     assert means_rate_at(doubled, step) == 2.0 * means_rate_at(plain, step)
-    assert rule_at(doubled, step) == Rule()
+    assert rule_at(doubled, step) == AdamRule()
 
 
 #: What rates are multiplied by in an eighth of 30,000 steps.
@@ -95,7 +100,9 @@ PASSES = 360
         (PASSES - 2, {}, 0.98),
         (PASSES, {}, 0.999),
         (PASSES - 2, {"beta2": 0.9}, 0.9),
-        (PASSES, {"beta2": 0.0}, 0.0),
+        (PASSES, {"beta2": 0.9}, 0.9),
+        (PASSES - 2, {"events": "steps"}, 0.98),
+        (PASSES, {"events": "steps"}, 0.999),
         (PASSES - 2, {"preset": "inria"}, 0.999),
         (PASSES - 2, {"schedule": "absolute"}, 0.999),
         (PASSES - 2, {"rate_factor": 1.0}, 0.98),
@@ -104,10 +111,36 @@ PASSES = 360
 def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, beta2, views):
     setup = assembled(max_views=length, steps=None, views=views, **settings)
     assert len(setup.train_views) == 9
-    assert all(rule_at(setup, step) == Rule((0.9, beta2)) for step in (1, length // views))
+    assert all(rule_at(setup, step) == AdamRule((0.9, beta2)) for step in (1, length // views))
     told = [note for note in setup.notes if "second moment" in note]
     assert len(told) == (beta2 == 0.98)
-    assert all(" over 50 steps: fewer than 40 views " in note for note in told)
+    assert all("fewer than 40 views " in note and " over 50 steps " in note for note in told)
+
+
+@pytest.mark.parametrize("steps", [60, 5_000])
+@pytest.mark.parametrize("views", [2, 5, 10])
+def test_under_the_batch_rule_the_second_moment_averages_over_as_many_steps(
+    steps, views, monkeypatch
+):
+    monkeypatch.setattr(rates, "HURRY", 10_000)
+    setup = assembled(steps=steps, views=views, batch_rule="sqrt")
+    first, second = rule_at(setup, 1).betas
+    if steps * views < 30_000:
+        assert 1 / (1 - second) == pytest.approx(max(50, steps / 50))
+        assert first == pytest.approx(1 - 0.1 * views)
+    else:
+        assert 1 / (1 - second) == pytest.approx(1_000 / views)
+
+
+@pytest.mark.parametrize(("planned", "beta2"), [(PASSES - 1, 0.98), (PASSES, 0.999)])
+@pytest.mark.parametrize("steps", [PASSES // 2, PASSES * 2])
+def test_the_rule_that_a_run_was_planned_with_stays_when_the_clock_changes_it(
+    planned, beta2, steps
+):
+    setup = assembled(steps=planned)
+    setup = replace(setup, schedule=replace(setup.schedule, total=steps))
+    assert rule_at(setup, 1) == AdamRule((0.9, beta2))
+    assert note_on_plan(setup) == tuple(n for n in setup.notes if "second moment" in n)
 
 
 def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(monkeypatch):
@@ -122,9 +155,16 @@ def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(mo
 
 def test_where_the_clock_decides_the_rates_follow_its_plan():
     setup = assembled(steps=None, seconds=60.0)
-    note, hurried = (note for note in setup.notes if "rates" in note and "times" in note)
+    note, hurried = (note for note in setup.notes if "30,000 / steps" in note)
     assert note.endswith(" times (30,000 / steps)^0.45, at most 4.5")
-    assert hurried.startswith("in a run of fewer than 40 views of each training photo ")
+    assert hurried == (
+        "if these are fewer than 40 views of each training photo: (30,000 / steps)^0.65, at most "
+        "6.3, Adam's second moment averages over a 50th of the steps, 50 at least"
+    )
+    own = assembled(steps=None, seconds=60.0, rate_factor=2.0)
+    (note,) = (note for note in own.notes if "second moment" in note)
+    assert note.startswith("if these are") and "30,000" not in note
+    assert not any("moment" in n for n in assembled(steps=None, seconds=60.0, beta2=0.99).notes)
     shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
     published, planned = (rates_at(each, 1)["opacities"] for each in (setup, shorter))
     assert planned == pytest.approx(EIGHTH * published)
@@ -155,7 +195,7 @@ def test_the_batch_rule_follows_the_views(views):
 def test_adam_by_the_rule_is_torch_s():
     rng = torch.Generator().manual_seed(3)
     start = torch.randn(50, generator=rng)
-    rule, rate = Rule.for_views(4), 1e-2 * 2.0
+    rule, rate = AdamRule.for_views(4), 1e-2 * 2.0
     theirs = start.clone().requires_grad_()
     optimizer = torch.optim.Adam([theirs], lr=rate, betas=rule.betas, eps=rule.eps)
     ours, state = {"x": start.clone()}, AdamState()

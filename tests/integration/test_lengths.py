@@ -20,7 +20,6 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.budget import seconds_ahead
 from crossgrad_core.training.expected_cost import Crowd, cost_ahead, cost_of_run
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.room import Beginning
 from crossgrad_core.training.start import first_state
 
 
@@ -233,7 +232,7 @@ def test_what_is_no_k_is_refused_with_its_form(text, form):
 def test_views_that_are_ahead_cost_what_they_cost():
     settings = {"steps": 1000, "densifier": {"name": "none"}}
     plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
-    crowd = Crowd(Beginning(100), 100)
+    crowd = Crowd(start=100, present=100)
     assert cost_of_run(plain, crowd, 500) == cost_of_run(changing, crowd, 500) == 1000
     assert cost_ahead(changing, crowd, 500, 400) == 1200
 

@@ -39,6 +39,7 @@ USUAL: Mapping[str, Any] = {
     "start": "sfm",
     "sampler": "random",
     "views": 2,
+    "beta2": 0.999,
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.
@@ -47,6 +48,7 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "bundled filled": {"max_size": 80, "start": "filled"},
     **{each: {"backbone": each, "operator": "symmetric"} for each in BACKBONES},
     "exposure": {"exposure": "affine", "views": 3},
+    "hurried": {"beta2": None},
     "mcmc": {"densifier": "mcmc", "resolution": "octaves", "views": 1},
 }
 

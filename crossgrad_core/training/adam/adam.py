@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.adam import adam
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.training.adam.coefficients import (
     LARGEST,
     SMALLEST_NORMAL,
     TINY,
     Coefficients,
-    Rule,
 )
 
 #: A tensor, its gradient, its moments and its step.
@@ -29,7 +28,7 @@ def adam_step(
     grads: Mapping[str, Tensor | None],
     state: AdamState,
     lrs: Mapping[str, float],
-    rule: Rule = Rule(),  # noqa: B008 - a frozen value
+    rule: AdamRule = AdamRule(),  # noqa: B008 - a frozen value
     scales: Mapping[str, float] | None = None,
 ) -> None:
     """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
@@ -53,19 +52,19 @@ def adam_step(
     Source: Kingma and Ba 2015, algorithm 1.
     """
     _check(params, grads, rule.betas)
+    given = {name: grad for name in params if (grad := grads.get(name)) is not None}
+    # Looked up before the first step is counted.
+    numbers = {name: (lrs[name], 1.0 if scales is None else scales[name]) for name in given}
     updates = []
-    for name, param in params.items():
-        grad = grads.get(name)
-        if grad is None:
-            continue
-        scale = 1.0 if scales is None else scales[name]
-        step = counted(name, param, state, lrs[name], rule, scale)
+    for name, grad in given.items():
+        (lr, scale), param = numbers[name], params[name]
+        step = counted(name, param, state, lr, rule, scale)
         updates.append((param, grad, state.exp_avg[name], state.exp_avg_sq[name], step))
     update_tensors(updates)
 
 
 def counted(
-    name: str, param: Tensor, state: AdamState, lr: float, rule: Rule, scale: float
+    name: str, param: Tensor, state: AdamState, lr: float, rule: AdamRule, scale: float
 ) -> Coefficients:
     """Counts one more step of a tensor, whose moments start at zero; the coefficients of the step.
 
@@ -162,7 +161,7 @@ def _without(values: Tensor, floor: float) -> Tensor:
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 
-def _coefficients(count: int, lr: float, rule: Rule) -> Coefficients:
+def _coefficients(count: int, lr: float, rule: AdamRule) -> Coefficients:
     (beta1, beta2), age = rule.betas, count * rule.age
     return Coefficients(
         beta1=beta1,

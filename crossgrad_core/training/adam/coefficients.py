@@ -2,11 +2,6 @@
 
 from dataclasses import dataclass
 from math import sqrt
-from typing import Final
-
-#: Added to the root of the second moment (3DGS).
-EPS = 1e-15
-
 
 # Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
 # less than 1e-14 of its learning rate, but as they decay they would become subnormal.
@@ -21,44 +16,6 @@ SMALLEST_NORMAL = 2.0**-126
 # Gradients are clamped to this size, because the square of a larger one overflows float32 and an
 # infinite second moment would stop its parameter for good.
 LARGEST = 1e18
-
-
-#: Decay of the first and of the second moment (3DGS).
-BETAS: Final = (0.9, 0.999)
-#: More views than this leave the first moment no memory under the batch rule.
-MOST_VIEWS: Final = 10
-
-
-@dataclass(frozen=True)
-class Rule:
-    """How Adam averages.
-
-    Attributes:
-        betas: Decay of the first and the second moment, each in [0, 1).
-        eps: Added to the root of the second moment.
-        age: What a tensor's count of steps is multiplied by before its bias is corrected.
-    """
-
-    betas: tuple[float, float] = BETAS
-    eps: float = EPS
-    age: float = 1.0
-
-    @classmethod
-    def for_views(cls, views: int, age: float = 1.0, betas: tuple[float, float] = BETAS) -> "Rule":
-        """The batch rule: moments forget as much per view as with one view per step.
-
-        Learning rates times sqrt(K) belong to it.
-
-        Args:
-            views: K, at most `MOST_VIEWS`.
-            age: Steps of K views that draw as many as the run has, over its steps; not 1 where K
-                changed.
-            betas: With one view per step.
-
-        Source: gsplat; Malladi et al. 2022 (square-root scaling), K views for K batches.
-        """
-        first, second = (max(0.0, 1.0 - views * (1.0 - beta)) for beta in betas)
-        return cls((first, second), EPS / sqrt(views), age)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,6 @@ from crossgrad_core.plugin import BlockKind, Model
 
 #: Bytes that the gradients of all probed views may take together.
 MEMORY = 512 * 2**20
-#: Adam's decay of squared gradients and its epsilon, as in training.
-_BETA2 = 0.999
-_EPS = 1e-15
 
 _Gradients = dict[str, Tensor]
 
@@ -164,6 +161,7 @@ def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradient
     The next step adds squared gradients to the moment first; here their mean over the probed views,
     so that all views share one metric. Elements that training never touched stay bounded by it.
     """
+    beta2 = model.rule.betas[1]
     for name, moment in model.adam.exp_avg_sq.items():
         having = [each for each in gradients if name in each]
         if not having:
@@ -172,8 +170,8 @@ def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradient
         for each in having:
             mean.addcmul_(each[name], each[name], value=1.0 / len(gradients))
         lengthened = 1.0 / subset.share if name in subset.tensors else 1.0
-        second = _BETA2 * subset.plain(name, moment) + (1.0 - _BETA2) * mean / lengthened
-        correction = 1.0 - _BETA2 ** (model.adam.steps[name] + 1)
-        root = (second / correction).sqrt_().add_(_EPS)
+        second = beta2 * subset.plain(name, moment) + (1.0 - beta2) * mean / lengthened
+        correction = 1.0 - beta2 ** ((model.adam.steps[name] + 1) * model.rule.age)
+        root = (second / correction).sqrt_().add_(model.rule.eps)
         for each in having:
             each[name] = each[name] / root

@@ -70,21 +70,17 @@ def count(evidence: Evidence) -> Decision:
         "as suits the length",
         "default",
         "",
-        "30,000, the start's, or one for 500 pixels of the photos, more in longer runs; no bound "
-        "from 30,000 views on",
+        "30,000 or the start's, more in longer runs; no bound from 30,000 views on",
         "docs/schedules.md (Taming 3DGS, metal-gauss)",
         "--max-gaussians N",
     )
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
     views = views_of_steps(evidence).paced(steps).views(steps)
-    cameras = [view.camera for view in evidence.scene.train_views]
-    pixels = sum(camera.width * camera.height for camera in cameras)
-    budget = usual_budget(points, views, pixels)
+    budget = usual_budget(points, views)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
-        f"{points:,} points, {views:,} views, {pixels / 1e6:.1f} MP: {shown}",
-        figures={"points": points, "views": views, "pixels": pixels},
+        f"{points:,} points, {views:,} views: {shown}", figures={"points": points, "views": views}
     )
 
 

@@ -6,14 +6,14 @@ import numba
 import pytest
 import torch
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.training.adam.adam import (
     adam_step,
     update_on_gpu,
     update_reference,
     update_tensors,
 )
-from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients, Rule
+from crossgrad_core.training.adam.coefficients import LARGEST, Coefficients
 
 SHAPES = {"means": (50, 3), "f_rest": (50, 15, 3), "opacities": (50,), "empty": (0, 3)}
 RATES = {"means": 1e-2, "f_rest": 1e-3, "opacities": 5e-2, "empty": 1.0}
@@ -197,7 +197,7 @@ def test_a_graph_over_old_values_notices_the_step():
     [
         (torch.ones(4), {}),
         (torch.ones(3).double(), {}),
-        (torch.ones(3), {"rule": Rule(betas=(0.9, 1.0))}),
+        (torch.ones(3), {"rule": AdamRule(betas=(0.9, 1.0))}),
     ],
 )
 def test_wrong_arguments_are_refused(grad, options):
@@ -226,6 +226,34 @@ def test_what_nothing_has_moved_yet_stays_and_all_else_does_not(last):
             still[2**16 + at] = False
             assert torch.equal(mine[still], other[still])
         assert (ours[3] != 0).any() or last == "exp_avg"
+
+
+def test_tensors_of_any_size_get_their_own_steps_in_one_call():
+    rng = torch.Generator().manual_seed(6)
+    sizes = {"small": 7, "one": 2**16, "empty": 0, "more": 2**16 + 1, "many": 3 * 2**16 + 5}
+    together = {name: torch.randn(size, generator=rng) for name, size in sizes.items()}
+    together["exact"] = torch.randn(9, generator=rng, dtype=torch.float64)
+    together["turned"] = torch.randn(4, 5, generator=rng).T
+    apart = {name: tensor.clone() for name, tensor in together.items()}
+    rates = {name: 1e-3 * (place + 1) for place, name in enumerate(together)}
+    state, own = AdamState(), {name: AdamState() for name in together}
+    for _ in range(3):
+        grads = {
+            name: torch.randn(t.shape, generator=rng, dtype=t.dtype) for name, t in together.items()
+        }
+        adam_step(together, grads, state, rates)
+        for name, tensor in apart.items():
+            adam_step({name: tensor}, {name: grads[name]}, own[name], rates)
+    for name, tensor in apart.items():
+        assert torch.equal(together[name], tensor), name
+        assert torch.equal(state.exp_avg_sq[name], own[name].exp_avg_sq[name]), name
+
+
+def test_a_tensor_without_a_rate_leaves_all_as_they_were():
+    params, state = {"x": torch.ones(3), "y": torch.ones(3)}, AdamState()
+    with pytest.raises(KeyError):
+        adam_step(params, {"x": torch.ones(3), "y": torch.ones(3)}, state, {"x": 1e-2})
+    assert torch.equal(params["x"], torch.ones(3)) and not state.steps.get("x")
 
 
 def test_not_a_number_is_not_left_out():

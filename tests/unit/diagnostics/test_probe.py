@@ -1,11 +1,13 @@
 """Probes: right dot products in both metrics, nothing changed, views and rows chosen well."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from crossgrad_core.commands import write_table
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
@@ -67,14 +69,16 @@ def test_gramians_hold_the_dot_products_of_each_view_s_own_gradient(model):
         np.testing.assert_allclose(found.plain[place], expected, rtol=1e-5, atol=1e-12)
 
 
-def test_adam_s_metric_divides_by_the_root_that_the_next_step_would_have(model):
+@pytest.mark.parametrize("rule", [AdamRule(), AdamRule((0.9, 0.98)), AdamRule.for_views(4, 0.7)])
+def test_adam_s_metric_divides_by_the_root_that_the_next_step_would_have(model, rule):
+    model, beta2 = replace(model, rule=rule), rule.betas[1]
     found = measure(model, VIEWS, np.random.default_rng(0))
     each = [gradients(model, view) for view in VIEWS]
     for place, name in enumerate(found.blocks):
         rows = np.stack([g[name].double().numpy().ravel() for g in each])
         before = model.adam.exp_avg_sq[name].double().numpy().ravel()
-        second = 0.999 * before + 0.001 * (rows**2).mean(axis=0)
-        rows = rows / (np.sqrt(second / (1 - 0.999**4)) + 1e-15)
+        second = beta2 * before + (1 - beta2) * (rows**2).mean(axis=0)
+        rows = rows / (np.sqrt(second / (1 - beta2 ** (4 * rule.age))) + rule.eps)
         np.testing.assert_allclose(found.adam[place], rows @ rows.T, rtol=1e-3, atol=1e-8)
 
 

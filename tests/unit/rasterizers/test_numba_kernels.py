@@ -15,6 +15,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
     GaussianArrays,
+    in_lines,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
@@ -426,6 +427,13 @@ def test_bits_do_not_depend_on_who_does_which_job(threads, monkeypatch):
     np.testing.assert_array_equal(frame.image, again.image)
     np.testing.assert_array_equal(frame.pixels, again.pixels)
     same_bits(gradients, gradients_again)
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 1_000_000])
+def test_rows_of_sixteen_numbers_fill_cache_lines(count):
+    room = in_lines(count)
+    assert room.shape == (count,) and room.dtype == np.float32
+    assert count == 0 or room.ctypes.data % 64 == 0
 
 
 def test_two_frames_live_side_by_side():

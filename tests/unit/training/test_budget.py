@@ -8,7 +8,6 @@ import pytest
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
@@ -26,7 +25,7 @@ from crossgrad_core.training.budget import (
 )
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.expected_cost import Crowd, cost_of_run, growth_ahead
-from crossgrad_core.training.room import Beginning, curve, usual_budget
+from crossgrad_core.training.room import curve, usual_budget
 from crossgrad_core.training.schedules import growth_note
 
 
@@ -54,7 +53,6 @@ class Run:
     hook: Hook = field(default_factory=Hook)
     notes: tuple[str, ...] = ("a note on the scene",)
     pixel_share: float = 0.6
-    train_views: tuple[View, ...] = ()
 
 
 def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
@@ -70,7 +68,7 @@ def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
 
 
 #: As many primitives as at the start.
-CROWD = Crowd(Beginning(1000), 1000)
+CROWD = Crowd(start=1000, present=1000)
 
 
 def reached(step, present=1000):
@@ -117,14 +115,14 @@ def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
 def along_the_curve(steps, start):
     """A run whose growth follows the curve, on the sample scene."""
     run = assemble(RunConfig(steps=steps, views=2), sample_scene(), "none")
-    return run, Crowd(Beginning(start), start)
+    return run, Crowd(start, start)
 
 
 def test_growth_along_the_curve_costs_what_the_curve_adds():
     run, crowd = along_the_curve(1000, 30_000)
     camera = run.train_views[0].camera
     empty = camera.width * camera.height / 8.0
-    budget = usual_budget(30_000, 2000, 0)
+    budget = usual_budget(30_000, 2000)
     ends = [*run.schedule.edit_steps(), 1000]
     edits = run.schedule.edits()
     assert edits == len(ends) - 1 > 5
@@ -133,7 +131,7 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
     mean = sum(n * (empty + count) for n, count in zip(steps, counts, strict=True)) / 1000
     assert growth_ahead(run, crowd, run.schedule, 0) == pytest.approx(mean / (empty + 30_000))
     # What was not added is not counted on: half-way the run has fewer than the curve allows.
-    behind = growth_ahead(run, Crowd(Beginning(30_000), 31_000), run.schedule, ends[-4])
+    behind = growth_ahead(run, Crowd(30_000, 31_000), run.schedule, ends[-4])
     left = zip(steps[-3:], [31_000, *counts[-2:]], strict=True)
     mean = sum(n * (empty + count) for n, count in left) / sum(steps[-3:])
     assert behind == pytest.approx(mean / (empty + 31_000))
@@ -141,12 +139,12 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
 
 def test_growth_along_the_curve_is_never_taken_for_more_than_free_growth():
     run, _ = along_the_curve(2000, 1)
-    assert growth_ahead(run, Crowd(Beginning(1), 1), run.schedule, 0) == 2.0
+    assert growth_ahead(run, Crowd(1, 1), run.schedule, 0) == 2.0
 
 
 def test_once_density_control_is_over_every_step_costs_the_same():
     run, _ = along_the_curve(2000, 30_000)
-    assert growth_ahead(run, Crowd(Beginning(30_000), 60_000), run.schedule, 1000) == 1.0
+    assert growth_ahead(run, Crowd(30_000, 60_000), run.schedule, 1000) == 1.0
 
 
 def test_without_density_control_every_step_costs_the_same():

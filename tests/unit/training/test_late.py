@@ -8,7 +8,7 @@ import torch
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.contexts import Regularized
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
@@ -20,7 +20,6 @@ from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
-from crossgrad_core.training.adam.coefficients import Rule
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
@@ -74,7 +73,7 @@ def test_late_steps_have_the_bits_of_steps_taken_at_once(monkeypatch, seed, most
     both = Both(
         torch.from_numpy(rng.normal(size=shape).astype(np.float32)) * 10.0 ** rng.uniform(-9, 3)
     )
-    rule = Rule.for_views(int(rng.integers(1, 11))) if seed % 2 else Rule()
+    rule = AdamRule.for_views(int(rng.integers(1, 11))) if seed % 2 else AdamRule()
     size, lr = 10.0 ** rng.uniform(-25, 3), 10.0 ** rng.uniform(-6, -1)
     for step in range(120):
         share = 0.0 if rng.random() < 0.6 else rng.random() ** 3
@@ -102,9 +101,9 @@ def long_wait():
     every, none = np.arange(64), np.zeros(0, np.int64)
     values = rng.normal(size=start.shape) * 10.0 ** rng.uniform(-12, 0, (64, 1, 1))
     rates = 1e-3 * 0.9997 ** np.arange(10_001)
-    both.step(every, values.astype(np.float32), rates[0], Rule())
+    both.step(every, values.astype(np.float32), rates[0], AdamRule())
     for rate in rates[1:]:
-        both.step(none, np.zeros((0, 3, 3), np.float32), rate, Rule())
+        both.step(none, np.zeros((0, 3, 3), np.float32), rate, AdamRule())
     both.catch_up()
     p, m, v = start.astype(np.float64), 0.0, 0.0
     gradient = values.astype(np.float32).astype(np.float64)
@@ -124,7 +123,9 @@ def test_with_many_rows_a_step_is_taken_with_all(monkeypatch, shape, share):
     both = Both(torch.from_numpy(rng.normal(size=shape).astype(np.float32)))
     for size in (0.02, share, share):
         rows = np.flatnonzero(np.repeat(rng.random(300) < size, 10))
-        both.step(rows, rng.normal(size=(len(rows), *shape[1:])).astype(np.float32), 1e-3, Rule())
+        both.step(
+            rows, rng.normal(size=(len(rows), *shape[1:])).astype(np.float32), 1e-3, AdamRule()
+        )
         assert ("x" in both.late.names) == (size < 0.2)
     assert both.same()
 
@@ -146,9 +147,9 @@ def test_what_is_not_a_number_stays_visible():
     both = Both(torch.ones(20, 3))
     values = np.ones((2, 3), np.float32)
     values[0, 1] = np.nan
-    both.step(np.array([3, 7]), values, 1e-3, Rule())
+    both.step(np.array([3, 7]), values, 1e-3, AdamRule())
     for _ in range(70):
-        both.step(np.array([5]), values[1:], 1e-3, Rule())
+        both.step(np.array([5]), values[1:], 1e-3, AdamRule())
     both.catch_up()
     assert both.rows.isnan().nonzero().tolist() == [[3, 1]]
 
@@ -359,7 +360,7 @@ def behind():
     for step in range(3):
         rows = torch.tensor([0, 1, 2] if step == 0 else [0, 2])
         gradient = by_rows(rows, torch.ones(len(rows), 2), (3, 2))
-        coefficients = counted("x", state.tensors["x"], state.moments, 0.1, Rule(), 1.0)
+        coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
         state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     return state
 
@@ -388,7 +389,7 @@ def test_going_back_forgets_what_was_late():
     snapshot = Snapshot.of(state)
     kept = state.tensors["x"].clone()
     gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
-    coefficients = counted("x", state.tensors["x"], state.moments, 0.1, Rule(), 1.0)
+    coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
     state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     snapshot._restore_tensors(state)
     assert not state.late.names and torch.equal(state.parameters["x"], kept)

@@ -25,7 +25,7 @@ from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import room
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.room import STATE, Beginning, began_with, bound_of, curve, usual_budget
+from crossgrad_core.training.room import bound_of, curve, usual_budget
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.start import first_state, thinned, told_of_start
 
@@ -240,35 +240,18 @@ def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
 
 
 def test_budgets_by_length():
-    assert [usual_budget(20_000, length, 0) for length in (1, 300, 1_000)] == [
-        30_001,
-        30_303,
-        31_034,
-    ]
-    assert usual_budget(20_000, 10_000, 0) == 150_000
+    assert [usual_budget(20_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
+    assert usual_budget(20_000, 10_000) == 150_000
     starts = (0, 5_000, 7_000, 15_000, 16_000, 30_000, 31_000)
-    budgets = [usual_budget(start, 0, 0) for start in starts]
+    budgets = [usual_budget(start, 0) for start in starts]
     assert budgets == [10_000, 10_000, 14_000, 30_000, 30_000, 30_000, 31_000]
-    assert usual_budget(90_000, 1_000, 0) == 93_103
-    assert usual_budget(90_000, 10_000, 0) == 450_000
-    assert usual_budget(5_000, 29_999, 0) > 10**9
+    assert usual_budget(90_000, 1_000) == 93_103
+    assert usual_budget(90_000, 10_000) == 450_000
+    assert usual_budget(5_000, 29_999) > 10**9
     lengths = range(1_000, 30_001, 500)
-    budgets = [usual_budget(0, length, 0) for length in lengths]
+    budgets = [usual_budget(0, length) for length in lengths]
     assert budgets == sorted(set(budgets))
     assert budgets[-1] == sys.maxsize
-
-
-def test_a_budget_for_many_pixels():
-    """One primitive for each 500 of them, though no more than twice as many as at the start."""
-    pixels = (15_000_000, 15_500_000, 20_000_000, 30_000_000)
-    assert [usual_budget(20_000, 0, each) for each in pixels] == [30_000, 31_000, 40_000, 40_000]
-    assert usual_budget(50_000, 0, 30_000_000) == 60_000
-
-
-def test_a_run_of_an_earlier_version_keeps_its_budget():
-    setup = setup_of("adc", max_gaussians="auto", growth="curve")
-    state = SimpleNamespace(states={STATE: PluginState({"start": 70})})
-    assert began_with(setup, state) == Beginning(70, 0)
 
 
 @pytest.mark.parametrize("longer", [700, 3_000, 5_000])
@@ -287,9 +270,7 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
         state.step = step
         if step <= schedule.total and schedule.densifies(step):
             densifier = SimpleNamespace(budgeted=True)
-            setup = SimpleNamespace(
-                config=config, schedule=schedule, densifier=densifier, train_views=()
-            )
+            setup = SimpleNamespace(config=config, schedule=schedule, densifier=densifier)
             present = max(present, room._most(setup, state))
             reached.append(present)
     assert len(reached) >= 3

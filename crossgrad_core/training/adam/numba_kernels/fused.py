@@ -1,4 +1,4 @@
-"""Adam's update of one float32 tensor in a single pass over memory (Numba, CPU)."""
+"""Adam's update of float32 tensors in a single pass over memory (Numba, CPU)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -126,6 +126,6 @@ def update_arrays(updates: Sequence[Arrays]) -> None:
     addresses = np.array([[one.ctypes.data for one in four] for four in arrays], np.int64)
     sizes = np.array([each.param.size for each in updates], np.int64)
     numbers = np.array([numbers_of(each.step) for each in updates], np.float32)
-    # A single chunk is not worth waking other threads for.
+    # No more elements than a chunk has are not worth waking other threads for.
     run = alone if sizes.sum() <= _CHUNK else share
     run(_update_chunks, addresses.reshape(-1, 4), sizes, numbers.reshape(-1, 9))

@@ -6,12 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.numerics.simd import WIDE
 from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import KernelCamera
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
+
+
+def in_lines(count: int) -> Float32:
+    """Returns room for so many numbers that begins a cache line, which holds `WIDE` of them.
+
+    NumPy's own large arrays begin 16 bytes behind one.
+    """
+    room = np.empty(count + WIDE, np.float32)
+    shift = -(room.ctypes.data // room.itemsize) % WIDE
+    return room[shift : shift + count]
 
 
 @dataclass(frozen=True)

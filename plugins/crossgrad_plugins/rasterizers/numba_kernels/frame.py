@@ -18,6 +18,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     Int64,
     Projected,
     TileLists,
+    in_lines,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.backward import differentiate
 from crossgrad_plugins.rasterizers.numba_kernels.binning import (
@@ -110,7 +111,7 @@ def backward(
         frame.projected,
         frame.lists,
     )
-    partials = _lines((lists.slots + 1) * PARTIAL)
+    partials = in_lines((lists.slots + 1) * PARTIAL)
     partials[-PARTIAL:] = 0.0
     written = np.zeros(lists.slots, np.uint8)
     share(
@@ -295,17 +296,6 @@ def _analytic(options: DrawOptions) -> Float32 | None:
     return np.empty(0, np.float32) if options.response == "analytic" else None
 
 
-#: Numbers in a cache line.
-LINE = 16
-
-
-def _lines(count: int) -> Float32:
-    """Room for so many numbers that begins a cache line, as each record and each sum then does."""
-    room = np.empty(count + LINE, np.float32)
-    shift = -(room.ctypes.data // room.itemsize) % LINE
-    return room[shift : shift + count]
-
-
 def _dilation(options: DrawOptions) -> float:
     return 0.0 if options.response == "analytic" else options.dilation
 
@@ -318,7 +308,7 @@ def _project(
     projected = Projected(
         camera=pinhole(camera.viewmat, camera.intrinsics, camera.width, camera.height),
         radii=np.empty(count, np.int32),
-        records=_lines(count * RECORD),
+        records=in_lines(count * RECORD),
         owners=np.empty(count, np.int32),
         drawn=np.empty(chunks, np.int64),
         limits=np.empty((count, 2), np.int32) if options.squares else None,
