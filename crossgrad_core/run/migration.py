@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crossgrad_core.contract.adam_state import BETAS
 from crossgrad_core.defaults import BARE_START, METRICS_OF_0_1
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
@@ -59,7 +58,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         # and ends as it did.
         rest.setdefault("events", "steps")
         rest.setdefault("rate_factor", 1.0)
-        rest.setdefault("beta2", BETAS[1])
+        rest.setdefault("beta2", 0.999)
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)
