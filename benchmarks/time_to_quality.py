@@ -29,7 +29,7 @@ import shutil
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
@@ -40,7 +40,7 @@ import viewer
 
 import crossgrad_core as cg
 from crossgrad_core.contract.scene import Scene
-from crossgrad_plugins.compare.statistics.estimate import estimate
+from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
 from crossgrad_plugins.compare.statistics.verdict import verdicts
 
 Row = dict[str, Any]
@@ -153,7 +153,7 @@ def _mean_colour(scene: Scene) -> float:
 
 
 def table(given: argparse.Namespace) -> None:
-    """Prints means and standard deviations, and what the code `new` gains over `old`."""
+    """Prints means and standard deviations, and what each code gains over `old`."""
     by_case: dict[tuple[str, str], dict[str, dict[int, Row]]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
@@ -164,18 +164,47 @@ def table(given: argparse.Namespace) -> None:
     for (scene, _), codes in cases:
         for code, own in sorted(codes.items(), reverse=True):
             print(f"| {scene} | {code} | {' | '.join(_cells(list(own.values())))} |")
-    found = []
+    old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
-        if seeds := sorted(codes.get("old", {}).keys() & codes.get("new", {}).keys()):
-            gains = [codes["new"][seed]["ply"] - codes["old"][seed]["ply"] for seed in seeds]
-            found.append((scene, lengths, estimate(gains, [scene] * len(gains), 0.1)))
-    print(f"\n| scene | seconds, old:new | new - old, dB | 95 % | seeds | verdict |\n{'|---' * 6}|")
-    for (scene, lengths, each), verdict in zip(
-        found, verdicts([e for *_, e in found]), strict=True
-    ):
-        low, high = each.wide
-        row = f"{each.center:+.2f} | [{low:+.2f}, {high:+.2f}] | {each.pairs} | {verdict.value}"
-        print(f"| {scene} | {lengths} | {row} |")
+        if "old" in codes:
+            # A code that ran alone is held against the first ones that ran as long as `old` did.
+            old[scene, lengths] = codes["old"]
+            old.setdefault((scene, lengths.split(":")[0]), codes["old"])
+    for code in sorted({code for _, codes in cases for code in codes} - {"old"}):
+        _print_gains(code, cases, old)
+
+
+def _print_gains(
+    code: str,
+    cases: Sequence[tuple[tuple[str, str], dict[str, dict[int, Row]]]],
+    old: Mapping[tuple[str, str], dict[int, Row]],
+) -> None:
+    """Prints what a code gains over `old`: by scene, and over the scenes of the same lengths."""
+    gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
+    for (scene, lengths), codes in cases:
+        before, now = old.get((scene, lengths), {}), codes.get(code, {})
+        if seeds := sorted(before.keys() & now.keys()):
+            gains[lengths][scene] = [now[seed]["ply"] - before[seed]["ply"] for seed in seeds]
+    found = [
+        (scene, lengths, estimate(own, [scene] * len(own), 0.1))
+        for lengths, by_scene in gains.items()
+        for scene, own in by_scene.items()
+    ]
+    titles = f"scene | seconds | {code} - old, dB | 95 % | 90 % | pairs | verdict"
+    print(f"\n| {titles} |\n{'|---' * 7}|")
+    for (*what, each), verdict in zip(found, verdicts([e for *_, e in found]), strict=True):
+        print(f"| {' | '.join([*what, *_gain(each), verdict.value])} |")
+    for lengths, by_scene in gains.items():
+        if len(by_scene) > 1:
+            own = [gain for each in by_scene.values() for gain in each]
+            scenes = [scene for scene, each in by_scene.items() for _ in each]
+            print(f"| all | {lengths} | {' | '.join(_gain(estimate(own, scenes, 0.1)))} | |")
+
+
+def _gain(each: Estimate) -> Iterator[str]:
+    yield f"{each.center:+.2f}"
+    yield from (f"[{low:+.2f}, {high:+.2f}]" for low, high in (each.wide, each.narrow))
+    yield str(each.pairs)
 
 
 def share(given: argparse.Namespace) -> None:

@@ -67,8 +67,7 @@ def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float,
         return first, config.beta2
     if not in_a_hurry(config, schedule, photos):
         return BETAS
-    steps = _planned(config, schedule)
-    memory = max(LEAST_MEMORY, MEMORY * steps)
+    steps, memory = _planned(config, schedule), _memory(config, schedule)
     if config.batch_rule == "sqrt":
         # K times as fast with K views per step; the floor is one of steps all the same.
         memory *= schedule.pace.views(steps) / steps
@@ -83,6 +82,11 @@ def _length(schedule: Schedule) -> int:
 def _planned(config: RunConfig, schedule: Schedule) -> int:
     """Steps of the run as it was planned."""
     return (schedule.mode == "scaled" and config.steps) or _length(schedule)
+
+
+def _memory(config: RunConfig, schedule: Schedule) -> float:
+    """Steps that the second moment averages over in a hurried run."""
+    return max(LEAST_MEMORY, MEMORY * _planned(config, schedule))
 
 
 def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, ...]:
@@ -120,10 +124,9 @@ def note_on_plan(setup: Setup) -> tuple[str, ...]:
 
 
 def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
-    memory = max(LEAST_MEMORY, MEMORY * _planned(config, schedule))
     return (
         f"fewer than {HURRY} views of each training photo: Adam's second moment averages over "
-        f"{memory:,.0f} steps (--set beta2=0.999 has what longer runs have)"
+        f"{_memory(config, schedule):,.0f} steps (--set beta2=0.999 has what longer runs have)"
     )
 
 
