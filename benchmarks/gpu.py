@@ -1,13 +1,17 @@
-"""Step times and quality on a GPU, as one table; what is there already is not measured again.
+"""Step times, memory and quality on a GPU, as one table; what is there is not measured again.
 
     python benchmarks/gpu.py SCENE                                 # all of it
     python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
+    python benchmarks/gpu.py SCENE --parts sizes steps
 
-Every rasterizer that runs on the GPU trains SCENE with every backbone, K and operator for a few
-hundred steps without density control, then for 30,000 steps as published. With the folder of
-gsplat's examples, gsplat's own trainer takes as many steps on the same scene. Runs, gpu.csv, the
-curves of the long runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the
-same command goes on. Without a GPU it ends with exit code 2.
+`sizes` takes steps of a made-up cloud of Gaussians, all of them seen, in photos of one megapixel;
+`steps` takes steps of SCENE with every rasterizer that runs on the GPU, every backbone, K and
+operator. Both are steps in the midst of density control, between two edits, with SH degree 3, in
+this process: seconds of the clock from an idle GPU to an idle GPU. `long` trains SCENE for 30,000
+steps as published, in processes of their own. With the folder of gsplat's examples, gsplat's own
+trainer takes as many steps on the same scene. Runs, gpu.csv, the curves of the long runs
+(gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the same command goes on.
+Without a GPU it ends with exit code 2.
 """
 
 import argparse
@@ -15,21 +19,35 @@ import csv
 import json
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
-from typing import Any
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
 
 from _machine import code, facts
 
+from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.reading import read_run
+
+if TYPE_CHECKING:
+    from crossgrad_core.training.setup import Setup
+    from crossgrad_core.training.state import TrainState
 
 #: The last one is the readable reference: it takes part where K is 1, for comparison.
 RASTERIZERS = ("gsplat", "gswarp", "torch")
 BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
 VIEWS = (1, 2, 4, 8)
 OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
+#: Gaussians of the made-up clouds, and megapixels of their photos.
+SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
+#: Of gsplat's trainer, which has no name among the rasterizers.
+THEIRS = "gsplat's trainer"
+PARTS = ("sizes", "steps", "long")
+#: The step of the published schedule at which a measured case begins.
+STEP = 5_010
 COLUMNS = (
     "part", "rasterizer", "backbone", "views", "operator", "steps", "ms_per_step",
     "views_per_second", "train_seconds", "psnr", "primitives", "peak_mib", "note", "gpu", "torch",
@@ -40,15 +58,16 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Case:
-    """One run.
+    """One row.
 
     Attributes:
-        part: `steps` or `long`.
+        part: `sizes`, `steps` or `long`.
         rasterizer: Its name.
         backbone: Its name.
         views: K.
         operator: Its name.
-        steps: How many it takes.
+        steps: How many are measured.
+        gaussians: Of a made-up cloud; 0 for SCENE.
     """
 
     part: str
@@ -57,6 +76,7 @@ class Case:
     views: int
     operator: str
     steps: int
+    gaussians: int = 0
 
     @property
     def name(self) -> str:
@@ -64,7 +84,7 @@ class Case:
         return "-".join(map(str, vars(self).values()))
 
     def command(self, scene: Path, out: Path) -> list[str]:
-        """The command that trains it."""
+        """The command that trains a long run."""
         options = {
             "--device": "cuda",
             "--rasterizer": self.rasterizer,
@@ -75,27 +95,126 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
+            "--schedule": "absolute",
+            "--eval-every": max(1, self.steps // 10),
         }
-        if self.part == "steps":
-            options |= {"--densifier": "none", "--eval-every": self.steps}
-        else:
-            options |= {"--schedule": "absolute", "--eval-every": max(1, self.steps // 30)}
         given = [str(part) for pair in options.items() for part in pair]
         return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
 
+    def config(self, scene: Path) -> dict[str, Any]:
+        """The settings of a case that is measured in this process."""
+        return {
+            "scene": str(scene),
+            "device": "cuda",
+            "rasterizer": {"name": self.rasterizer},
+            "backbone": {"name": self.backbone},
+            "sampler": {"name": "random"},
+            "views_per_step": self.views,
+            "operator": {"name": self.operator},
+            "steps": 30_000,
+            "schedule": "absolute",
+            "growth": "free",
+            "events": "steps",
+        }
+
 
 def cases(steps: int, long: int) -> Iterator[Case]:
-    """All runs, the short ones first."""
-    for rasterizer in RASTERIZERS:
-        for backbone in BACKBONES:
-            yield Case("steps", rasterizer, backbone, 1, "sum", steps)
-    for rasterizer in RASTERIZERS[:-1]:
-        for views in VIEWS[1:]:
-            for operator in OPERATORS:
-                yield Case("steps", rasterizer, "vanilla", views, operator, steps)
-    for rasterizer in RASTERIZERS[:-1]:
-        for views in VIEWS[:2]:
-            yield Case("long", rasterizer, "vanilla", views, "sum", long)
+    """All rows, the short ones first."""
+    fast = RASTERIZERS[:-1]
+    for rasterizer, count in product(fast, SIZES):
+        for views, operator in ((1, "sum"), (2, "pcgrad")):
+            yield Case("sizes", rasterizer, "vanilla", views, operator, steps, count)
+    for rasterizer, backbone in product(RASTERIZERS, BACKBONES):
+        yield Case("steps", rasterizer, backbone, 1, "sum", steps)
+    for rasterizer, views, operator in product(fast, VIEWS[1:], OPERATORS):
+        yield Case("steps", rasterizer, "vanilla", views, operator, steps)
+    for rasterizer, views in product(fast, VIEWS[:2]):
+        yield Case("long", rasterizer, "vanilla", views, "sum", long)
+
+
+class Short:
+    """Measures cases in this process, and remembers them in a file.
+
+    Args:
+        scene: SCENE.
+        kept: The file, one JSON line per case.
+    """
+
+    def __init__(self, scene: Path, kept: Path) -> None:
+        self._scene, self._kept = scene, kept
+        lines = kept.read_text(encoding="utf-8").splitlines() if kept.is_file() else []
+        self._known: dict[str, Row] = {row.pop("case"): row for row in map(json.loads, lines)}
+
+    def row(self, case: Case) -> Row:
+        """The figures of a case, or why it has none; refusals and figures stay."""
+        if case.name in self._known:
+            return self._known[case.name]
+        try:
+            found = self._measured(case)
+        except UserError as error:
+            found = {"note": " ".join(str(error).split())}
+        except Exception as error:  # One case must not end the table.
+            return _row(case, {"note": f"{type(error).__name__}: {error}"})
+        row = _row(case, found)
+        with self._kept.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"case": case.name, **row}) + "\n")
+        return row
+
+    def _measured(self, case: Case) -> Row:
+        import torch
+
+        device = torch.device("cuda")
+        setup, state = self._begun(case)
+        setup.rasterizer.burn_in("cuda")
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+        seconds = steady(setup, state, case.steps, lambda: torch.cuda.synchronize(device))
+        machine = facts()
+        return {
+            "ms_per_step": round(1e3 * seconds / case.steps, 2),
+            "views_per_second": round(case.steps * case.views / seconds, 1),
+            "primitives": state.primitives(setup),
+            "peak_mib": round(torch.cuda.max_memory_allocated() / 2**20, 1),
+            "gpu": torch.cuda.get_device_name(),
+            "torch": machine["torch"],
+            "code": code(),
+            "date": machine["date"],
+        }
+
+    def _begun(self, case: Case) -> "tuple[Setup, TrainState]":
+        from scale import Cell, Run
+
+        from crossgrad_core.commands import assemble, begin, configured, read_scene
+
+        if case.gaussians:
+            cell = Cell(
+                case.gaussians, case.gaussians, PIXELS, views=case.views, operator=case.operator
+            )
+            run = Run(cell, device="cuda", rasterizer={"name": case.rasterizer})
+            return run.setup, run.state
+        config = configured(case.config(self._scene))
+        scene, reader = read_scene(config)
+        setup = assemble(config, scene, reader)
+        state = begin(setup)
+        state.step = STEP
+        return setup, state
+
+
+def steady(setup: "Setup", state: "TrainState", steps: int, wait: Callable[[], None]) -> float:
+    """Seconds of `steps` steps, all photos being there and all kernels loaded."""
+    from crossgrad_core.training.loop import timed_step
+    from crossgrad_core.training.views import target_at
+
+    for index in range(len(setup.train_views)):
+        target_at(setup, state, index, 1.0)
+    for _ in range(max(3, steps // 6)):
+        timed_step(setup, state)
+    wait()
+    start = perf_counter()
+    for _ in range(steps):
+        timed_step(setup, state)
+    wait()
+    return perf_counter() - start
 
 
 def finished(folder: Path) -> Path | None:
@@ -126,16 +245,20 @@ def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
     return None, why
 
 
+def _row(case: Case, found: Row) -> Row:
+    own = {name: value for name, value in asdict(case).items() if name in COLUMNS}
+    return {**dict.fromkeys(COLUMNS, ""), **own, **found, "note": found.get("note", "")[:300]}
+
+
 def row_of(case: Case, run: Path | None, why: str) -> Row:
-    """The figures of a case, or why it has none."""
-    row: Row = {**dict.fromkeys(COLUMNS, ""), **vars(case), "note": why[:300]}
+    """The figures of a long run, or why it has none."""
     if run is None:
-        return row
+        return _row(case, {"note": why})
     results = read_run(run)
     summary: Mapping[str, Any] = results.summary or {}
     environment = summary["environment"]
     seconds = float(summary["train_seconds"])
-    return row | {
+    found = {
         "ms_per_step": round(1e3 * seconds / case.steps, 2),
         "views_per_second": round(case.steps * case.views / seconds, 1),
         "train_seconds": round(seconds, 2),
@@ -147,13 +270,14 @@ def row_of(case: Case, run: Path | None, why: str) -> Row:
         "code": environment["commit"] or environment["crossgrad"],
         "date": _written(run / "summary.json"),
     }
+    return _row(case, found)
 
 
 def theirs(examples: Path, scene: Path, out: Path, steps: int) -> Row:
     """Gsplat's own trainer on the same scene: its step time, PSNR and number of Gaussians."""
     folder = out / "runs" / f"gsplat-trainer-{steps}"
     row: Row = {**dict.fromkeys(COLUMNS, ""), "part": "long", "backbone": "vanilla", "views": 1}
-    row |= {"rasterizer": "gsplat's trainer", "operator": "sum", "steps": steps}
+    row |= {"rasterizer": THEIRS, "operator": "sum", "steps": steps}
     trained = folder / "stats" / f"train_step{steps - 1}_rank0.json"
     if not trained.is_file():
         options = ["--data_dir", scene, "--data_factor", 1, "--result_dir", folder]
@@ -237,9 +361,15 @@ def run_all(arguments: argparse.Namespace, gpu: str) -> None:
         write_csv(out / "gpu_curves.csv", ("run", "step", "train_seconds", "psnr"), curves)
         (out / "gpu.md").write_text(as_markdown(rows, described), encoding="utf-8")
 
+    short = Short(scene, out / "short.jsonl")
     for case in cases(arguments.steps, arguments.long):
+        if case.part not in arguments.parts:
+            continue
+        if case.part != "long":
+            write(short.row(case))
+            continue
         run, why = measured(case, scene, out)
-        if run is not None and case.part == "long":
+        if run is not None:
             curves.extend(curve_rows(case, run))
         write(row_of(case, run, why))
     if arguments.gsplat_examples is not None:
@@ -250,7 +380,8 @@ def main() -> None:
     """Runs the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--steps", type=int, default=60, help="measured steps of a short case")
     parser.add_argument("--long", type=int, default=30_000)
     parser.add_argument("--out", type=Path, default=Path("gpu"))
     parser.add_argument("--gsplat-examples", type=Path)

@@ -200,8 +200,8 @@ def _points(cell: Cell) -> np.ndarray:
     return np.asarray(world[rng.permutation(cell.gaussians)])
 
 
-def setup_of(cell: Cell) -> "Setup":
-    """The run of a cell."""
+def setup_of(cell: Cell, **options: object) -> "Setup":
+    """The run of a cell, with further options."""
     from crossgrad_core.commands import assemble, configured
 
     config = configured(
@@ -218,6 +218,7 @@ def setup_of(cell: Cell) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "free",
             "events": "steps",
+            **options,
         }
     )
     return assemble(config, scene_of(cell), "colmap")
@@ -228,13 +229,14 @@ class Run:
 
     Args:
         cell: What is run.
+        options: Further options of the run.
     """
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: Cell, **options: object) -> None:
         from crossgrad_core.commands import begin
         from crossgrad_core.training.keeper import Keeper
 
-        self.setup = setup_of(cell)
+        self.setup = setup_of(cell, **options)
         self.state: TrainState = begin(self.setup)
         self.state.step = STEP
         self.keeper = Keeper(self.state)

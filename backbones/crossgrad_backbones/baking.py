@@ -61,7 +61,7 @@ def as_plain(
 
 def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pixels right and down [N, 3] per local unit along each of the main axes [N, 3, 3]."""
-    pose = camera.world_to_camera.to(means)
+    pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)
     row_u = camera.fx / z * (pose[0, :3] - x / z * pose[2, :3])
     row_v = camera.fy / z * (pose[1, :3] - y / z * pose[2, :3])

@@ -60,7 +60,7 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
     z is the standardised log r of a camera, kept in the range of the training cameras: outside it
     a quadratic says nothing.
     """
-    centers = torch.stack([camera.center for camera in cameras]).to(scale)
+    centers = torch.stack([camera.center for camera in cameras]).to(scale, non_blocking=True)
     z = (_log_distances(centers, scale[:3]) - scale[3]) * scale[4]
     z = torch.minimum(torch.maximum(z, scale[5]), scale[6])
     return torch.stack([z.mean(), z.square().mean()])

@@ -16,7 +16,7 @@ from crossgrad_core.contract.state import PluginState
 def half_size(record: RenderedView, like: Tensor) -> Tensor:
     """[2] pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
     camera = record.camera
-    return torch.tensor([camera.width / 2, camera.height / 2]).to(like)
+    return torch.tensor([camera.width / 2, camera.height / 2]).to(like, non_blocking=True)
 
 
 def ndc_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:

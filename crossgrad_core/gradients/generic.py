@@ -89,7 +89,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
     """Writes the row-wise weighted sum of a column; `weights` is [N, K], 0 leaves a row out."""
     rows = len(weights)
     total = torch.zeros_like(out, dtype=torch.float64).view(rows, -1)
-    factors = torch.from_numpy(np.ascontiguousarray(weights.T)).to(out.device)
+    factors = torch.from_numpy(np.ascontiguousarray(weights.T)).to(out.device, non_blocking=True)
     for w, g in zip(factors, column, strict=True):
         if g is not None:
             wide = g.reshape(rows, -1).double()

@@ -67,7 +67,8 @@ def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
     if not share:
         return gaussians
     kept = state.rngs[STREAM].random(len(gaussians), dtype=np.float32) >= share
-    factors = torch.from_numpy(kept / np.float32(1.0 - share)).to(gaussians.opacities.device)
+    factors = torch.from_numpy(kept / np.float32(1.0 - share))
+    factors = factors.to(gaussians.opacities.device, non_blocking=True)
     raised = gaussians.opacities * factors
     # Cut off at 1, but not its gradient: what is nearly opaque could never fade.
     return replace(gaussians, opacities=raised - (raised.detach() - 1.0).clamp(min=0.0))

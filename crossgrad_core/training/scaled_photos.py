@@ -93,7 +93,8 @@ class DevicePhotos:
 def on_device(pair: Pair, device: torch.device) -> Pair:
     """A photo and its mask on a device."""
     image, mask = pair
-    return image.to(device), None if mask is None else mask.to(device)
+    moved = None if mask is None else mask.to(device, non_blocking=True)
+    return image.to(device, non_blocking=True), moved
 
 
 def _sizes(full: Camera, wanted: Camera) -> list[_Size]:

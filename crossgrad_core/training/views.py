@@ -407,7 +407,7 @@ def background_of(setup: Setup, state: TrainState) -> Tensor:
     """[3] RGB that the next training view is drawn over."""
     if setup.config.background == "random":
         rgb = state.rngs["background"].random(3).astype(np.float32)
-        return torch.from_numpy(rgb).to(setup.device)
+        return torch.from_numpy(rgb).to(setup.device, non_blocking=True)
     return eval_background(setup)
 
 
@@ -416,7 +416,7 @@ def eval_background(setup: Setup) -> Tensor:
     name = setup.config.background
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
-    return torch.tensor(rgb, dtype=torch.float32, device=setup.device)
+    return torch.tensor(rgb, dtype=torch.float32).to(setup.device, non_blocking=True)
 
 
 def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: TensorGradients) -> None:

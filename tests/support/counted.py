@@ -1,7 +1,8 @@
-"""A device of its own, in the machine's memory, that notes whenever a value is read back from it.
+"""A device of its own, in the machine's memory, that notes whenever the host would wait for it.
 
-A tensor there is no CPU tensor: code that asks takes the way of a GPU. Each of these operations
-would keep the host waiting for one.
+A tensor there is no CPU tensor: code that asks takes the way of a GPU. The host waits for one when
+a value is read back from it, and when a tensor is copied there in the ordinary way: the copy comes
+after all that the GPU still has to do.
 """
 
 from typing import Any, Final
@@ -17,6 +18,8 @@ NAME: Final = "counted"
 READING: Final = frozenset(
     {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_consecutive"}
 )
+#: A copy to the device that is not `non_blocking`.
+BLOCKING: Final = "a copy that waits"
 #: How torch makes a backend of Python code; not every version has it.
 REGISTER: Final = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
 
@@ -102,8 +105,11 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], reads: list[str]) -> Any:
         isinstance(each, Tensor) and each.dtype in {torch.bool, torch.uint8}
         for each in tree_leaves(args[1] if name == "index" else args[1:2])
     )
+    enters = wanted is not None and torch.device(wanted).type == NAME and not of_device
     if of_device and (name in READING or by_mask or leaves):
         reads.append(f"{name} to the CPU" if leaves else name)
+    elif enters and name == "_to_copy" and not kwargs.get("non_blocking"):
+        reads.append(BLOCKING)
     result = func(*tree_map(_raw, args), **tree_map(_raw, kwargs))
     if leaves or not (of_device or (wanted is not None and torch.device(wanted).type == NAME)):
         return result

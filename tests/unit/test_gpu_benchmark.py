@@ -5,6 +5,7 @@ import json
 import runpy
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,9 +15,11 @@ from support.run_folders import ENVIRONMENT, RunFolder
 from typer.testing import CliRunner
 
 from crossgrad_core.cli.main import app
+from crossgrad_core.commands import configured
 from crossgrad_core.errors import UserError
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
+SCENE = SCRIPT.parents[1] / "examples" / "scenes" / "boruszyn"
 VERSIONS = {**ENVIRONMENT, "gpu": "H", "commit": "abcdef0", "packages": {"torch": "2.13.0+cu130"}}
 
 
@@ -35,16 +38,56 @@ def test_without_a_gpu_it_says_so_and_ends_with_2(script, monkeypatch, capsys):
     assert "sees no GPU" in capsys.readouterr().err
 
 
-def test_every_command_is_one_that_crossgrad_takes(script, tmp_path):
+def test_every_case_is_one_that_crossgrad_takes(script, tmp_path):
     """All options are known; a machine without a GPU is the only thing to object to."""
-    for case in {case.part: case for case in script.cases(10, 60)}.values():
-        words = case.command(tmp_path, tmp_path / "out")
-        answer = CliRunner().invoke(app, words[3:])
-        assert isinstance(answer.exception, UserError), answer.output
-        assert answer.exception.where == "--device"
+    cases = list(script.cases(10, 60))
+    assert len(cases) == len({case.name for case in cases})
+    (long, *_) = [case for case in cases if case.part == "long"]
+    answer = CliRunner().invoke(app, long.command(tmp_path, tmp_path / "out")[3:])
+    assert isinstance(answer.exception, UserError), answer.output
+    assert answer.exception.where == "--device"
+    for case in cases:
+        configured(case.config(tmp_path))
 
 
-def test_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monkeypatch):
+@pytest.mark.parametrize("gaussians", [0, 500])
+def test_short_cases_are_steps_in_this_process(script, tmp_path, monkeypatch, gaussians):
+    """Measured here on the CPU, with what a GPU would be asked left out."""
+    cloud = import_module("scale").Run
+    begun, config, on_cpu = cloud.__init__, script.Case.config, {"device": "cpu"}
+    monkeypatch.setattr(cloud, "__init__", lambda run, cell, **o: begun(run, cell, **o | on_cpu))
+    monkeypatch.setattr(script.Case, "config", lambda *given: config(*given) | on_cpu)
+    for name in ("empty_cache", "reset_peak_memory_stats", "synchronize"):
+        monkeypatch.setattr(torch.cuda, name, lambda *_: None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 3 * 2**20)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "H")
+    short = script.Short(SCENE, tmp_path / "short.jsonl")
+    good = script.Case("steps", "numba", "vanilla", 2, "pcgrad", 3, gaussians)
+    refused = script.Case("steps", "numba", "vanilla", 1, "nobody", 3, gaussians)
+    row = short.row(good)
+    assert row["views_per_second"] == pytest.approx(2e3 / row["ms_per_step"], rel=0.02)
+    assert row["peak_mib"] == 3.0
+    assert gaussians in {0, row["primitives"]}
+    why = short.row(refused)
+    assert "nobody" in why["note"]
+    monkeypatch.setattr(script.Short, "_measured", None)
+    again = script.Short(SCENE, tmp_path / "short.jsonl")
+    assert again.row(good) == row
+    assert again.row(refused) == why
+
+
+def test_what_fails_is_noted_and_tried_again(script, tmp_path, monkeypatch):
+    def fails(_short, _case):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(script.Short, "_measured", fails)
+    short = script.Short(tmp_path, tmp_path / "short.jsonl")
+    row = short.row(script.Case("steps", "gsplat", "vanilla", 1, "sum", 3))
+    assert row["note"] == "RuntimeError: out of memory"
+    assert not (tmp_path / "short.jsonl").exists()
+
+
+def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monkeypatch):
     asked, run = [], subprocess.run
 
     def crossgrad(command, **options):
@@ -52,37 +95,40 @@ def test_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monkeypat
             return run(command, **options)
         asked.append(command)
         out = Path(command[command.index("--out") + 1])
-        if "mip" in command:
-            return SimpleNamespace(returncode=2, stderr="gswarp does\nnot | draw it")
-        if "octree" in command:
-            return SimpleNamespace(returncode=1, stderr="out of memory")
+        views = command[command.index("--views") + 1]
+        if "gswarp" in command:
+            why = "gswarp does\nnot | draw it", "out of memory"
+            return SimpleNamespace(returncode=int(views), stderr=why[views == "1"])
         RunFolder(steps=10, seconds=2.0, environment=VERSIONS).write(out)
         return SimpleNamespace(returncode=0, stderr="")
 
     monkeypatch.setattr(subprocess, "run", crossgrad)
     arguments = SimpleNamespace(
-        out=tmp_path / "gpu", scene=tmp_path, steps=10, long=10, gsplat_examples=None
+        out=tmp_path / "gpu",
+        scene=tmp_path,
+        steps=10,
+        long=10,
+        gsplat_examples=None,
+        parts=["long"],
     )
     script.run_all(arguments, "H")
-    cases = list(script.cases(10, 10))
-    assert len(asked) == len(cases) == len(set(cases))
+    cases = [case for case in script.cases(10, 10) if case.part == "long"]
+    assert len(asked) == len(cases) == 4
     with (tmp_path / "gpu" / "gpu.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     for row, case in zip(rows, cases, strict=True):
-        if case.backbone == "mip":
-            assert row["note"] == "gswarp does not | draw it"
-        elif case.backbone == "octree":
-            assert row["note"] == "out of memory"
+        if case.rasterizer == "gswarp":
+            expected = {1: "out of memory", 2: "gswarp does not | draw it"}
+            assert row["note"] == expected[case.views]
         else:
             assert float(row["ms_per_step"]) == 200.0
             assert row["code"] == "abcdef0"
     table = (tmp_path / "gpu" / "gpu.md").read_text()
     assert table.count("\n| ") == len(cases) + 1
-    assert len((tmp_path / "gpu" / "gpu_curves.csv").read_text().splitlines()) > 12
+    assert len((tmp_path / "gpu" / "gpu_curves.csv").read_text().splitlines()) > 4
     asked.clear()
     script.run_all(arguments, "H")
-    assert all("octree" in command for command in asked)
-    assert len(asked) == sum(case.backbone == "octree" for case in cases)
+    assert [command[command.index("--views") + 1] for command in asked] == ["1"]
 
 
 def test_the_trainer_of_gsplat_is_read_from_its_files(script, tmp_path):

@@ -121,7 +121,7 @@ def _look(
     anchors, offsets, features, log_scales = (
         parameters[name][seen.rows] for name in ("anchors", "offsets", "features", "scales")
     )
-    eye = camera.center.to(anchors)
+    eye = camera.center.to(anchors, non_blocking=True)
     raw = heads.raw(parameters, features, heads.views(anchors - eye), code)
     opacities = torch.tanh(raw.opacities).clamp(min=0.0)
     if seen.factor is not None:

@@ -35,7 +35,8 @@ def decoded(
         are left out.
     """
     positions = parameters["anchors"]
-    views = heads.views(positions.index_select(0, seen.rows) - camera.center.to(positions))
+    eye = camera.center.to(positions, non_blocking=True)
+    views = heads.views(positions.index_select(0, seen.rows) - eye)
     decode = _fused if _fusible(parameters) else _plain
     gaussians = decode(heads, parameters, seen, views, code)
     mask = torch.zeros(positions.shape[0], dtype=torch.bool, device=positions.device)

@@ -50,7 +50,7 @@ def _axes(camera: Camera) -> list[tuple[float, ...]]:
 
 
 def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
-    pose = camera.world_to_camera.to(positions)
+    pose = camera.world_to_camera.to(positions, non_blocking=True)
     *flat, depth = torch.addmm(pose[:3, 3], positions, pose[:3, :3].T).unbind(1)
     squares = torch.exp(2.0 * log_scales[:, :3])
     inside = depth > NEAR

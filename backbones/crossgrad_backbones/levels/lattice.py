@@ -72,7 +72,8 @@ class Lattice:
         """
         halves = 0.5 * self.root_cell * self._forks(-levels.to(anchors))
         squares = torch.zeros_like(halves)
-        for along, center in zip(anchors.unbind(1), camera.to(anchors).unbind(), strict=True):
+        at = camera.to(anchors, non_blocking=True)
+        for along, center in zip(anchors.unbind(1), at.unbind(), strict=True):
             squares += (along + halves - center).square()
         return squares.sqrt()
 

@@ -41,7 +41,7 @@ class PixelDensityControl(CloneSplit):
     def _nearness(self, record: ViewRecord) -> Tensor:
         """[N] in [0, 1], the factor f of each Gaussian in this view."""
         means = record.gaussians.means
-        pose = record.view.camera.world_to_camera.to(means)
+        pose = record.view.camera.world_to_camera.to(means, non_blocking=True)
         x, y, z = means.unbind(1)
         # No matrix product: its rounding depends on the number of threads.
         depths = x * pose[2, 0] + y * pose[2, 1] + z * pose[2, 2] + pose[2, 3]

@@ -75,7 +75,7 @@ class ExposurePerPhoto(Exposure):
 
     def _centred(self, values: Tensor) -> Tensor:
         """The values [P, V] in float64 with their mean where it belongs, in float32."""
-        neutral = self.neutral().to(values)
+        neutral = self.neutral().to(values, non_blocking=True)
         return self.moved(self.parameter, values, values.mean(dim=0), neutral).float()
 
     @override

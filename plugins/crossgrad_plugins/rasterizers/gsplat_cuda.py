@@ -141,14 +141,14 @@ def _batch(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def _center(gaussians: Gaussians, camera: Camera) -> Tensor:
-    return camera.center.to(gaussians.means)
+    return camera.center.to(gaussians.means, non_blocking=True)
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
     """Poses [K, 1, 4, 4] and calibrations [K, 1, 3, 3], copied to the device in one piece."""
     poses = torch.stack([camera.world_to_camera.reshape(-1) for camera in cameras])
     matrices = torch.stack([camera.matrix.reshape(-1) for camera in cameras])
-    both = torch.cat([poses, matrices], 1).to(like)
+    both = torch.cat([poses, matrices], 1).to(like, non_blocking=True)
     count = len(cameras)
     return {"viewmats": both[:, :16].view(count, 1, 4, 4), "Ks": both[:, 16:].view(count, 1, 3, 3)}
 

@@ -82,19 +82,20 @@ class GswarpRasterizer(Rasterizer):
     ) -> Render:
         if not len(gaussians):
             return nothing_drawn(camera, background, outputs)
-        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32).to(gaussians.means.device))
+        device = gaussians.means.device
+        screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=device))
         enlarged = _NEAR / self.near
         size = (camera.width / 2, camera.height / 2)
         call = Call(
             partial(_draw, screen, settings_of(camera, background, enlarged)),
-            partial(_observe, screen, gaussians.means.new_tensor(size)),
+            partial(_observe, screen, size),
         )
         tensors = [
             gaussians.means * enlarged,
             normalize(gaussians.quats, dim=-1),
             gaussians.scales * enlarged,
             gaussians.opacities[:, None],
-            view_colors(gaussians, camera.center.to(gaussians.means)),
+            view_colors(gaussians, camera.center.to(gaussians.means, non_blocking=True)),
         ]
         image, alpha, depth = drawn(call, tensors)
         return Render(
@@ -117,7 +118,7 @@ def settings_of(camera: Camera, background: Tensor, enlarged: float) -> dict[str
     projection[0, 0], projection[0, 2] = 2 * camera.fx / width, 2 * camera.cx / width - 1
     projection[1, 1], projection[1, 2] = 2 * camera.fy / height, 2 * camera.cy / height - 1
     projection[2, 2] = projection[3, 2] = 1.0
-    matrices = torch.stack([pose.T, (projection @ pose).T]).to(background)
+    matrices = torch.stack([pose.T, (projection @ pose).T]).to(background, non_blocking=True)
     return {
         "image_height": height,
         "image_width": width,
@@ -150,6 +151,7 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
     return Drawing((image, meta.alpha, meta.depth), centers)
 
 
-def _observe(screen: Screen, half: Tensor, _centers: Tensor, gradient: Tensor) -> None:
+def _observe(screen: Screen, half: tuple[float, float], _centers: Tensor, gradient: Tensor) -> None:
     """Notes the gradient [N, 3] by the projected means, which gswarp gives in NDC units."""
-    screen.mean_gradient = gradient[:, :2] / half
+    along = zip(gradient[:, :2].unbind(1), half, strict=True)
+    screen.mean_gradient = torch.stack([each / side for each, side in along], dim=1)

@@ -96,7 +96,8 @@ class TorchRasterizer(Rasterizer):
         projection = project(gaussians.means, gaussians.quats, gaussians.scales, camera)
         dilation = self.dilation if gaussians.dilation is None else gaussians.dilation
         shapes = shape(projection, gaussians.opacities, dilation, gaussians.response)
-        return projection, shapes, view_colors(gaussians, camera.center.to(gaussians.means))
+        eye = camera.center.to(gaussians.means, non_blocking=True)
+        return projection, shapes, view_colors(gaussians, eye)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
         """The Gaussians to draw, front to back, their tile boxes [V, 4], and all published radii.

@@ -3,6 +3,8 @@
 It is the readable definition and the oracle of the fused kernel.
 """
 
+from functools import cache
+
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -54,7 +56,7 @@ def l1_ssim_loss(
     if weights is not None:
         return _weighted((1 - ssim_weight) * absolute + ssim_weight * dissimilarity, mask, weights)
     if mask is None:
-        count = image.new_tensor(max(image.numel(), 1))
+        count = torch.full((), max(image.numel(), 1), dtype=image.dtype, device=image.device)
     else:
         dissimilarity = masked(dissimilarity, mask)
         count = (mask.sum() * image.shape[-1]).clamp(min=1)
@@ -90,6 +92,12 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     return ssim
 
 
+@cache
+def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The window where it is needed: copied there once, since a GPU is waited for meanwhile."""
+    return gaussian_window().to(device, dtype)
+
+
 def _windowed(fields: Tensor) -> Tensor:
     """Gaussian-weighted sums of [M, H, W, C] over the window around each pixel, same shape."""
     if fields.numel() == 0:
@@ -98,7 +106,7 @@ def _windowed(fields: Tensor) -> Tensor:
     # One group per plane: torch's depthwise convolution is the fastest of its ways on the CPU.
     planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
     groups = planes.shape[1]
-    weight = gaussian_window().to(fields).expand(groups, 1, WINDOW)
+    weight = _window_for(fields.dtype, fields.device).expand(groups, 1, WINDOW)
     planes = conv2d(planes, weight.unsqueeze(-1), padding=(RADIUS, 0), groups=groups)
     planes = conv2d(planes, weight.unsqueeze(-2), padding=(0, RADIUS), groups=groups)
     return planes.view(fields.shape).permute(0, 2, 3, 1)

@@ -34,14 +34,14 @@ def binned_directions(
         axes: [G, 2] from `longest_axes`.
         size: Width and height of the image, pixels.
     """
-    scaled = gradients * torch.tensor(size).to(gradients)[:, None, None]
+    scaled = gradients * torch.tensor(size).to(gradients, non_blocking=True)[:, None, None]
     # Divided by the larger one first: their squares could be below the smallest number.
     largest = scaled.abs().amax(0)
     moved = largest > 0
     scaled = scaled / torch.where(moved, largest, 1.0)
     units = scaled / torch.where(moved, scaled.square().sum(0).sqrt(), 1.0)
     along = (offsets * axes.T[:, None, :]).sum(0)  # [P, G]
-    edges = torch.tensor(EDGES).to(along)
+    edges = torch.tensor(EDGES).to(along, non_blocking=True)
     bins = torch.bucketize(along, edges, right=True)
     fields = torch.cat([units, gradients.abs(), moved[None].to(units)])  # [FIELDS, P, G]
     found = [torch.where(bins == number, fields, 0.0).sum(1) for number in range(BINS)]

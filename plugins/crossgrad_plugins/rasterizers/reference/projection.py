@@ -45,7 +45,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
         scales: [N, 3] local units.
         camera: The camera; cast to the type of `means`.
     """
-    pose = camera.world_to_camera.to(means)
+    pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     slope_x, slope_y = x / z, y / z
     u = camera.fx * slope_x + camera.cx

@@ -1,0 +1,258 @@
+"""What only a GPU can show: the kernels themselves, what a step waits for, and whole runs.
+
+Skipped where there is no CUDA device, as in CI; `docs/rasterizers.md` says how to run them on one.
+"""
+
+import warnings
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+from support.gaussians import posed_camera, random_gaussians
+from torch import Tensor
+
+from crossgrad_core.commands import assemble, begin, configured
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.loop import timed_step
+from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
+from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
+from crossgrad_plugins.rasterizers.gswarp_cuda import GswarpRasterizer
+from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+    # Of the packages and of torch, whose versions are the machine's.
+    pytest.mark.filterwarnings("default"),
+]
+
+RASTERIZERS = {"gsplat": GsplatRasterizer, "gswarp": GswarpRasterizer}
+#: The rasterizer that draws by the same rules.
+REFERENCES = {
+    "gsplat": TorchRasterizer(max_alpha=0.999),
+    "gswarp": TorchRasterizer(footprint="3-sigma"),
+}
+CAMERAS = {
+    "middle": posed_camera(160, 120, focal=130.0, principal=(0.5, 0.5)),
+    "narrow": posed_camera(333, 9, focal=200.0, principal=(0.5, 0.5)),
+    "one pixel": posed_camera(1, 1, focal=1.0, principal=(0.5, 0.5)),
+}
+#: One step between neighbouring values of alpha at the edge of a footprint.
+EDGE = 1.0 / 255.0
+TENSORS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
+
+
+@pytest.fixture(params=RASTERIZERS)
+def name(request):
+    if not RASTERIZERS[request.param].speed("cuda"):
+        pytest.skip(f"{request.param} is not installed, or cannot compile its kernels")
+    return request.param
+
+
+def leaves(gaussians, device, dtype):
+    return gaussians.mapped(lambda each: each.detach().to(device, dtype).requires_grad_())
+
+
+def drawn(rasterizer, gaussians, camera, *, cap=None):
+    """Image and gradients, on the CPU in float64, and the render."""
+    background = torch.tensor([0.1, 0.5, 0.3]).to(gaussians.means)
+    render = rasterizer.render(gaussians, camera, background, rasterizer.provides)
+    ramp = torch.linspace(0.5, 1.5, render.image.numel()).view(render.image.shape)
+    (render.image * ramp.to(render.image)).sum().backward()
+    own = {name: getattr(gaussians, name) for name in TENSORS}
+    gradients = {n: t.grad.double().cpu() for n, t in own.items() if isinstance(t, Tensor)}
+    return render.image.detach().double().cpu(), gradients, render
+
+
+def same_gradients(found, expected, share):
+    assert found.keys() == expected.keys()
+    for name, gradient in expected.items():
+        assert found[name].isfinite().all(), name
+        assert (found[name] - gradient).norm() <= share * gradient.norm(), name
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sh_degree", [None, 0, 3])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_images_and_gradients_are_those_of_float64(name, seed, sh_degree, camera):
+    scene = random_gaussians(400, camera, seed=seed, sh_degree=sh_degree, opacities=(0.05, 0.95))
+    image, gradients, _ = drawn(RASTERIZERS[name](), leaves(scene, "cuda", torch.float32), camera)
+    # What is rounded the other way at a threshold is rounded so before the oracle draws it.
+    rounded = leaves(scene.mapped(lambda each: each.float()), "cpu", torch.float64)
+    expected, wanted, _ = drawn(REFERENCES[name], rounded, camera)
+    error = (image - expected).abs()
+    assert error.max() <= 3 * EDGE
+    assert error.mean() <= 2e-5
+    same_gradients(gradients, wanted, 5e-3)
+
+
+@pytest.mark.parametrize("sh_degree", [None, 3])
+def test_antialiased_gaussians_are_those_of_the_rules(sh_degree):
+    camera = CAMERAS["middle"]
+    scene = random_gaussians(400, camera, sh_degree=sh_degree, response="antialiased")
+    image, gradients, _ = drawn(GsplatRasterizer(), leaves(scene, "cuda", torch.float32), camera)
+    expected, wanted, _ = drawn(REFERENCES["gsplat"], leaves(scene, "cpu", torch.float64), camera)
+    assert (image - expected).abs().max() <= 3 * EDGE
+    same_gradients(gradients, wanted, 5e-3)
+
+
+def extremes():
+    camera = CAMERAS["middle"]
+    usual = random_gaussians(300, camera, seed=5)
+    some = torch.arange(300) % 7 == 0
+
+    def changed(**tensors):
+        return replace(usual, **tensors)
+
+    eye = camera.center
+    return {
+        "tiny": changed(scales=usual.scales * 1e-6),
+        "huge": changed(scales=torch.where(some[:, None], 1e3, usual.scales)),
+        "needles": changed(scales=usual.scales * torch.tensor([1e2, 1e-5, 1.0])),
+        "nearly opaque": changed(opacities=torch.full((300,), 0.9999, dtype=torch.float64)),
+        "faint": changed(opacities=torch.full((300,), 1e-3, dtype=torch.float64)),
+        "long quaternions": changed(quats=usual.quats * 1e6),
+        "at the camera": changed(means=torch.where(some[:, None], eye + 1e-4, usual.means)),
+        "behind": changed(means=torch.where(some[:, None], 2 * eye - usual.means, usual.means)),
+        "all in one place": changed(means=usual.means[:1].expand(300, 3).clone()),
+        "one": usual.mapped(lambda each: each[:1]),
+        "far away": changed(means=eye + 1e4 * (usual.means - eye), scales=usual.scales * 1e4),
+    }
+
+
+@pytest.mark.parametrize("case", extremes())
+def test_extreme_gaussians_give_what_they_give_in_float64(name, case):
+    camera, scene = CAMERAS["middle"], extremes()[case]
+    image, gradients, _ = drawn(RASTERIZERS[name](), leaves(scene, "cuda", torch.float32), camera)
+    rounded = leaves(scene.mapped(lambda each: each.float()), "cpu", torch.float64)
+    expected, wanted, _ = drawn(REFERENCES[name], rounded, camera)
+    assert image.isfinite().all()
+    assert (image - expected).abs().mean() <= 1e-3
+    for tensor, gradient in gradients.items():
+        assert gradient.isfinite().all(), tensor
+        assert gradient.norm() <= 2 * wanted[tensor].norm() + 1e-3, tensor
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_views_together_are_views_one_by_one(seed):
+    camera, rasterizer = CAMERAS["middle"], GsplatRasterizer()
+    scenes = [random_gaussians(200, camera, seed=10 * seed + k, sh_degree=2) for k in range(3)]
+    together = [leaves(scene, "cuda", torch.float32) for scene in scenes]
+    alone = [leaves(scene, "cuda", torch.float32) for scene in scenes]
+    behind = torch.zeros(3, device="cuda")
+    views = [(scene, camera) for scene in together]
+    outputs = rasterizer.provides
+    joint = rasterizer.render_views(views, [behind] * 3, outputs)
+    torch.stack([render.image.square().sum() for render in joint]).sum().backward()
+    for scene, own, render in zip(alone, together, joint, strict=True):
+        single = rasterizer.render(scene, camera, behind, outputs)
+        single.image.square().sum().backward()
+        torch.testing.assert_close(single.image, render.image, rtol=0, atol=1e-6)
+        for field in ("mean_gradient", "abs_gradient"):
+            one, other = getattr(single.screen, field), getattr(render.screen, field)
+            assert (one - other).norm() <= 1e-4 * one.norm()
+        assert torch.equal(single.screen.pixels, render.screen.pixels)
+        for one, other in zip(scene.floats(), own.floats(), strict=True):
+            assert (one.grad - other.grad).norm() <= 1e-4 * one.grad.norm()
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_counts_of_pixels_are_those_of_the_reference(camera):
+    scene = random_gaussians(300, camera, seed=3, opacities=(0.3, 0.95))
+    _, _, ours = drawn(GsplatRasterizer(), leaves(scene, "cuda", torch.float32), camera)
+    _, _, theirs = drawn(REFERENCES["gsplat"], leaves(scene, "cpu", torch.float32), camera)
+    found, expected = ours.screen.pixels.cpu(), theirs.screen.pixels
+    # A pixel at the edge of a footprint may fall either way.
+    assert (found - expected).abs().sum() <= 1e-3 * expected.sum() + 1
+    marked = torch.rand(camera.height, camera.width, generator=torch.manual_seed(1)) < 0.3
+    some, others = ours.screen.count(marked.cuda()), ours.screen.count(~marked.cuda())
+    assert torch.equal(some + others, ours.screen.pixels)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_loss_is_that_of_the_cpu(masked):
+    random = torch.Generator().manual_seed(7)
+    image = torch.rand(61, 83, 3, generator=random)
+    photo = torch.randint(0, 256, (61, 83, 3), generator=random, dtype=torch.uint8)
+    mask = torch.rand(61, 83, generator=random) < 0.8 if masked else None
+    exact = image.double().requires_grad_()
+    l1_ssim_loss(exact, photo, mask).backward()
+    ours = image.cuda().requires_grad_()
+    loss = photometric_loss(ours, photo.cuda(), None if mask is None else mask.cuda())
+    loss.backward()
+    assert float(loss) == pytest.approx(float(l1_ssim_loss(exact, photo, mask)), rel=1e-5)
+    assert (ours.grad.cpu().double() - exact.grad).norm() <= 1e-4 * exact.grad.norm()
+
+
+def test_adam_is_that_of_the_cpu():
+    random = torch.Generator().manual_seed(8)
+    shapes = {"a": (1000, 3), "b": (1000,), "c": (1000, 15, 3)}
+    start = {name: torch.randn(shape, generator=random) for name, shape in shapes.items()}
+    states = {}
+    for device in ("cpu", "cuda"):
+        tensors = {name: each.clone().to(device).requires_grad_() for name, each in start.items()}
+        moments = AdamState()
+        draws = torch.Generator().manual_seed(9)
+        for _ in range(50):
+            gradients = {
+                name: torch.randn(shape, generator=draws).to(device)
+                for name, shape in shapes.items()
+            }
+            adam_step(tensors, gradients, moments, dict.fromkeys(shapes, 1e-2))
+        states[device] = {name: each.detach().cpu() for name, each in tensors.items()}
+    for name, expected in states["cpu"].items():
+        torch.testing.assert_close(states["cuda"][name], expected, rtol=0, atol=2e-5)
+
+
+def started(rasterizer, **options):
+    config = {
+        "steps": 200,
+        "device": "cuda",
+        "rasterizer": {"name": rasterizer},
+        "metrics": [{"name": "psnr"}],
+        **options,
+    }
+    setup = assemble(configured(config), sample_scene(), "none")
+    return setup, begin(setup)
+
+
+#: Waits of a step: for the losses, and for the Gramians or what tells whether all is finite.
+WAITS = {"gswarp": 2, "gsplat": 3}
+
+
+@pytest.mark.parametrize("options", [{}, {"views_per_step": 2, "operator": {"name": "pcgrad"}}])
+def test_a_steady_step_waits_as_often_as_the_documents_say(options):
+    """gsplat waits once more for each of its calls; of a copy to the GPU nobody waits."""
+    if not GsplatRasterizer.speed("cuda"):
+        pytest.skip("gsplat is not installed")
+    setup, state = started("gsplat", densifier={"name": "none"}, **options)
+    for _ in range(5):
+        timed_step(setup, state)
+    torch.cuda.synchronize()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            timed_step(setup, state)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    waits = Counter(
+        f"{each.filename}:{each.lineno}" for each in found if "synchroniz" in str(each.message)
+    )
+    assert sum(waits.values()) <= WAITS["gsplat"], waits
+
+
+@pytest.mark.parametrize("backbone", ["vanilla", "pixel", "mip", "distance", "scaffold", "octree"])
+@pytest.mark.parametrize("operator", ["sum", "pcgrad"])
+def test_every_backbone_learns(name, backbone, operator):
+    options = {"views_per_step": 2, "operator": {"name": operator}, "backbone": {"name": backbone}}
+    if name == "gswarp" and backbone in {"mip", "pixel"}:
+        pytest.skip("refused: docs/rasterizers.md")
+    setup, state = started(name, **options)
+    losses = [sum(timed_step(setup, state).losses) for _ in range(80)]
+    assert sum(losses[-20:]) < 0.9 * sum(losses[:20])
+    assert all(each.isfinite().all() for each in state.tensors.values())
