@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
@@ -66,9 +67,15 @@ def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
     share = setup.config.dropout
     if not share:
         return gaussians
-    kept = state.rngs[STREAM].random(len(gaussians), dtype=np.float32) >= share
-    factors = torch.from_numpy(kept / np.float32(1.0 - share))
-    factors = factors.to(gaussians.opacities.device, non_blocking=True)
-    raised = gaussians.opacities * factors
+    draws = _draws(state.rngs[STREAM], len(gaussians), gaussians.opacities.device)
+    raised = gaussians.opacities * ((draws >= share) / (1.0 - share))
     # Cut off at 1, but not its gradient: what is nearly opaque could never fade.
     return replace(gaussians, opacities=raised - (raised.detach() - 1.0).clamp(min=0.0))
+
+
+def _draws(rng: np.random.Generator, count: int, device: torch.device) -> Tensor:
+    """[N] uniform in [0, 1), drawn on the device: of a million the CPU would draw for 4 ms."""
+    if device.type == "cpu":
+        return torch.from_numpy(rng.random(count, dtype=np.float32))
+    generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 63)))
+    return torch.rand(count, generator=generator, device=device)

@@ -4,7 +4,6 @@ Skipped where there is no CUDA device, as in CI; `docs/rasterizers.md` says how 
 """
 
 import warnings
-from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -69,10 +68,15 @@ def drawn(rasterizer, gaussians, camera, *, cap=None):
 
 
 def same_gradients(found, expected, share):
+    """But for a few Gaussians, of which a pixel at the edge of a footprint fell the other way."""
     assert found.keys() == expected.keys()
     for name, gradient in expected.items():
         assert found[name].isfinite().all(), name
-        assert (found[name] - gradient).norm() <= share * gradient.norm(), name
+        errors = (found[name] - gradient).flatten(1 if gradient.dim() > 1 else 0)
+        lengths = errors.norm(dim=1) if gradient.dim() > 1 else errors.abs()
+        usual = lengths.sort().values[:-4] if len(lengths) > 4 else lengths
+        assert usual.norm() <= share * gradient.norm(), name
+        assert lengths.norm() <= 0.1 * gradient.norm() + 1e-6, name
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -208,11 +212,12 @@ def test_adam_is_that_of_the_cpu():
         torch.testing.assert_close(states["cuda"][name], expected, rtol=0, atol=2e-5)
 
 
-def started(rasterizer, **options):
+def started(rasterizer, device="cuda", **options):
     config = {
         "steps": 200,
-        "device": "cuda",
-        "rasterizer": {"name": rasterizer},
+        "device": device,
+        "rasterizer": rasterizer,
+        "dropout": 0.0,  # Drawn on the device.
         "metrics": [{"name": "psnr"}],
         **options,
     }
@@ -220,16 +225,12 @@ def started(rasterizer, **options):
     return setup, begin(setup)
 
 
-#: Waits of a step: for the losses, and for the Gramians or what tells whether all is finite.
-WAITS = {"gswarp": 2, "gsplat": 3}
-
-
 @pytest.mark.parametrize("options", [{}, {"views_per_step": 2, "operator": {"name": "pcgrad"}}])
 def test_a_steady_step_waits_as_often_as_the_documents_say(options):
-    """gsplat waits once more for each of its calls; of a copy to the GPU nobody waits."""
+    """For the losses, for the Gramians or what tells whether all is finite, and in gsplat."""
     if not GsplatRasterizer.speed("cuda"):
         pytest.skip("gsplat is not installed")
-    setup, state = started("gsplat", densifier={"name": "none"}, **options)
+    setup, state = started({"name": "gsplat"}, densifier={"name": "none"}, **options)
     for _ in range(5):
         timed_step(setup, state)
     torch.cuda.synchronize()
@@ -240,19 +241,35 @@ def test_a_steady_step_waits_as_often_as_the_documents_say(options):
             timed_step(setup, state)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    waits = Counter(
-        f"{each.filename}:{each.lineno}" for each in found if "synchroniz" in str(each.message)
-    )
-    assert sum(waits.values()) <= WAITS["gsplat"], waits
+    waits = [f"{w.filename}:{w.lineno}" for w in found if "synchronizing CUDA" in str(w.message)]
+    assert len(waits) <= 3, waits
+
+
+#: The CPU's rasterizer by the rules of each.
+ALIKE = {"gsplat": {"max_alpha": 0.999}, "gswarp": {"footprint": "3-sigma"}}
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "pixel", "mip", "distance", "scaffold", "octree"])
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
-def test_every_backbone_learns(name, backbone, operator):
-    options = {"views_per_step": 2, "operator": {"name": operator}, "backbone": {"name": backbone}}
+def test_every_backbone_learns_as_on_the_cpu(name, backbone, operator):
+    """Without growth, whose draws and order would take them apart."""
     if name == "gswarp" and backbone in {"mip", "pixel"}:
         pytest.skip("refused: docs/rasterizers.md")
-    setup, state = started(name, **options)
-    losses = [sum(timed_step(setup, state).losses) for _ in range(80)]
-    assert sum(losses[-20:]) < 0.9 * sum(losses[:20])
-    assert all(each.isfinite().all() for each in state.tensors.values())
+    options = {
+        "views_per_step": 2,
+        "operator": {"name": operator},
+        "backbone": {"name": backbone},
+        "densifier": {"name": "none"},
+    }
+    if backbone == "scaffold":
+        options["backbone"]["voxel_size"] = 1e-2
+    losses = {}
+    for device, rasterizer in (("cuda", {"name": name}), ("cpu", {"name": "numba", **ALIKE[name]})):
+        setup, state = started(rasterizer, device, **options)
+        losses[device] = torch.tensor([timed_step(setup, state).losses for _ in range(60)])
+        assert all(each.isfinite().all() for each in state.tensors.values())
+    apart = (losses["cuda"] - losses["cpu"]).abs() / losses["cpu"].mean()
+    # Rounding takes runs apart in the end, sooner where a network or a threshold chooses.
+    assert apart[:8].max() <= 2e-3
+    assert apart.mean() <= 3e-2
+    assert losses["cuda"][-10:].mean() < losses["cuda"][:10].mean()

@@ -27,6 +27,7 @@ def install(monkeypatch: Any) -> None:
     monkeypatch.setattr(rendering, "isect_offset_encode", reference._isect_offset_encode)
     monkeypatch.setattr(rendering, "rasterize_to_pixels", composited)
     monkeypatch.setattr("gsplat.rasterize_to_indices_in_range", listed)
+    monkeypatch.setattr("gsplat.spherical_harmonics", reference._spherical_harmonics)
 
 
 def projected(means, covars, quats, scales, viewmats, Ks, width, height, **options) -> Any:

@@ -25,7 +25,7 @@ from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
 from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
-from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
+from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
 _PACKAGE = "gsplat"
 _GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -105,7 +105,7 @@ class GsplatRasterizer(Rasterizer):
         ]
         # The Gaussians of each view are a batch of their own, so that gradients stay apart.
         tensors = [_batch([getattr(each, name) for each, _ in views]) for name in _GEOMETRY]
-        tensors.append(_batch([view_colors(each, _center(each, c)) for each, c in views]))
+        tensors.append(_batch([_colors(each, c) for each, c in views]))
         settings = {
             "width": camera.width,
             "height": camera.height,
@@ -140,8 +140,16 @@ def _batch(tensors: Sequence[Tensor]) -> Tensor:
     return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
-def _center(gaussians: Gaussians, camera: Camera) -> Tensor:
-    return camera.center.to(gaussians.means, non_blocking=True)
+def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """[N, 3] RGB as `view_colors` has it; harmonics in one kernel instead of some hundred."""
+    center = camera.center.to(gaussians.means, non_blocking=True)
+    coefficients = coefficients_of(gaussians)
+    if coefficients is None or not gaussians.sh_degree:
+        return view_colors(gaussians, center)
+    from gsplat import spherical_harmonics
+
+    found: Tensor = spherical_harmonics(gaussians.sh_degree, gaussians.means - center, coefficients)
+    return (0.5 + found).clamp(min=0.0)
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:

@@ -23,9 +23,11 @@ from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
 from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
-from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
+from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
 _PACKAGE = "gswarp"
+#: Dimensions of colours; harmonics have one more.
+_RGB = 2
 #: Depth up to which gswarp draws nothing, in the units that it is given.
 _NEAR = 0.2
 
@@ -86,8 +88,9 @@ class GswarpRasterizer(Rasterizer):
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=device))
         enlarged = _NEAR / self.near
         size = (camera.width / 2, camera.height / 2)
+        degree = 0 if gaussians.sh_dc is None else gaussians.sh_degree
         call = Call(
-            partial(_draw, screen, settings_of(camera, background, enlarged)),
+            partial(_draw, screen, settings_of(camera, background, enlarged, degree)),
             partial(_observe, screen, size),
         )
         tensors = [
@@ -95,7 +98,7 @@ class GswarpRasterizer(Rasterizer):
             normalize(gaussians.quats, dim=-1),
             gaussians.scales * enlarged,
             gaussians.opacities[:, None],
-            view_colors(gaussians, camera.center.to(gaussians.means, non_blocking=True)),
+            _colors(gaussians, camera, degree),
         ]
         image, alpha, depth = drawn(call, tensors)
         return Render(
@@ -106,7 +109,17 @@ class GswarpRasterizer(Rasterizer):
         )
 
 
-def settings_of(camera: Camera, background: Tensor, enlarged: float) -> dict[str, Any]:
+def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
+    """[N, 3] RGB, or [N, (degree + 1)^2, 3] for gswarp's own harmonics: one kernel."""
+    coefficients = coefficients_of(gaussians) if degree else None
+    if coefficients is not None:
+        return coefficients
+    return view_colors(gaussians, camera.center.to(gaussians.means, non_blocking=True))
+
+
+def settings_of(
+    camera: Camera, background: Tensor, enlarged: float, degree: int = 0
+) -> dict[str, Any]:
     """The fields of gswarp's settings for a camera of a scene that is `enlarged` times as large.
 
     Its matrices are transposed; the projection maps the image to [-1, 1], with the principal point.
@@ -118,7 +131,9 @@ def settings_of(camera: Camera, background: Tensor, enlarged: float) -> dict[str
     projection[0, 0], projection[0, 2] = 2 * camera.fx / width, 2 * camera.cx / width - 1
     projection[1, 1], projection[1, 2] = 2 * camera.fy / height, 2 * camera.cy / height - 1
     projection[2, 2] = projection[3, 2] = 1.0
-    matrices = torch.stack([pose.T, (projection @ pose).T]).to(background, non_blocking=True)
+    center = torch.nn.functional.pad(camera.center * enlarged, (0, 1))[None].expand(4, 4)
+    matrices = torch.stack([pose.T, (projection @ pose).T, center])
+    matrices = matrices.to(background, non_blocking=True)
     return {
         "image_height": height,
         "image_width": width,
@@ -128,8 +143,8 @@ def settings_of(camera: Camera, background: Tensor, enlarged: float) -> dict[str
         "scale_modifier": 1.0,
         "viewmatrix": matrices[0],
         "projmatrix": matrices[1],
-        "sh_degree": 0,
-        "campos": background.new_zeros(3),  # For harmonics, which are ours.
+        "sh_degree": degree,
+        "campos": matrices[2, 0, :3],
         "prefiltered": False,
         "auto_tune_verbose": False,
     }
@@ -144,7 +159,7 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
         means3D=means,
         means2D=centers,
         opacities=opacities,
-        colors_precomp=colors,
+        **{"colors_precomp" if colors.dim() == _RGB else "shs": colors},
         scales=scales,
         rotations=quats,
     )

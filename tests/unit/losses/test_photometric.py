@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
+from crossgrad_plugins.losses.photometric import on_device
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 from crossgrad_plugins.losses.photometric.reference import gaussian_window, l1_ssim_loss, ssim_map
@@ -227,3 +228,32 @@ def test_ssim_of_one_pixel_sees_the_zero_padding():
 def test_wrong_shapes_are_refused(image, target, mask):
     with pytest.raises(ValueError, match="must"):
         photometric_loss(image, target, mask)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_the_gradient_written_out_is_autograds(name, masked):
+    """What a GPU computes: in float64 to its rounding, in float32 as near as autograd in it."""
+    image, target, _ = CASES[name]
+    mask = random_mask(image.shape[:2]) if masked else None
+    value, gradient = loss_and_gradient(l1_ssim_loss, image.double(), target.double(), mask)
+
+    def errors(found):
+        loss, slope = found
+        return abs(float(loss) - float(value)), float((slope.double() - gradient).norm())
+
+    exact = errors(on_device.loss_and_gradient(image.double(), target.double(), mask, 0.2))
+    close = errors(on_device.loss_and_gradient(image, target, mask, 0.2))
+    usual = errors(loss_and_gradient(l1_ssim_loss, image, target, mask))
+    for size, fine, coarse, other in zip(
+        (float(value), float(gradient.norm())), exact, close, usual, strict=True
+    ):
+        assert fine <= 1e-10 * size
+        assert coarse <= 2 * other + 2e-6 * size
+
+
+def test_uint8_photos_are_shares_of_255_where_the_gradient_is_written_out():
+    photo = (255 * NATURAL).round().to(torch.uint8)
+    found = on_device.loss_and_gradient(BLURRED, photo, None, 0.2)
+    expected = on_device.loss_and_gradient(BLURRED, photo.float() / 255, None, 0.2)
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))

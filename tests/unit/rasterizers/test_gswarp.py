@@ -71,14 +71,25 @@ class Rasterizer:
         fx, fy = matrix[0, 0] * width / 2, matrix[1, 1] * height / 2
         return Camera(width, height, float(fx), float(fy), float(cx), float(cy), pose)
 
-    def __call__(self, *, means3D, means2D, opacities, colors_precomp, scales, rotations):
+    def __call__(self, *, means3D, means2D, opacities, scales, rotations, **colors):
         assert torch.allclose(rotations.norm(dim=-1), torch.ones(len(rotations)))
-        gaussians = Gaussians(means3D, rotations, scales, opacities[:, 0], colors=colors_precomp)
+        gaussians = Gaussians(
+            means3D, rotations, scales, opacities[:, 0], **self.own_colors(**colors)
+        )
         reference = TorchRasterizer(near=NEAR, footprint="3-sigma")
         moved, shift = _shifted(gaussians, self.camera(), means2D)
         render = reference.render(moved, shift, self.settings.bg, frozenset({"depth"}))
         radii = render.screen.radii
         return render.image.permute(2, 0, 1), radii, Meta(render.depth[None], render.alpha[None])
+
+    def own_colors(self, colors_precomp=None, shs=None):
+        if shs is None:
+            return {"colors": colors_precomp}
+        degree = self.settings.sh_degree
+        assert shs.shape[1] == (degree + 1) ** 2
+        center = self.camera().center.float()
+        torch.testing.assert_close(self.settings.campos, center, rtol=1e-4, atol=1e-4)
+        return {"sh_dc": shs[:, :1], "sh_rest": shs[:, 1:], "sh_degree": degree}
 
 
 def _shifted(gaussians: Gaussians, camera: Camera, means2d: Tensor) -> tuple[Gaussians, Any]:
@@ -103,7 +114,7 @@ def leaves(gaussians):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, OFF_AXIS], ids=["middle", "off the axis"])
-@pytest.mark.parametrize("sh_degree", [None, 2])
+@pytest.mark.parametrize("sh_degree", [None, 0, 1, 3])
 def test_what_is_handed_over_and_taken_back_is_ours(gswarp, camera, sh_degree):
     scene = random_gaussians(30, camera, seed=6, sh_degree=sh_degree)
     mine, theirs = leaves(scene), leaves(scene)

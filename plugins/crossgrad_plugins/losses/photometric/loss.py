@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
+from crossgrad_plugins.losses.photometric.on_device import loss_and_gradient
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 
 
@@ -19,8 +20,9 @@ def photometric_loss(
 ) -> Tensor:
     """(1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
 
-    On the CPU in float32 value and gradient come from one fused pass (the gradient is first order
-    only); every other device and type, and weights, take the differentiable torch path.
+    In float32 value and gradient come from one pass (the gradient is first order only): a fused
+    kernel on the CPU, torch's operators elsewhere. Other types, and weights, take the torch path
+    that can be differentiated again.
 
     Args:
         image: [H, W, 3] floating point, the render.
@@ -39,11 +41,12 @@ def photometric_loss(
     if weights is not None:
         _check_weights(image, weights)
         return l1_ssim_loss(image, target, mask, ssim_weight, weights)
+    if image.dtype != torch.float32:
+        return l1_ssim_loss(image, target, mask, ssim_weight)
     on_cpu = all(t is None or t.device.type == "cpu" for t in (image, target, mask))
-    if on_cpu and image.dtype == torch.float32:
-        loss: Tensor = _FusedLoss.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
-        return loss
-    return l1_ssim_loss(image, target, mask, ssim_weight)
+    way = _FusedLoss if on_cpu else _DeviceLoss
+    loss: Tensor = way.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
+    return loss
 
 
 class _FusedLoss(torch.autograd.Function):
@@ -79,6 +82,26 @@ class _FusedLoss(torch.autograd.Function):
         (gradient,) = ctx.saved_tensors
         scaled = gradient if float(upstream) == 1.0 else gradient * upstream
         return scaled, None, None, None
+
+
+class _DeviceLoss(torch.autograd.Function):
+    """Likewise on a GPU, which is not waited for."""
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
+    ) -> Tensor:
+        loss, gradient = loss_and_gradient(image, target, mask, ssim_weight)
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None, None
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

@@ -82,7 +82,8 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     Source: Wang et al. 2004, eq. 13, 11 x 11 Gaussian window, sigma 1.5, L = 1.
     """
     x, y = image, target
-    mean_x, mean_y, xx, yy, xy = _windowed(torch.stack((x, y, x * x, y * y, x * y)))
+    fields = torch.stack((x, y, x * x, y * y, x * y)).permute(0, 3, 1, 2)
+    mean_x, mean_y, xx, yy, xy = blurred(fields).permute(0, 2, 3, 1)
     variance_x = xx - mean_x * mean_x
     variance_y = yy - mean_y * mean_y
     covariance = xy - mean_x * mean_y
@@ -98,15 +99,14 @@ def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
     return gaussian_window().to(device, dtype)
 
 
-def _windowed(fields: Tensor) -> Tensor:
-    """Gaussian-weighted sums of [M, H, W, C] over the window around each pixel, same shape."""
+def blurred(fields: Tensor) -> Tensor:
+    """Gaussian-weighted sums of [M, C, H, W] over the window around each pixel, same shape."""
     if fields.numel() == 0:
         return fields
-    fields = fields.permute(0, 3, 1, 2)  # [M, C, H, W]
     # One group per plane: torch's depthwise convolution is the fastest of its ways on the CPU.
     planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
     groups = planes.shape[1]
     weight = _window_for(fields.dtype, fields.device).expand(groups, 1, WINDOW)
     planes = conv2d(planes, weight.unsqueeze(-1), padding=(RADIUS, 0), groups=groups)
     planes = conv2d(planes, weight.unsqueeze(-2), padding=(0, RADIUS), groups=groups)
-    return planes.view(fields.shape).permute(0, 2, 3, 1)
+    return planes.view(fields.shape)

@@ -16,15 +16,20 @@ def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
     """
     if gaussians.colors is not None:
         return gaussians.colors
-    if gaussians.sh_dc is None:
+    coefficients = coefficients_of(gaussians)
+    if coefficients is None:
         raise ValueError("Gaussians need `colors` or `sh_dc`; found neither")
-    coefficients = gaussians.sh_dc
-    if gaussians.sh_rest is not None:
-        active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]
-        coefficients = torch.cat([coefficients, active], 1)
     offsets = gaussians.means - center
     basis = harmonics(offsets / offsets.norm(dim=-1, keepdim=True), gaussians.sh_degree)
     return (0.5 + (basis[:, :, None] * coefficients).sum(1)).clamp(min=0.0)
+
+
+def coefficients_of(gaussians: Gaussians) -> Tensor | None:
+    """[N, (degree + 1)^2, 3] the bands up to the active degree; None where there are none."""
+    if gaussians.sh_dc is None or gaussians.sh_rest is None:
+        return gaussians.sh_dc
+    active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]
+    return torch.cat([gaussians.sh_dc, active], 1)
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:
