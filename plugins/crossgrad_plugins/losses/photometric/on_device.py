@@ -1,7 +1,7 @@
 """The photometric loss and its gradient at once, in plain torch without autograd, for a GPU.
 
-Autograd would launch some ninety kernels, most of them shorter than launching them takes. Written
-out it is half as many, and twelve planes are filtered, nine on the way back, not fifteen each way.
+Autograd would launch some ninety kernels, most of them shorter than launching them takes; the
+gradient written out takes half as many, and filters twelve planes, and nine on the way back, instead of twice fifteen.
 """
 
 import torch
