@@ -1,7 +1,7 @@
 """The photometric loss and its gradient at once, in plain torch without autograd, for a GPU.
 
-Autograd would launch some ninety kernels, most of them shorter than launching them takes; the
-gradient written out takes half as many, and filters twelve planes, and nine on the way back, instead of twice fifteen.
+Autograd would launch some ninety kernels, most of them shorter than launching them takes. Written
+out it is half as many, and nine planes are filtered on the way back instead of fifteen.
 """
 
 import torch
@@ -41,11 +41,10 @@ def loss_and_gradient(
 
 def _ssim_and_slope(x: Tensor, y: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """SSIM of every pixel [C, H, W], and the gradient by `x` of its sum over the kept pixels."""
-    # Of the squares only the sum is asked for.
-    mean_x, mean_y, both, xy = blurred(torch.stack((x, y, x * x + y * y, x * y)))
+    mean_x, mean_y, xx, yy, xy = blurred(torch.stack((x, y, x * x, y * y, x * y)))
     product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     a1, a2 = 2 * product + C1, 2 * (xy - product) + C2
-    b1, b2 = squares + C1, both - squares + C2
+    b1, b2 = squares + C1, xx + yy - squares + C2
     bottom = b1 * b2
     ssim = a1 * a2 / bottom
     # By the mean of x, where its variance and the covariance hold it too, by xx and by xy.
