@@ -2,16 +2,16 @@
 
     python benchmarks/gpu.py SCENE                                 # all of it
     python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
-    python benchmarks/gpu.py SCENE --parts sizes steps
+    python benchmarks/gpu.py SCENE --only sizes-gsplat steps-gsplat
 
 `sizes` takes steps of a made-up cloud of Gaussians, all of them seen, in photos of one megapixel;
 `steps` takes steps of SCENE with every rasterizer that runs on the GPU, every backbone, K and
 operator. Both are steps in the midst of density control, between two edits, with SH degree 3, in
 this process: seconds of the clock from an idle GPU to an idle GPU. `long` trains SCENE for 30,000
-steps as published, in processes of their own. With the folder of gsplat's examples, gsplat's own
-trainer takes as many steps on the same scene. Runs, gpu.csv, the curves of the long runs
-(gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the same command goes on.
-Without a GPU it ends with exit code 2.
+steps as published, in processes of their own; rows are what it had after 7,000, 15,000 and all
+steps. With the folder of gsplat's examples, gsplat's own trainer takes as many steps on the same
+scene. Runs, gpu.csv, the curves of the long runs (gpu_curves.csv) and gpu.md are in the folder of
+`--out`. Interrupted, the same command goes on. Without a GPU it ends with exit code 2.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from itertools import product
@@ -45,7 +45,8 @@ OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Of gsplat's trainer, which has no name among the rasterizers.
 THEIRS = "gsplat's trainer"
-PARTS = ("sizes", "steps", "long")
+#: Steps of a long run that have a row, beside its last.
+STOPS = (7_000, 15_000)
 #: The step of the published schedule at which a measured case begins.
 STEP = 5_010
 COLUMNS = (
@@ -96,7 +97,7 @@ class Case:
             "--metrics": "psnr",
             "--out": out,
             "--schedule": "absolute",
-            "--eval-every": max(1, self.steps // 10),
+            "--eval-every": max(1, self.steps // 30),
         }
         given = [str(part) for pair in options.items() for part in pair]
         return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
@@ -130,6 +131,13 @@ def cases(steps: int, long: int) -> Iterator[Case]:
         yield Case("steps", rasterizer, "vanilla", views, operator, steps)
     for rasterizer, views in product(fast, VIEWS[:2]):
         yield Case("long", rasterizer, "vanilla", views, "sum", long)
+
+
+def chosen(cases: Iterable[Case], only: Sequence[str] | None) -> Iterator[Case]:
+    """The cases with one of the texts in their names; all where there is none."""
+    for case in cases:
+        if not only or any(text in case.name for text in only):
+            yield case
 
 
 class Short:
@@ -250,58 +258,99 @@ def _row(case: Case, found: Row) -> Row:
     return {**dict.fromkeys(COLUMNS, ""), **own, **found, "note": found.get("note", "")[:300]}
 
 
-def row_of(case: Case, run: Path | None, why: str) -> Row:
-    """The figures of a long run, or why it has none."""
+def rows_of(case: Case, run: Path | None, why: str) -> Iterator[Row]:
+    """The figures of a long run at its stops, or why it has none."""
     if run is None:
-        return _row(case, {"note": why})
+        yield _row(case, {"note": why})
+        return
     results = read_run(run)
     summary: Mapping[str, Any] = results.summary or {}
     environment = summary["environment"]
-    seconds = float(summary["train_seconds"])
-    found = {
-        "ms_per_step": round(1e3 * seconds / case.steps, 2),
-        "views_per_second": round(case.steps * case.views / seconds, 1),
-        "train_seconds": round(seconds, 2),
-        "psnr": _rounded(results.figure("psnr")),
-        "primitives": summary["primitives"],
-        "peak_mib": _rounded(summary.get("peak_memory_mib")),
+    own = {
         "gpu": environment["gpu"],
         "torch": environment["packages"]["torch"],
         "code": environment["commit"] or environment["crossgrad"],
         "date": _written(run / "summary.json"),
     }
-    return _row(case, found)
+    for row in results.rows:
+        if row["step"] in stops(case.steps):
+            found = _paced(row["step"], case.views, row["train_seconds"]) | {
+                "psnr": _rounded(row.get("psnr")),
+                "primitives": row["primitives"],
+            }
+            if row["step"] == case.steps:
+                found["peak_mib"] = _rounded(summary.get("peak_memory_mib"))
+            yield _row(case, own | found)
 
 
-def theirs(examples: Path, scene: Path, out: Path, steps: int) -> Row:
-    """Gsplat's own trainer on the same scene: its step time, PSNR and number of Gaussians."""
-    folder = out / "runs" / f"gsplat-trainer-{steps}"
-    row: Row = {**dict.fromkeys(COLUMNS, ""), "part": "long", "backbone": "vanilla", "views": 1}
-    row |= {"rasterizer": THEIRS, "operator": "sum", "steps": steps}
-    trained = folder / "stats" / f"train_step{steps - 1}_rank0.json"
-    if not trained.is_file():
-        options = ["--data_dir", scene, "--data_factor", 1, "--result_dir", folder]
-        options += ["--max_steps", steps, "--eval_steps", steps, "--save_steps", steps]
-        command = [sys.executable, "simple_trainer.py", "default", "--disable_viewer", *options]
-        ended = subprocess.run(
-            list(map(str, command)), cwd=examples, capture_output=True, text=True, check=False
-        )
-        if not trained.is_file():
-            return row | {"note": " ".join(ended.stderr.split())[-300:]}
-    training = json.loads(trained.read_text(encoding="utf-8"))
-    held_out = folder / "stats" / f"val_step{steps - 1}.json"
-    shown = json.loads(held_out.read_text(encoding="utf-8")) if held_out.is_file() else {}
-    seconds = float(training["ellipse_time"])
-    return row | {
+def stops(steps: int) -> tuple[int, ...]:
+    """The steps of a long run whose figures are in the table."""
+    return (*(stop for stop in STOPS if stop < steps), steps)
+
+
+def _paced(steps: int, views: int, seconds: float) -> Row:
+    return {
+        "steps": steps,
         "ms_per_step": round(1e3 * seconds / steps, 2),
-        "views_per_second": round(steps / seconds, 1),
+        "views_per_second": round(steps * views / seconds, 1),
         "train_seconds": round(seconds, 2),
-        "psnr": _rounded(shown.get("psnr")),
-        "primitives": training["num_GS"],
-        "peak_mib": round(1024 * float(training["mem"]), 1),
-        "note": "its photos, split and loss; seconds as it counts them",
-        "date": _written(trained),
     }
+
+
+def theirs(
+    examples: Path, scene: Path, out: Path, steps: int, limit: float | None = None
+) -> Iterator[Row]:
+    """Gsplat's own trainer on the same scene: its step time, PSNR and number of Gaussians.
+
+    Args:
+        examples: The folder of its examples.
+        scene: The scene.
+        out: Where runs are.
+        steps: How many it takes.
+        limit: Seconds after which it is stopped; it has rows for what it reached.
+    """
+    folder = out / "runs" / f"gsplat-trainer-{steps}"
+    wanted = [str(stop) for stop in stops(steps)]
+    why = ""
+    if not _trained(folder, steps).is_file():
+        options = ["--data_dir", scene, "--data_factor", 1, "--result_dir", folder]
+        options += ["--max_steps", steps, "--eval_steps", *wanted, "--save_steps", *wanted]
+        command = [sys.executable, "simple_trainer.py", "default", "--disable_viewer", *options]
+        why = _failure(list(map(str, command)), examples, limit)
+    own: Row = {"part": "long", "rasterizer": THEIRS, "backbone": "vanilla", "views": 1}
+    own = {**dict.fromkeys(COLUMNS, ""), **own, "operator": "sum"}
+    for stop in stops(steps):
+        trained = _trained(folder, stop)
+        if not trained.is_file():
+            yield own | {"steps": steps, "note": why}
+            return
+        training = json.loads(trained.read_text(encoding="utf-8"))
+        held_out = folder / "stats" / f"val_step{stop - 1}.json"
+        shown = json.loads(held_out.read_text(encoding="utf-8")) if held_out.is_file() else {}
+        found = _paced(stop, 1, float(training["ellipse_time"])) | {
+            "psnr": _rounded(shown.get("psnr")),
+            "primitives": training["num_GS"],
+            "peak_mib": round(1024 * float(training["mem"]), 1),
+            "note": "its photos, split and loss; seconds as it counts them",
+            "date": _written(trained),
+        }
+        yield own | found
+
+
+def _failure(command: list[str], folder: Path, limit: float | None) -> str:
+    """Runs a command in a folder; why it did not come to its end, else nothing."""
+    try:
+        ended = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, check=False, timeout=limit
+        )
+    except subprocess.TimeoutExpired:
+        return f"stopped after {limit:g} s"
+    return " ".join(ended.stderr.split())[-300:] if ended.returncode else ""
+
+
+def _trained(folder: Path, step: int) -> Path:
+    """What gsplat's trainer writes at a stop."""
+    return folder / "stats" / f"train_step{step - 1}_rank0.json"
 
 
 def curve_rows(case: Case, run: Path) -> Iterator[Row]:
@@ -362,29 +411,31 @@ def run_all(arguments: argparse.Namespace, gpu: str) -> None:
         (out / "gpu.md").write_text(as_markdown(rows, described), encoding="utf-8")
 
     short = Short(scene, out / "short.jsonl")
-    for case in cases(arguments.steps, arguments.long):
-        if case.part not in arguments.parts:
-            continue
+    for case in chosen(cases(arguments.steps, arguments.long), arguments.only):
         if case.part != "long":
             write(short.row(case))
             continue
         run, why = measured(case, scene, out)
         if run is not None:
             curves.extend(curve_rows(case, run))
-        write(row_of(case, run, why))
+        for row in rows_of(case, run, why):
+            write(row)
     if arguments.gsplat_examples is not None:
-        write(theirs(arguments.gsplat_examples.resolve(), scene, out, arguments.long))
+        examples, limit = arguments.gsplat_examples.resolve(), arguments.trainer_seconds
+        for row in theirs(examples, scene, out, arguments.long, limit):
+            write(row)
 
 
 def main() -> None:
     """Runs the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases with it in their name")
     parser.add_argument("--steps", type=int, default=60, help="measured steps of a short case")
     parser.add_argument("--long", type=int, default=30_000)
     parser.add_argument("--out", type=Path, default=Path("gpu"))
     parser.add_argument("--gsplat-examples", type=Path)
+    parser.add_argument("--trainer-seconds", type=float, help="at most, of gsplat's trainer")
     arguments = parser.parse_args()
     import torch
 

@@ -245,7 +245,7 @@ def test_a_steady_step_waits_as_often_as_the_documents_say(options):
     assert len(waits) <= 3, waits
 
 
-#: The CPU's rasterizer by the rules of each.
+#: The reference by the rules of each.
 ALIKE = {"gsplat": {"max_alpha": 0.999}, "gswarp": {"footprint": "3-sigma"}}
 
 
@@ -264,7 +264,7 @@ def test_every_backbone_learns_as_on_the_cpu(name, backbone, operator):
     if backbone == "scaffold":
         options["backbone"]["voxel_size"] = 1e-2
     losses = {}
-    for device, rasterizer in (("cuda", {"name": name}), ("cpu", {"name": "numba", **ALIKE[name]})):
+    for device, rasterizer in (("cuda", {"name": name}), ("cpu", {"name": "torch", **ALIKE[name]})):
         setup, state = started(rasterizer, device, **options)
         losses[device] = torch.tensor([timed_step(setup, state).losses for _ in range(60)])
         assert all(each.isfinite().all() for each in state.tensors.values())

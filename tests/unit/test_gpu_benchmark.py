@@ -109,7 +109,7 @@ def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monk
         steps=10,
         long=10,
         gsplat_examples=None,
-        parts=["long"],
+        only=["long"],
     )
     script.run_all(arguments, "H")
     cases = [case for case in script.cases(10, 10) if case.part == "long"]
@@ -132,11 +132,28 @@ def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monk
 
 
 def test_the_trainer_of_gsplat_is_read_from_its_files(script, tmp_path):
-    stats = tmp_path / "runs" / "gsplat-trainer-7" / "stats"
+    """At every stop that it reached; it is not started again where it reached the last one."""
+    stats = tmp_path / "runs" / "gsplat-trainer-8000" / "stats"
     stats.mkdir(parents=True)
-    training = {"mem": 1.5, "ellipse_time": 0.7, "num_GS": 123}
-    (stats / "train_step6_rank0.json").write_text(json.dumps(training))
-    (stats / "val_step6.json").write_text(json.dumps({"psnr": 21.25, "num_GS": 123}))
-    row = script.theirs(tmp_path, tmp_path, tmp_path, 7)
-    assert (row["ms_per_step"], row["psnr"], row["primitives"]) == (100.0, 21.25, 123)
-    assert row["peak_mib"] == 1536.0
+    for stop, seconds in ((7000, 7.0), (8000, 9.6)):
+        training = {"mem": 1.5, "ellipse_time": seconds, "num_GS": 123}
+        (stats / f"train_step{stop - 1}_rank0.json").write_text(json.dumps(training))
+        shown = {"psnr": 21.25, "num_GS": 123}
+        (stats / f"val_step{stop - 1}.json").write_text(json.dumps(shown))
+    early, late = script.theirs(tmp_path, tmp_path, tmp_path, 8000)
+    assert (early["steps"], early["ms_per_step"]) == (7000, 1.0)
+    assert (late["steps"], late["ms_per_step"]) == (8000, 1.2)
+    assert (late["psnr"], late["primitives"], late["peak_mib"]) == (21.25, 123, 1536.0)
+
+
+def test_what_the_trainer_of_gsplat_did_not_reach_has_no_figures(script, tmp_path, monkeypatch):
+    ended = SimpleNamespace(returncode=1, stderr="no\nmemory")
+    asked = []
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: asked.append(command) or ended)
+    (row,) = script.theirs(tmp_path, tmp_path, tmp_path, 16_000)
+    assert (row["steps"], row["note"], row["psnr"]) == (16_000, "no memory", "")
+    assert asked[0].count("15000") == 2
+    monkeypatch.undo()
+    (tmp_path / "simple_trainer.py").write_text("import time; time.sleep(60)")
+    (row,) = script.theirs(tmp_path, tmp_path, tmp_path, 16_000, 0.5)
+    assert row["note"] == "stopped after 0.5 s"
