@@ -42,15 +42,17 @@ def loss_and_gradient(
 def _ssim_and_slope(x: Tensor, y: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """SSIM of every pixel [C, H, W], and the gradient by `x` of its sum over the kept pixels."""
     mean_x, mean_y, xx, yy, xy = blurred(torch.stack((x, y, x * x, y * y, x * y)))
+    # Rounded alike, so that the moments of equal images cancel alike.
     product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
-    a1, a2 = 2 * product + C1, 2 * (xy - product) + C2
-    b1, b2 = squares + C1, xx + yy - squares + C2
-    bottom = b1 * b2
-    ssim = a1 * a2 / bottom
-    # By the mean of x, where its variance and the covariance hold it too, by xx and by xy.
-    by_mean = 2 * (mean_y * (a2 - a1) / bottom + mean_x * ssim * (1 / b2 - 1 / b1))
-    slopes = torch.stack((by_mean, ssim / -b2, 2 * a1 / bottom))
+    # Halves of the factors of SSIM above the line, and those below it.
+    a1, a2 = product + C1 / 2, (xy - product).add_(C2 / 2)
+    b1, b2 = squares + C1, (xx + yy).sub_(squares).add_(C2)
+    share = 4 / (b1 * b2)
+    ssim = a1 * a2 * share
+    # By the mean of x, where its variance and the covariance hold it too; by xx; by xy.
+    by_mean = share * torch.addcmul(mean_y * (a2 - a1), mean_x * ssim, b1 - b2, value=0.5)
+    slopes = torch.stack((by_mean, (ssim / b2).neg_(), a1 * share))
     if mask is not None:
         slopes *= mask
     of_mean, of_xx, of_xy = blurred(slopes)  # The window is symmetric: its adjoint is itself.
-    return ssim, of_mean + 2 * x * of_xx + y * of_xy
+    return ssim, torch.addcmul(torch.addcmul(of_mean, x, of_xx, value=2), y, of_xy)
