@@ -19,14 +19,15 @@ import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
-from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from _gpu_cases import PIXELS, Case, cases, chosen, stops
+from _gsplat_trainer import trained
 from _machine import code, facts
 
 from crossgrad_core.errors import UserError
@@ -36,17 +37,8 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: The last one is the readable reference: it takes part where K is 1, for comparison.
-RASTERIZERS = ("gsplat", "gswarp", "torch")
-BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
-VIEWS = (1, 2, 4, 8)
-OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
-#: Gaussians of the made-up clouds, and megapixels of their photos.
-SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Of gsplat's trainer, which has no name among the rasterizers.
 THEIRS = "gsplat's trainer"
-#: Steps of a long run that have a row, beside its last.
-STOPS = (7_000, 15_000)
 #: The step of the published schedule at which a measured case begins.
 STEP = 5_010
 COLUMNS = (
@@ -55,89 +47,6 @@ COLUMNS = (
     "code", "date",
 )  # fmt: skip
 Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Case:
-    """One row.
-
-    Attributes:
-        part: `sizes`, `steps` or `long`.
-        rasterizer: Its name.
-        backbone: Its name.
-        views: K.
-        operator: Its name.
-        steps: How many are measured.
-        gaussians: Of a made-up cloud; 0 for SCENE.
-    """
-
-    part: str
-    rasterizer: str
-    backbone: str
-    views: int
-    operator: str
-    steps: int
-    gaussians: int = 0
-
-    @property
-    def name(self) -> str:
-        """The folder of its runs."""
-        return "-".join(map(str, vars(self).values()))
-
-    def command(self, scene: Path, out: Path) -> list[str]:
-        """The command that trains a long run."""
-        options = {
-            "--device": "cuda",
-            "--rasterizer": self.rasterizer,
-            "--backbone": self.backbone,
-            "--sampler": "random",
-            "--views": self.views,
-            "--operator": self.operator,
-            "--steps": self.steps,
-            "--metrics": "psnr",
-            "--out": out,
-            "--schedule": "absolute",
-            "--eval-every": max(1, self.steps // 30),
-        }
-        given = [str(part) for pair in options.items() for part in pair]
-        return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
-
-    def config(self, scene: Path) -> dict[str, Any]:
-        """The settings of a case that is measured in this process."""
-        return {
-            "scene": str(scene),
-            "device": "cuda",
-            "rasterizer": {"name": self.rasterizer},
-            "backbone": {"name": self.backbone},
-            "sampler": {"name": "random"},
-            "views_per_step": self.views,
-            "operator": {"name": self.operator},
-            "steps": 30_000,
-            "schedule": "absolute",
-            "growth": "free",
-            "events": "steps",
-        }
-
-
-def cases(steps: int, long: int) -> Iterator[Case]:
-    """All rows, the short ones first."""
-    fast = RASTERIZERS[:-1]
-    for rasterizer, count in product(fast, SIZES):
-        for views, operator in ((1, "sum"), (2, "pcgrad")):
-            yield Case("sizes", rasterizer, "vanilla", views, operator, steps, count)
-    for rasterizer, backbone in product(RASTERIZERS, BACKBONES):
-        yield Case("steps", rasterizer, backbone, 1, "sum", steps)
-    for rasterizer, views, operator in product(fast, VIEWS[1:], OPERATORS):
-        yield Case("steps", rasterizer, "vanilla", views, operator, steps)
-    for rasterizer, views in product(fast, VIEWS[:2]):
-        yield Case("long", rasterizer, "vanilla", views, "sum", long)
-
-
-def chosen(cases: Iterable[Case], only: Sequence[str] | None) -> Iterator[Case]:
-    """The cases with one of the texts in their names; all where there is none."""
-    for case in cases:
-        if not only or any(text in case.name for text in only):
-            yield case
 
 
 class Short:
@@ -283,11 +192,6 @@ def rows_of(case: Case, run: Path | None, why: str) -> Iterator[Row]:
             yield _row(case, own | found)
 
 
-def stops(steps: int) -> tuple[int, ...]:
-    """The steps of a long run whose figures are in the table."""
-    return (*(stop for stop in STOPS if stop < steps), steps)
-
-
 def _paced(steps: int, views: int, seconds: float) -> Row:
     return {
         "steps": steps,
@@ -300,57 +204,21 @@ def _paced(steps: int, views: int, seconds: float) -> Row:
 def theirs(
     examples: Path, scene: Path, out: Path, steps: int, limit: float | None = None
 ) -> Iterator[Row]:
-    """Gsplat's own trainer on the same scene: its step time, PSNR and number of Gaussians.
-
-    Args:
-        examples: The folder of its examples.
-        scene: The scene.
-        out: Where runs are.
-        steps: How many it takes.
-        limit: Seconds after which it is stopped; it has rows for what it reached.
-    """
-    folder = out / "runs" / f"gsplat-trainer-{steps}"
-    wanted = [str(stop) for stop in stops(steps)]
-    why = ""
-    if not _trained(folder, steps).is_file():
-        options = ["--data_dir", scene, "--data_factor", 1, "--result_dir", folder]
-        options += ["--max_steps", steps, "--eval_steps", *wanted, "--save_steps", *wanted]
-        command = [sys.executable, "simple_trainer.py", "default", "--disable_viewer", *options]
-        why = _failure(list(map(str, command)), examples, limit)
+    """The rows of gsplat's own trainer."""
     own: Row = {"part": "long", "rasterizer": THEIRS, "backbone": "vanilla", "views": 1}
     own = {**dict.fromkeys(COLUMNS, ""), **own, "operator": "sum"}
-    for stop in stops(steps):
-        trained = _trained(folder, stop)
-        if not trained.is_file():
-            yield own | {"steps": steps, "note": why}
-            return
-        training = json.loads(trained.read_text(encoding="utf-8"))
-        held_out = folder / "stats" / f"val_step{stop - 1}.json"
-        shown = json.loads(held_out.read_text(encoding="utf-8")) if held_out.is_file() else {}
-        found = _paced(stop, 1, float(training["ellipse_time"])) | {
-            "psnr": _rounded(shown.get("psnr")),
-            "primitives": training["num_GS"],
-            "peak_mib": round(1024 * float(training["mem"]), 1),
+    reached, why = trained(examples, scene, out / "runs", stops(steps), limit)
+    for stop in reached:
+        found = {
+            "psnr": _rounded(stop.psnr),
+            "primitives": stop.gaussians,
+            "peak_mib": round(stop.mib, 1),
             "note": "its photos, split and loss; seconds as it counts them",
-            "date": _written(trained),
+            "date": _written(stop.file),
         }
-        yield own | found
-
-
-def _failure(command: list[str], folder: Path, limit: float | None) -> str:
-    """Runs a command in a folder; why it did not come to its end, else nothing."""
-    try:
-        ended = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, check=False, timeout=limit
-        )
-    except subprocess.TimeoutExpired:
-        return f"stopped after {limit:g} s"
-    return " ".join(ended.stderr.split())[-300:] if ended.returncode else ""
-
-
-def _trained(folder: Path, step: int) -> Path:
-    """What gsplat's trainer writes at a stop."""
-    return folder / "stats" / f"train_step{step - 1}_rank0.json"
+        yield own | _paced(stop.step, 1, stop.seconds) | found
+    if why:
+        yield own | {"steps": steps, "note": why}
 
 
 def curve_rows(case: Case, run: Path) -> Iterator[Row]:

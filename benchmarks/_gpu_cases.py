@@ -1,0 +1,106 @@
+"""What benchmarks/gpu.py measures."""
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+#: The last one is the readable reference: it takes part where K is 1, for comparison.
+RASTERIZERS = ("gsplat", "gswarp", "torch")
+BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
+VIEWS = (1, 2, 4, 8)
+OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
+#: Gaussians of the made-up clouds, and megapixels of their photos.
+SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
+#: Steps of a long run that have a row, beside its last.
+STOPS = (7_000, 15_000)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row.
+
+    Attributes:
+        part: `sizes`, `steps` or `long`.
+        rasterizer: Its name.
+        backbone: Its name.
+        views: K.
+        operator: Its name.
+        steps: How many are measured.
+        gaussians: Of a made-up cloud; 0 for SCENE.
+    """
+
+    part: str
+    rasterizer: str
+    backbone: str
+    views: int
+    operator: str
+    steps: int
+    gaussians: int = 0
+
+    @property
+    def name(self) -> str:
+        """The folder of its runs."""
+        return "-".join(map(str, vars(self).values()))
+
+    def command(self, scene: Path, out: Path) -> list[str]:
+        """The command that trains a long run."""
+        options = {
+            "--device": "cuda",
+            "--rasterizer": self.rasterizer,
+            "--backbone": self.backbone,
+            "--sampler": "random",
+            "--views": self.views,
+            "--operator": self.operator,
+            "--steps": self.steps,
+            "--metrics": "psnr",
+            "--out": out,
+            "--schedule": "absolute",
+            "--eval-every": max(1, self.steps // 30),
+        }
+        given = [str(part) for pair in options.items() for part in pair]
+        return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
+
+    def config(self, scene: Path) -> dict[str, Any]:
+        """The settings of a case that is measured in this process."""
+        return {
+            "scene": str(scene),
+            "device": "cuda",
+            "rasterizer": {"name": self.rasterizer},
+            "backbone": {"name": self.backbone},
+            "sampler": {"name": "random"},
+            "views_per_step": self.views,
+            "operator": {"name": self.operator},
+            "steps": 30_000,
+            "schedule": "absolute",
+            "growth": "free",
+            "events": "steps",
+        }
+
+
+def cases(steps: int, long: int) -> Iterator[Case]:
+    """All rows, the short ones first."""
+    fast = RASTERIZERS[:-1]
+    for rasterizer, count in product(fast, SIZES):
+        for views, operator in ((1, "sum"), (2, "pcgrad")):
+            yield Case("sizes", rasterizer, "vanilla", views, operator, steps, count)
+    for rasterizer, backbone in product(RASTERIZERS, BACKBONES):
+        yield Case("steps", rasterizer, backbone, 1, "sum", steps)
+    for rasterizer, views, operator in product(fast, VIEWS[1:], OPERATORS):
+        yield Case("steps", rasterizer, "vanilla", views, operator, steps)
+    for rasterizer, views in product(fast, VIEWS[:2]):
+        yield Case("long", rasterizer, "vanilla", views, "sum", long)
+
+
+def chosen(cases: Iterable[Case], only: Sequence[str] | None) -> Iterator[Case]:
+    """The cases with one of the texts in their names; all where there is none."""
+    for case in cases:
+        if not only or any(text in case.name for text in only):
+            yield case
+
+
+def stops(steps: int) -> tuple[int, ...]:
+    """The steps of a long run whose figures are in the table."""
+    return (*(stop for stop in STOPS if stop < steps), steps)
