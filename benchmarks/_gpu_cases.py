@@ -1,4 +1,4 @@
-"""What benchmarks/gpu.py measures."""
+"""The cases of benchmarks/gpu.py, and the stops of its long runs."""
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence

@@ -10,7 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Stop:
-    """What the trainer had after some steps.
+    """Figures of the trainer after some steps.
 
     Attributes:
         step: How many.

@@ -1,7 +1,7 @@
 """The photometric loss and its gradient at once, in plain torch without autograd, for a GPU.
 
 Autograd would launch some ninety kernels, most of them shorter than launching them takes. Written
-out it is half as many, and nine planes are filtered on the way back instead of fifteen.
+out it is half as many, and nine planes are filtered in the backward pass instead of fifteen.
 """
 
 import torch
