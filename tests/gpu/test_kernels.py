@@ -5,7 +5,9 @@ Skipped where there is no CUDA device, as in CI; `docs/rasterizers.md` says how 
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from support.gaussians import posed_camera, random_gaussians
@@ -15,6 +17,7 @@ from crossgrad_core.commands import assemble, begin, configured
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.dropout import STREAM, dropped
 from crossgrad_core.training.loop import timed_step
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
@@ -210,6 +213,23 @@ def test_adam_is_that_of_the_cpu():
         states[device] = {name: each.detach().cpu() for name, each in tensors.items()}
     for name, expected in states["cpu"].items():
         torch.testing.assert_close(states["cuda"][name], expected, rtol=0, atol=2e-5)
+
+
+def test_what_a_view_is_drawn_without_is_drawn_on_the_device_and_repeatable():
+    scene = random_gaussians(100_000, CAMERAS["middle"], opacities=(0.1, 0.2))
+    setup = SimpleNamespace(config=SimpleNamespace(dropout=0.3))
+    found = []
+    for _ in range(2):
+        state = SimpleNamespace(rngs={STREAM: np.random.default_rng(4)})
+        gaussians = leaves(scene, "cuda", torch.float32)
+        found.append([dropped(setup, state, gaussians).opacities.detach() for _ in range(2)])
+    (first, second), again = found
+    assert torch.equal(first, again[0])
+    assert torch.equal(second, again[1])
+    assert not torch.equal(first, second)
+    assert float((first == 0).float().mean()) == pytest.approx(0.3, abs=0.01)
+    kept = first > 0
+    torch.testing.assert_close(first[kept], scene.opacities.float().cuda()[kept] / 0.7)
 
 
 def started(rasterizer, device="cuda", **options):
