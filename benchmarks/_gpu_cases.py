@@ -1,7 +1,7 @@
 """The cases of benchmarks/gpu.py, and the stops of its long runs."""
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -94,11 +94,9 @@ def cases(steps: int, long: int) -> Iterator[Case]:
         yield Case("long", rasterizer, "vanilla", views, "sum", long)
 
 
-def chosen(cases: Iterable[Case], only: Sequence[str] | None) -> Iterator[Case]:
-    """The cases with one of the texts in their names; all where there is none."""
-    for case in cases:
-        if not only or any(text in case.name for text in only):
-            yield case
+def is_chosen(case: Case, only: Sequence[str] | None) -> bool:
+    """Whether a case has one of the texts in its name, or there is none."""
+    return not only or any(text in case.name for text in only)
 
 
 def stops(steps: int) -> tuple[int, ...]:

@@ -49,11 +49,13 @@ def trained(
         command = [sys.executable, "simple_trainer.py", "default", "--disable_viewer", *options]
         why = _failure(list(map(str, command)), examples, limit)
     reached = [_stop(folder, step) for step in stops if _told(folder, step).is_file()]
+    if not why and len(reached) < len(stops):
+        why = f"it wrote no figures after {stops[-1]} steps"
     return reached, why
 
 
 def _stop(folder: Path, step: int) -> Stop:
-    told, held_out = _told(folder, step), folder / "stats" / f"val_step{step - 1}.json"
+    told, held_out = _told(folder, step), folder / "stats" / f"val_step{step - 1:04d}.json"
     training = json.loads(told.read_text(encoding="utf-8"))
     shown = json.loads(held_out.read_text(encoding="utf-8")) if held_out.is_file() else {}
     return Stop(
@@ -67,7 +69,7 @@ def _stop(folder: Path, step: int) -> Stop:
 
 
 def _told(folder: Path, step: int) -> Path:
-    return folder / "stats" / f"train_step{step - 1}_rank0.json"
+    return folder / "stats" / f"train_step{step - 1:04d}_rank0.json"
 
 
 def _failure(command: list[str], folder: Path, limit: float | None) -> str:

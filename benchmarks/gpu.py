@@ -16,22 +16,24 @@ scene. Runs, gpu.csv, the curves of the long runs (gpu_curves.csv) and gpu.md ar
 
 import argparse
 import csv
+import gc
 import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from _gpu_cases import PIXELS, Case, cases, chosen, stops
+from _gpu_cases import PIXELS, Case, cases, is_chosen, stops
 from _gsplat_trainer import trained
 from _machine import code, facts
 
-from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.reading import read_run
+from crossgrad_core.training.keeper import Keeper
 
 if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
@@ -50,48 +52,69 @@ Row = dict[str, Any]
 
 
 class Short:
-    """Measures cases in this process, and remembers them in a file.
+    """Measures cases in this process, and remembers their figures in a file.
 
     Args:
         scene: SCENE.
         kept: The file, one JSON line per case.
+        place: What figures are of, besides their case: another place has others.
     """
 
-    def __init__(self, scene: Path, kept: Path) -> None:
-        self._scene, self._kept = scene, kept
-        lines = kept.read_text(encoding="utf-8").splitlines() if kept.is_file() else []
-        self._known: dict[str, Row] = {row.pop("case"): row for row in map(json.loads, lines)}
+    def __init__(self, scene: Path, kept: Path, place: str) -> None:
+        self.scene, self._kept, self._place = scene, kept, place
+        self._known: dict[str, Row] = {}
+        for line in kept.read_text(encoding="utf-8").splitlines() if kept.is_file() else []:
+            # The last one may have been cut off.
+            with suppress(json.JSONDecodeError, KeyError):
+                row = json.loads(line)
+                self._known[row.pop("case")] = row
+
+    def known(self, case: Case) -> Row | None:
+        """The figures of a case that was measured here before."""
+        return self._known.get(self._key(case))
 
     def row(self, case: Case) -> Row:
-        """The figures of a case, or why it has none; refusals and figures stay."""
-        if case.name in self._known:
-            return self._known[case.name]
+        """The figures of a case, or why it has none, which is looked at again."""
+        if (known := self.known(case)) is not None:
+            return known
         try:
             found = self._measured(case)
-        except UserError as error:
-            found = {"note": " ".join(str(error).split())}
-        except Exception as error:  # One case must not end the table.
-            return _row(case, {"note": f"{type(error).__name__}: {error}"})
+        except Exception as error:
+            # One case must not end the table, but for one that leaves the GPU useless.
+            self._wait()
+            return _row(case, {"note": " ".join(f"{type(error).__name__}: {error}".split())})
         row = _row(case, found)
         with self._kept.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"case": case.name, **row}) + "\n")
+            file.write(json.dumps({"case": self._key(case), **row}) + "\n")
         return row
+
+    def _key(self, case: Case) -> str:
+        return f"{case.name}, {self._place}"
+
+    def _wait(self) -> None:
+        import torch
+
+        torch.cuda.synchronize()
 
     def _measured(self, case: Case) -> Row:
         import torch
 
-        device = torch.device("cuda")
+        gc.collect()
+        torch.cuda.empty_cache()
+        before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.burn_in("cuda")
+        keeper = Keeper(state)  # A run holds a copy to which it can go back.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        seconds = steady(setup, state, case.steps, lambda: torch.cuda.synchronize(device))
+        seconds = steady(setup, state, case.steps, self._wait)
+        del keeper
         machine = facts()
         return {
             "ms_per_step": round(1e3 * seconds / case.steps, 2),
             "views_per_second": round(case.steps * case.views / seconds, 1),
             "primitives": state.primitives(setup),
-            "peak_mib": round(torch.cuda.max_memory_allocated() / 2**20, 1),
+            "peak_mib": round((torch.cuda.max_memory_allocated() - before) / 2**20, 1),
             "gpu": torch.cuda.get_device_name(),
             "torch": machine["torch"],
             "code": code(),
@@ -109,7 +132,7 @@ class Short:
             )
             run = Run(cell, device="cuda", rasterizer={"name": case.rasterizer})
             return run.setup, run.state
-        config = configured(case.config(self._scene))
+        config = configured(case.config(self.scene))
         scene, reader = read_scene(config)
         setup = assemble(config, scene, reader)
         state = begin(setup)
@@ -164,6 +187,7 @@ def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
 
 def _row(case: Case, found: Row) -> Row:
     own = {name: value for name, value in asdict(case).items() if name in COLUMNS}
+    own["primitives"] = case.gaussians or ""
     return {**dict.fromkeys(COLUMNS, ""), **own, **found, "note": found.get("note", "")[:300]}
 
 
@@ -221,12 +245,11 @@ def theirs(
         yield own | {"steps": steps, "note": why}
 
 
-def curve_rows(case: Case, run: Path) -> Iterator[Row]:
-    """Step, training seconds and PSNR of every evaluation of a long run."""
-    for step, seconds, psnr in (
-        (row["step"], row["train_seconds"], row.get("psnr")) for row in read_run(run).rows
-    ):
-        yield {"run": case.name, "step": step, "train_seconds": seconds, "psnr": psnr}
+def curve_rows(case: Case, run: Path | None) -> Iterator[Row]:
+    """Step, training seconds and PSNR of every evaluation of a long run, if there is one."""
+    for row in [] if run is None else read_run(run).rows:
+        shown = {name: row.get(name) for name in ("step", "train_seconds", "psnr")}
+        yield {"run": case.name, **shown}
 
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
@@ -261,6 +284,17 @@ def _rounded(value: float | None) -> float | str:
     return "" if value is None else round(float(value), 3)
 
 
+def case_rows(case: Case, short: Short, out: Path, *, new: bool) -> tuple[list[Row], list[Row]]:
+    """The rows of a case and of its curve; none where it is neither new nor measured before."""
+    if case.part != "long":
+        row = short.row(case) if new else short.known(case)
+        return ([] if row is None else [row]), []
+    if not new and finished(out / "runs" / case.name) is None:
+        return [], []
+    run, why = measured(case, short.scene, out)
+    return list(rows_of(case, run, why)), list(curve_rows(case, run))
+
+
 def run_all(arguments: argparse.Namespace, gpu: str) -> None:
     """Measures what is missing, and writes the tables after every run."""
     out, scene = arguments.out.resolve(), arguments.scene.resolve()
@@ -278,15 +312,11 @@ def run_all(arguments: argparse.Namespace, gpu: str) -> None:
         write_csv(out / "gpu_curves.csv", ("run", "step", "train_seconds", "psnr"), curves)
         (out / "gpu.md").write_text(as_markdown(rows, described), encoding="utf-8")
 
-    short = Short(scene, out / "short.jsonl")
-    for case in chosen(cases(arguments.steps, arguments.long), arguments.only):
-        if case.part != "long":
-            write(short.row(case))
-            continue
-        run, why = measured(case, scene, out)
-        if run is not None:
-            curves.extend(curve_rows(case, run))
-        for row in rows_of(case, run, why):
+    short = Short(scene, out / "short.jsonl", f"{scene}, {gpu}, {code()}")
+    for case in cases(arguments.steps, arguments.long):
+        found, curve = case_rows(case, short, out, new=is_chosen(case, arguments.only))
+        curves.extend(curve)
+        for row in found:
             write(row)
     if arguments.gsplat_examples is not None:
         examples, limit = arguments.gsplat_examples.resolve(), arguments.trainer_seconds
@@ -305,6 +335,11 @@ def main() -> None:
     parser.add_argument("--gsplat-examples", type=Path)
     parser.add_argument("--trainer-seconds", type=float, help="at most, of gsplat's trainer")
     arguments = parser.parse_args()
+    all_cases = list(cases(arguments.steps, arguments.long))
+    if missing := [t for t in arguments.only or () if not any(t in c.name for c in all_cases)]:
+        names = ", ".join(case.name for case in all_cases)
+        print(f"no case has {missing[0]!r} in its name: {names}", file=sys.stderr)
+        sys.exit(2)
     import torch
 
     if not torch.cuda.is_available():

@@ -218,6 +218,7 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "free",
             "events": "steps",
+            "dropout": 0.0,  # Each photo sees all that is in front of it.
             **options,
         }
     )

@@ -93,7 +93,7 @@ def penalty(weights: Tensor, l2: float, smoothness: float) -> Tensor:
     the mean over the training cameras. There z has mean 0 and variance 1, so that the mean of
     (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
     """
-    factors = weights.new_tensor([l2 + smoothness, l2 + 4 * smoothness])
+    factors = torch.tensor([l2 + smoothness, l2 + 4 * smoothness]).to(weights, non_blocking=True)
     total: Tensor = (weights.square() @ factors).sum()
     return total / max(1, len(weights))
 

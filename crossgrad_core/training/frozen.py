@@ -7,6 +7,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.contract.scene import View
+from crossgrad_core.training.scaled_photos import on_device
 
 
 def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str, Tensor]:
@@ -24,13 +25,8 @@ def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str
     wanted = {n: model.parameters[n] for n in tensors if model.parameters[n].requires_grad}
     gaussians = model.backbone.decode(model.parameters, view.camera, model.phase)
     image = model.rasterizer.render(gaussians, view.camera, model.background).image
-    mask = view.photo.mask()
-    loss = model.loss.loss(
-        model.exposed(view, image),
-        view.photo.image().to(image.device),
-        None if mask is None else mask.to(image.device),
-        None,
-    )
+    photo, mask = on_device((view.photo.image(), view.photo.mask()), image.device)
+    loss = model.loss.loss(model.exposed(view, image), photo, mask, None)
     if not loss.requires_grad:
         return {}
     found = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)

@@ -105,15 +105,27 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], reads: list[str]) -> Any:
         isinstance(each, Tensor) and each.dtype in {torch.bool, torch.uint8}
         for each in tree_leaves(args[1] if name == "index" else args[1:2])
     )
-    enters = wanted is not None and torch.device(wanted).type == NAME and not of_device
     if of_device and (name in READING or by_mask or leaves):
         reads.append(f"{name} to the CPU" if leaves else name)
-    elif enters and name == "_to_copy" and not kwargs.get("non_blocking"):
+    elif _enters(name, args, kwargs, of_device=bool(of_device)):
         reads.append(BLOCKING)
     result = func(*tree_map(_raw, args), **tree_map(_raw, kwargs))
     if leaves or not (of_device or (wanted is not None and torch.device(wanted).type == NAME)):
         return result
     return tree_map(lambda each: Tensor(each) if isinstance(each, torch.Tensor) else each, result)
+
+
+def _enters(name: str, args: Any, kwargs: dict[str, Any], *, of_device: bool) -> bool:
+    """Whether values of the machine's memory are copied to the device, and waited for."""
+    here = [t for t in tree_leaves(args) if isinstance(t, torch.Tensor) and type(t) is not Tensor]
+    if name == "_to_copy":
+        wanted = kwargs.get("device")
+        there = wanted is not None and torch.device(wanted).type == NAME and not of_device
+        return there and not kwargs.get("non_blocking")
+    if name == "copy_":
+        waits = not (kwargs.get("non_blocking") or (len(args) > 2 and args[2]))
+        return of_device and bool(here) and waits
+    return of_device and name.startswith("index") and bool(here)
 
 
 def _raw(value: Any) -> Any:

@@ -59,9 +59,10 @@ def test_short_cases_are_steps_in_this_process(script, tmp_path, monkeypatch, ga
     monkeypatch.setattr(script.Case, "config", lambda *given: config(*given) | on_cpu)
     for name in ("empty_cache", "reset_peak_memory_stats", "synchronize"):
         monkeypatch.setattr(torch.cuda, name, lambda *_: None)
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 3 * 2**20)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda: 2**20)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 4 * 2**20)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "H")
-    short = script.Short(SCENE, tmp_path / "short.jsonl")
+    short = script.Short(SCENE, tmp_path / "short.jsonl", "here")
     good = script.Case("steps", "numba", "vanilla", 2, "pcgrad", 3, gaussians)
     refused = script.Case("steps", "numba", "vanilla", 1, "nobody", 3, gaussians)
     row = short.row(good)
@@ -70,21 +71,48 @@ def test_short_cases_are_steps_in_this_process(script, tmp_path, monkeypatch, ga
     assert gaussians in {0, row["primitives"]}
     why = short.row(refused)
     assert "nobody" in why["note"]
-    monkeypatch.setattr(script.Short, "_measured", None)
-    again = script.Short(SCENE, tmp_path / "short.jsonl")
-    assert again.row(good) == row
-    assert again.row(refused) == why
+    assert why["primitives"] == (gaussians or "")
+    with (tmp_path / "short.jsonl").open("a") as file:
+        file.write('{"case": "cut o')
+    again = script.Short(SCENE, tmp_path / "short.jsonl", "here")
+    assert again.row(good) == again.known(good) == row
+    # Another place has other figures, and what was missing may be there now.
+    assert again.known(refused) is None
+    assert script.Short(SCENE, tmp_path / "short.jsonl", "there").known(good) is None
 
 
 def test_what_fails_is_noted_and_tried_again(script, tmp_path, monkeypatch):
     def fails(_short, _case):
-        raise RuntimeError("out of memory")
+        raise RuntimeError("out of\nmemory")
 
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
     monkeypatch.setattr(script.Short, "_measured", fails)
-    short = script.Short(tmp_path, tmp_path / "short.jsonl")
-    row = short.row(script.Case("steps", "gsplat", "vanilla", 1, "sum", 3))
-    assert row["note"] == "RuntimeError: out of memory"
+    short = script.Short(tmp_path, tmp_path / "short.jsonl", "here")
+    case = script.Case("steps", "gsplat", "vanilla", 1, "sum", 3)
+    assert short.row(case)["note"] == "RuntimeError: out of memory"
     assert not (tmp_path / "short.jsonl").exists()
+    # After an illegal access nothing on the GPU can be believed.
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: fails(short, case))
+    with pytest.raises(RuntimeError, match="out of"):
+        short.row(case)
+
+
+def test_a_text_that_no_case_has_ends_with_2(script, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "scene", "--only", "sizes", "tall"])
+    with pytest.raises(SystemExit) as ended:
+        script.main()
+    assert ended.value.code == 2
+    assert "no case has 'tall' in its name: sizes-gsplat" in capsys.readouterr().err
+
+
+def test_what_was_measured_before_stays_in_the_table(script, tmp_path, monkeypatch):
+    case = next(iter(script.cases(10, 60)))
+    monkeypatch.setattr(script.Short, "_measured", lambda *_: {"ms_per_step": 1.5})
+    short = script.Short(tmp_path, tmp_path / "short.jsonl", "here")
+    assert script.case_rows(case, short, tmp_path, new=False) == ([], [])
+    assert script.case_rows(case, short, tmp_path, new=True)[0][0]["ms_per_step"] == 1.5
+    again = script.Short(tmp_path, tmp_path / "short.jsonl", "here")
+    assert len(script.case_rows(case, again, tmp_path, new=False)[0]) == 1
 
 
 def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monkeypatch):

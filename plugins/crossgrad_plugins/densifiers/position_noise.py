@@ -42,7 +42,7 @@ def position_noise(
     largest = torch.exp(torch.maximum(torch.maximum(a, b), c))
     rows = (factor * largest > NEGLIGIBLE).nonzero().squeeze(1)
     draws = rng.standard_normal((rows.shape[0], 3), dtype=np.float32)
-    noise = torch.from_numpy(draws).to(log_scales)
+    noise = torch.from_numpy(draws).to(log_scales, non_blocking=True)
     axes = torch.nn.functional.normalize(parameters["quats"].detach()[rows], dim=-1)
     variances = torch.exp(2.0 * log_scales[rows])
     shifts = rotated(variances * rotated(noise, axes, back=True), axes)

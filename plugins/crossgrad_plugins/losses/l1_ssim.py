@@ -11,8 +11,8 @@ from crossgrad_plugins.losses.photometric.loss import photometric_loss
 class L1SSIM(Loss):
     """(1 - w) * L1 + w * (1 - SSIM), means over the pixels that count and their channels.
 
-    On the CPU value and gradient come from one fused pass; pixel weights, other devices and other
-    types take plain torch.
+    In float32 value and gradient come from one pass, on the CPU a fused one; pixel weights and
+    other types take torch's operators and autograd.
 
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
     """

@@ -141,9 +141,9 @@ def _batch(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """[N, 3] RGB as `view_colors` has it; harmonics in one kernel instead of some hundred."""
+    """[N, 3] RGB as `view_colors` has it; harmonics above degree 0 in one kernel."""
     center = camera.center.to(gaussians.means, non_blocking=True)
-    coefficients = coefficients_of(gaussians)
+    coefficients = coefficients_of(gaussians) if gaussians.colors is None else None
     if coefficients is None or not gaussians.sh_degree:
         return view_colors(gaussians, center)
     from gsplat import spherical_harmonics

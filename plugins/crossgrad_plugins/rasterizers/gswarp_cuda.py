@@ -26,8 +26,6 @@ from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
 _PACKAGE = "gswarp"
-#: Dimensions of colours; harmonics have one more.
-_RGB = 2
 #: Depth up to which gswarp draws nothing, in the units that it is given.
 _NEAR = 0.2
 
@@ -88,7 +86,7 @@ class GswarpRasterizer(Rasterizer):
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=device))
         enlarged = _NEAR / self.near
         size = (camera.width / 2, camera.height / 2)
-        degree = 0 if gaussians.sh_dc is None else gaussians.sh_degree
+        degree = gaussians.sh_degree if gaussians.colors is None else 0
         call = Call(
             partial(_draw, screen, settings_of(camera, background, enlarged, degree)),
             partial(_observe, screen, size),
@@ -117,12 +115,11 @@ def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
     return view_colors(gaussians, camera.center.to(gaussians.means, non_blocking=True))
 
 
-def settings_of(
-    camera: Camera, background: Tensor, enlarged: float, degree: int = 0
-) -> dict[str, Any]:
+def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int) -> dict[str, Any]:
     """The fields of gswarp's settings for a camera of a scene that is `enlarged` times as large.
 
-    Its matrices are transposed; the projection maps the image to [-1, 1], with the principal point.
+    Above degree 0 gswarp evaluates harmonics itself. Its matrices are transposed; the projection
+    maps the image to [-1, 1], with the principal point.
     """
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= enlarged
@@ -159,7 +156,7 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
         means3D=means,
         means2D=centers,
         opacities=opacities,
-        **{"colors_precomp" if colors.dim() == _RGB else "shs": colors},
+        **{"shs" if settings["sh_degree"] else "colors_precomp": colors},
         scales=scales,
         rotations=quats,
     )

@@ -7,9 +7,14 @@ import torch
 from torch.nn.functional import interpolate
 
 from crossgrad_plugins.losses.photometric import on_device
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.loss import _DeviceLoss, photometric_loss
 from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
-from crossgrad_plugins.losses.photometric.reference import gaussian_window, l1_ssim_loss, ssim_map
+from crossgrad_plugins.losses.photometric.reference import (
+    _window_for,
+    gaussian_window,
+    l1_ssim_loss,
+    ssim_map,
+)
 
 H, W = 34, 46
 
@@ -250,6 +255,48 @@ def test_the_gradient_written_out_is_autograds(name, masked):
     ):
         assert fine <= 1e-10 * size
         assert coarse <= 2 * other + 2e-6 * size
+
+
+@pytest.mark.parametrize("ssim_weight", [0.0, 1.0])
+@pytest.mark.parametrize("kept", [None, "none", "one"])
+def test_the_gradient_written_out_at_the_ends_of_its_options(ssim_weight, kept):
+    """What does not count may be anything."""
+    image, target = BLURRED.double(), NATURAL.double()
+    mask = None if kept is None else torch.zeros(image.shape[:2], dtype=torch.bool)
+    if mask is not None:
+        image = torch.where(mask[..., None], image, torch.nan)
+    if kept == "one":
+        mask[7, 9], image[7, 9] = True, BLURRED[7, 9].double()
+    value, gradient = loss_and_gradient(l1_ssim_loss, image, target, mask, ssim_weight)
+    found, slope = on_device.loss_and_gradient(image, target, mask, ssim_weight)
+    assert found.item() == pytest.approx(value, rel=1e-12, abs=1e-15)
+    torch.testing.assert_close(slope, gradient.nan_to_num(), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("image", [NATURAL, FLAT, torch.zeros(H, W, 3), torch.zeros(0, 4, 3)])
+def test_equal_images_have_no_loss_where_the_gradient_is_written_out(image):
+    value, slope = on_device.loss_and_gradient(image, image, None, 0.2)
+    assert value.item() == 0.0
+    assert slope.shape == image.shape
+    assert not slope.any()
+
+
+def test_the_loss_of_a_gpu_hands_its_gradient_on():
+    """On the CPU here: what comes from above is a factor, of any sign."""
+    image = BLURRED.clone().requires_grad_()
+    loss = _DeviceLoss.apply(image, NATURAL, None, 0.2)
+    (found,) = torch.autograd.grad(-3.0 * loss, image)
+    expected = on_device.loss_and_gradient(BLURRED, NATURAL, None, 0.2)[1]
+    torch.testing.assert_close(found, -3.0 * expected)
+
+
+def test_the_window_serves_gradients_whoever_asked_first():
+    _window_for.cache_clear()
+    with torch.inference_mode():
+        ssim_map(BLURRED.double(), NATURAL.double())
+    image = BLURRED.double().requires_grad_()
+    l1_ssim_loss(image, NATURAL.double()).backward()
+    assert image.grad.any()
 
 
 def test_uint8_photos_are_shares_of_255_where_the_gradient_is_written_out():

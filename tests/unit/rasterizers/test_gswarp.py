@@ -176,7 +176,7 @@ def test_matrices_project_a_point_to_the_pixel_that_our_camera_does():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     points[:, 2] += 4.0
     pixels, depths = OFF_AXIS.project(points.numpy())
-    found = settings_of(OFF_AXIS, torch.zeros(3), 4.0)
+    found = settings_of(OFF_AXIS, torch.zeros(3), 4.0, 0)
     enlarged = torch.cat([points * 4.0, torch.ones(50, 1, dtype=torch.float64)], 1).float()
     x, y, _, w = (enlarged @ found["projmatrix"]).unbind(-1)
     ahead = torch.from_numpy(depths) > 0.1

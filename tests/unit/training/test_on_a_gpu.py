@@ -128,6 +128,7 @@ def steps(setup, count):
         (Together(), {"views": 3, "resolution": {"name": "octaves"}}),
         (Together(), {"views": 2, "operator": {"name": "pcgrad"}, "exposure": {"name": "gain"}}),
         (Dense(), {"views": 2, "backbone": {"name": "mip"}}),
+        (Dense(), {"backbone": {"name": "distance"}}),
     ],
     ids=str,
 )
@@ -159,6 +160,8 @@ def test_the_device_notes_what_is_waited_for():
             lambda: torch.arange(3.0).to(one.device),
             lambda: torch.arange(3.0).to(two),
             lambda: one.new_tensor([1.0]),
+            lambda: one.copy_(torch.arange(3.0)),
+            lambda: one[torch.tensor([0, 2])],
             lambda: torch.tensor(1.0, device=one.device),
             lambda: float(one.sum()),
             lambda: bool((one > 0).any()),

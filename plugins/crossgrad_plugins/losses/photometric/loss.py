@@ -41,12 +41,12 @@ def photometric_loss(
     if weights is not None:
         _check_weights(image, weights)
         return l1_ssim_loss(image, target, mask, ssim_weight, weights)
-    if image.dtype != torch.float32:
-        return l1_ssim_loss(image, target, mask, ssim_weight)
     on_cpu = all(t is None or t.device.type == "cpu" for t in (image, target, mask))
-    way = _FusedLoss if on_cpu else _DeviceLoss
-    loss: Tensor = way.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
-    return loss
+    if image.dtype == torch.float32 and (on_cpu or image.requires_grad):
+        way = _FusedLoss if on_cpu else _DeviceLoss
+        loss: Tensor = way.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
+        return loss
+    return l1_ssim_loss(image, target, mask, ssim_weight)
 
 
 class _FusedLoss(torch.autograd.Function):
@@ -85,7 +85,7 @@ class _FusedLoss(torch.autograd.Function):
 
 
 class _DeviceLoss(torch.autograd.Function):
-    """Likewise on a GPU, which is not waited for."""
+    """As `_FusedLoss`, by torch's operators: for a GPU, which is not waited for."""
 
     @staticmethod
     @override

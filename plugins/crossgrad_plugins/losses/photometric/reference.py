@@ -95,8 +95,12 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 @cache
 def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The window where it is needed: copied there once, since a GPU is waited for meanwhile."""
-    return gaussian_window().to(device, dtype)
+    """The window where it is needed: copied there once, since a GPU is waited for meanwhile.
+
+    Others may ask first who need no gradients: made without inference mode it serves all.
+    """
+    with torch.inference_mode(mode=False):
+        return gaussian_window().to(device, dtype)
 
 
 def blurred(fields: Tensor) -> Tensor:

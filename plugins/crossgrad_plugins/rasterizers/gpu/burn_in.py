@@ -21,6 +21,7 @@ MEAN: Final = 5e-4
 GRADIENT: Final = 2e-2
 _SIZE: Final = (70, 50)
 _NUMBER: Final = 200
+_TENSORS: Final = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,17 @@ class Look:
 
 
 def burn_in(rasterizer: Rasterizer, device: str) -> None:
-    """Draws the known scene twice, since it is the first process and the first call that fail.
+    """Draws the known scene in colours and in harmonics.
+
+    It is the first process and the first call that fail, so that it is drawn twice in any case.
 
     Raises:
         UserError: The rasterizer raises something, or draws something else than `torch` does.
     """
-    expected = look_at(_reference(rasterizer), "cpu")
-    for _ in range(2):
+    for harmonics in (False, True):
+        expected = look_at(_reference(rasterizer), "cpu", harmonics=harmonics)
         try:
-            found = look_at(rasterizer, device)
+            found = look_at(rasterizer, device, harmonics=harmonics)
         except UserError:
             raise
         except Exception as error:
@@ -56,7 +59,7 @@ def burn_in(rasterizer: Rasterizer, device: str) -> None:
             raise _refused(rasterizer, "draws a known scene wrongly", wrong)
 
 
-def known_scene(device: str) -> tuple[Gaussians, Camera]:
+def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
     """Gaussians of a few pixels, some outside the image, and a camera off their axis."""
     random = torch.Generator().manual_seed(872)
 
@@ -69,7 +72,10 @@ def known_scene(device: str) -> tuple[Gaussians, Camera]:
         quats=uniform(-1.0, 1.0, 4),
         scales=uniform(0.03, 0.12, 3),
         opacities=uniform(0.1, 0.9),
-        colors=uniform(0.0, 1.0, 3),
+        colors=None if harmonics else uniform(0.0, 1.0, 3),
+        sh_dc=uniform(-1.0, 1.0, 1, 3) if harmonics else None,
+        sh_rest=uniform(-0.3, 0.3, 15, 3) if harmonics else None,
+        sh_degree=3 if harmonics else 0,
     )
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.1, 2.5])
@@ -77,16 +83,16 @@ def known_scene(device: str) -> tuple[Gaussians, Camera]:
     return gaussians, Camera(width, height, 60.0, 62.0, 36.0, 24.0, pose)
 
 
-def look_at(rasterizer: Rasterizer, device: str) -> Look:
+def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
     """What a rasterizer makes of the known scene."""
-    gaussians, camera = known_scene(device)
+    gaussians, camera = known_scene(device, harmonics=harmonics)
     background = torch.tensor([0.2, 0.4, 0.6], device=device)
     image = rasterizer.render(gaussians, camera, background).image
     ramp = torch.linspace(0.0, 1.0, image.numel(), device=device).view(image.shape)
     loss = (image - ramp).square().mean()
     loss.backward()  # type: ignore[no-untyped-call]
-    names = ("means", "quats", "scales", "opacities", "colors")
-    gradients = {name: getattr(gaussians, name).grad for name in names}
+    tensors = {name: getattr(gaussians, name) for name in _TENSORS}
+    gradients = {name: each.grad for name, each in tensors.items() if each is not None}
     known = {name: g.cpu() for name, g in gradients.items() if g is not None}
     return Look(image.detach().cpu(), float(loss.detach()), known)
 

@@ -10,7 +10,7 @@ def nothing_drawn(camera: Camera, background: Tensor, outputs: frozenset[str]) -
     """The background, and statistics of no rows."""
     image = background.expand(camera.height, camera.width, 3)
     alpha = torch.zeros_like(image[..., 0])
-    none = torch.zeros(0, dtype=torch.int32).to(background.device)
+    none = torch.zeros(0, dtype=torch.int32, device=background.device)
     screen = Screen(
         radii=none,
         pixels=none if "pixels" in outputs else None,

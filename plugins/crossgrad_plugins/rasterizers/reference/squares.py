@@ -31,7 +31,7 @@ def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
     Pixels are numbered from the centre of the first one here. Empty where the radius is 0 or the
     square is off the image.
     """
-    tiles = torch.tensor([-(-pixels // TILE) for pixels in size]).to(means)
+    tiles = torch.tensor([-(-pixels // TILE) for pixels in size]).to(means, non_blocking=True)
     middle = torch.where(radii[:, None] > 0, means, 0.0) - 0.5
     first = ((middle - radii[:, None]) / TILE).floor().clamp(min=0).minimum(tiles)
     last = (((middle + radii[:, None]) / TILE).floor() + 1).clamp(min=0).minimum(tiles)

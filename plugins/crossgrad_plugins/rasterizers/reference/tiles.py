@@ -32,7 +32,7 @@ def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
     """
     # One pixel of slack so that no rounding here can cut a footprint.
     low, high = means - reach - 1, means + reach + 1
-    limit = torch.tensor(size, dtype=means.dtype, device=means.device)
+    limit = torch.tensor(size).to(means, non_blocking=True)
     seen = (high > 0) & (low < limit)
     first = (low.clamp(min=0).minimum(limit) / TILE).floor().long()
     last = (high.clamp(min=0).minimum(limit) / TILE).ceil().long()
