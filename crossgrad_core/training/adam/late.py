@@ -23,7 +23,7 @@ from crossgrad_core.training.adam.coefficients import Coefficients
 LONGEST: Final = 256
 #: Share of the rows from which on a step is taken with all of them, in the order of memory: to
 #: bring those left out up to date later takes longer.
-MOST_ROWS: Final = 0.2
+MOST_ROWS: Final = 0.15
 #: Second moments that fade faster may be gone before the kernel looks again.
 LEAST_BETA2: Final = 0.5
 
