@@ -74,7 +74,7 @@ def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
 
 
 def _draws(rng: np.random.Generator, count: int, device: torch.device) -> Tensor:
-    """[N] uniform in [0, 1), drawn on the device: of a million the CPU would draw for 4 ms."""
+    """[N] uniform in [0, 1), drawn on the device: the CPU takes milliseconds for a million."""
     if device.type == "cpu":
         return torch.from_numpy(rng.random(count, dtype=np.float32))
     generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 63)))

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -364,7 +364,23 @@ def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> T
         mask=target.mask,
     )
     factors = setup.hook.crossgrad_pixel_weights(context=context)
-    return reduce(torch.mul, factors) if factors else None
+    return _checked(reduce(torch.mul, factors), context) if factors else None
+
+
+def _checked(weights: Tensor, context: PixelContext) -> Tensor:
+    """Pixel weights, if a loss can use them; of a GPU, which would be waited for, their shape."""
+    shape = context.target.shape[:2]
+    fits = weights.shape == shape and weights.is_floating_point()
+    if fits and (not weights.is_cpu or bool(((weights >= 0) & (weights < inf)).all())):
+        return weights
+    least = f", the least {float(weights.min()):g}" if fits else ""
+    raise UserError(
+        "a plugin weighs pixels in a way that no loss can use",
+        where=f"hook crossgrad_pixel_weights, photo {context.view.name}",
+        expected=f"finite numbers of 0 or more, floating point, {list(shape)}",
+        found=f"{list(weights.shape)} of {weights.dtype}{least}",
+        todo="repair the plugin, or run without it",
+    )
 
 
 def camera_at(camera: Camera, scale: float) -> Camera:

@@ -297,6 +297,35 @@ class Weighing:
         return torch.from_numpy(context.rng.random(shape, dtype=np.float32))
 
 
+class WeighingBy:
+    """Weighs pixels by what it is given."""
+
+    def __init__(self, change):
+        self.change = change
+
+    @hookimpl
+    def crossgrad_pixel_weights(self, context):
+        return self.change(torch.ones(context.camera.height, context.camera.width))
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda ones: ones - 1.5, "the least -0.5"),
+        (lambda ones: ones.index_fill(1, torch.tensor([2]), torch.nan), "the least nan"),
+        (lambda ones: ones / 0.0, "the least inf"),
+        (lambda ones: ones[:-1], "torch.float32"),
+        (lambda ones: ones.int(), "torch.int32"),
+    ],
+    ids=["negative", "NaN", "infinite", "a row short", "whole numbers"],
+)
+def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
+    with pytest.raises(UserError, match="a plugin weighs pixels") as refused:
+        trained(1, WeighingBy(change))
+    assert found in refused.value.found
+    assert refused.value.where.startswith("hook crossgrad_pixel_weights, photo ")
+
+
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_before_the_first_edit_they_change_no_bit(choice, operator):

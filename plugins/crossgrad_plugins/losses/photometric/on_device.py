@@ -1,8 +1,8 @@
 """The photometric loss and its gradient at once, in plain torch without autograd, for a GPU.
 
-Autograd would launch some ninety kernels, most of them shorter than launching them takes. Written
-out, with sums and differences as in the fused kernel of the CPU (`numba_kernels.fused`), it is half
-as many, and twelve planes are filtered, nine in the backward pass, instead of fifteen each time.
+Autograd launches about twice as many kernels, most of them shorter than launching them takes. With
+sums and differences, as in the fused kernel of the CPU (`numba_kernels.fused`), twelve planes are
+filtered, and nine in the backward pass, instead of fifteen each time.
 """
 
 import torch
