@@ -81,8 +81,10 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     medians = np.median(tried, axis=1)
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
-    kept = np.linalg.norm(measured - frame.points(points), axis=1) <= medians[best]
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
+    # Worked out again the residuals are rounded in another way: half of them must remain.
+    half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
+    kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half
     for _ in range(_PASSES):
         frame = _frame(points[kept], measured[kept])
         residuals = np.linalg.norm(measured - frame.points(points), axis=1)
