@@ -58,7 +58,7 @@ class Case:
             "--metrics": "psnr",
             "--out": out,
             "--schedule": "absolute",
-            "--eval-every": max(1, self.steps // 30),
+            "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
         given = [str(part) for pair in options.items() for part in pair]
         return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]

@@ -20,7 +20,7 @@ import gc
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -28,12 +28,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import torch
 from _gpu_cases import PIXELS, Case, cases, is_chosen, stops
 from _gsplat_trainer import trained
 from _machine import code, facts
+from scale import STEP, Cell, Run
 
+from crossgrad_core.commands import assemble, begin, configured, read_scene
 from crossgrad_core.run.results.reading import read_run
 from crossgrad_core.training.keeper import Keeper
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.views import target_at
 
 if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
@@ -41,8 +46,6 @@ if TYPE_CHECKING:
 
 #: Of gsplat's trainer, which has no name among the rasterizers.
 THEIRS = "gsplat's trainer"
-#: The step of the published schedule at which a measured case begins.
-STEP = 5_010
 COLUMNS = (
     "part", "rasterizer", "backbone", "views", "operator", "steps", "ms_per_step",
     "views_per_second", "train_seconds", "psnr", "primitives", "peak_mib", "note", "gpu", "torch",
@@ -81,7 +84,7 @@ class Short:
             found = self._measured(case)
         except Exception as error:
             # One case must not end the table, but for one that leaves the GPU useless.
-            self._wait()
+            torch.cuda.synchronize()
             return _row(case, {"note": " ".join(f"{type(error).__name__}: {error}".split())})
         row = _row(case, found)
         with self._kept.open("a", encoding="utf-8") as file:
@@ -91,14 +94,7 @@ class Short:
     def _key(self, case: Case) -> str:
         return f"{case.name}, {self._place}"
 
-    def _wait(self) -> None:
-        import torch
-
-        torch.cuda.synchronize()
-
     def _measured(self, case: Case) -> Row:
-        import torch
-
         gc.collect()
         torch.cuda.empty_cache()
         before = torch.cuda.memory_allocated()
@@ -107,7 +103,7 @@ class Short:
         keeper = Keeper(state)  # A run holds a copy to which it can go back.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        seconds = steady(setup, state, case.steps, self._wait)
+        seconds = steady(setup, state, case.steps)
         del keeper
         machine = facts()
         return {
@@ -122,10 +118,6 @@ class Short:
         }
 
     def _begun(self, case: Case) -> "tuple[Setup, TrainState]":
-        from scale import Cell, Run
-
-        from crossgrad_core.commands import assemble, begin, configured, read_scene
-
         if case.gaussians:
             cell = Cell(
                 case.gaussians, case.gaussians, PIXELS, views=case.views, operator=case.operator
@@ -140,20 +132,17 @@ class Short:
         return setup, state
 
 
-def steady(setup: "Setup", state: "TrainState", steps: int, wait: Callable[[], None]) -> float:
+def steady(setup: "Setup", state: "TrainState", steps: int) -> float:
     """Seconds of `steps` steps, all photos being there and all kernels loaded."""
-    from crossgrad_core.training.loop import timed_step
-    from crossgrad_core.training.views import target_at
-
     for index in range(len(setup.train_views)):
         target_at(setup, state, index, 1.0)
     for _ in range(max(3, steps // 6)):
         timed_step(setup, state)
-    wait()
+    torch.cuda.synchronize()
     start = perf_counter()
     for _ in range(steps):
         timed_step(setup, state)
-    wait()
+    torch.cuda.synchronize()
     return perf_counter() - start
 
 
@@ -340,8 +329,6 @@ def main() -> None:
         names = ", ".join(case.name for case in all_cases)
         print(f"no case has {missing[0]!r} in its name: {names}", file=sys.stderr)
         sys.exit(2)
-    import torch
-
     if not torch.cuda.is_available():
         print(f"torch {torch.__version__} sees no GPU: nothing is measured", file=sys.stderr)
         sys.exit(2)

@@ -128,9 +128,7 @@ def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int
     projection[0, 0], projection[0, 2] = 2 * camera.fx / width, 2 * camera.cx / width - 1
     projection[1, 1], projection[1, 2] = 2 * camera.fy / height, 2 * camera.cy / height - 1
     projection[2, 2] = projection[3, 2] = 1.0
-    center = torch.nn.functional.pad(camera.center * enlarged, (0, 1))[None].expand(4, 4)
-    matrices = torch.stack([pose.T, (projection @ pose).T, center])
-    matrices = matrices.to(background, non_blocking=True)
+    matrices = torch.stack([pose.T, (projection @ pose).T]).to(background, non_blocking=True)
     return {
         "image_height": height,
         "image_width": width,
@@ -141,7 +139,7 @@ def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int
         "viewmatrix": matrices[0],
         "projmatrix": matrices[1],
         "sh_degree": degree,
-        "campos": matrices[2, 0, :3],
+        "campos": (camera.center * enlarged).to(background, non_blocking=True),
         "prefiltered": False,
         "auto_tune_verbose": False,
     }

@@ -1,6 +1,6 @@
 """The photometric loss and its gradient at once, in plain torch without autograd, for a GPU.
 
-Autograd launches about twice as many kernels, most of them shorter than launching them takes. With
+Autograd launches more kernels, most of them shorter than launching them takes. With
 sums and differences, as in the fused kernel of the CPU (`numba_kernels.fused`), twelve planes are
 filtered, and nine in the backward pass, instead of fifteen each time.
 """
