@@ -33,11 +33,9 @@ pytestmark = [
 ]
 
 RASTERIZERS = {"gsplat": GsplatRasterizer, "gswarp": GswarpRasterizer}
-#: The rasterizer that draws by the same rules.
-REFERENCES = {
-    "gsplat": TorchRasterizer(max_alpha=0.999),
-    "gswarp": TorchRasterizer(footprint="3-sigma"),
-}
+#: Options with which rasterizer `torch` draws by the same rules.
+ALIKE = {"gsplat": {"max_alpha": 0.999}, "gswarp": {"footprint": "3-sigma"}}
+REFERENCES = {name: TorchRasterizer(**options) for name, options in ALIKE.items()}
 CAMERAS = {
     "middle": posed_camera(160, 120, focal=130.0, principal=(0.5, 0.5)),
     "narrow": posed_camera(333, 9, focal=200.0, principal=(0.5, 0.5)),
@@ -278,10 +276,6 @@ def test_a_steady_step_waits_as_often_as_the_documents_say(options):
             torch.cuda.set_sync_debug_mode("default")
     waits = [f"{w.filename}:{w.lineno}" for w in found if "synchronizing CUDA" in str(w.message)]
     assert len(waits) <= 3, waits
-
-
-#: The reference by the rules of each.
-ALIKE = {"gsplat": {"max_alpha": 0.999}, "gswarp": {"footprint": "3-sigma"}}
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "pixel", "mip", "distance", "scaffold", "octree"])
