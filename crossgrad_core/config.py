@@ -247,6 +247,11 @@ class RunConfig(BaseModel):
         description="Evaluate and export the average of the parameters of the last share of the "
         "steps. Default: 0.",
     )
+    floaters: Annotated[Literal["keep", "remove"] | None, Flag("keep|remove", TRAINING)] = Field(
+        None,
+        description="What is done at the end with primitives before cameras that no training photo "
+        "shows. Default: remove; keep with --preset inria, and where density control is none.",
+    )
     dropout: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
         None,
         ge=0,

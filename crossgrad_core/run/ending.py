@@ -18,6 +18,7 @@ from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.training.budget import Length
+from crossgrad_core.training.floaters import remove_floaters, removes_floaters, told_of
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
@@ -98,6 +99,8 @@ class Course:
                 ended = train(self.setup, state, self.session, self.stopper, length.due, keeper)
                 if ended != "paused":
                     self.ending = Ending(ended)
+                    if ended == "finished":
+                        self._remove_floaters()
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
@@ -106,6 +109,13 @@ class Course:
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised
+
+    def _remove_floaters(self) -> None:
+        setup = self.setup
+        if removes_floaters(setup.config, setup.densifier):
+            count = remove_floaters(setup, self.state)
+            if count > 0:
+                setup.hook.crossgrad_message(text=told_of(count))
 
     def _catch_up(self) -> None:
         """Evaluates where an earlier session ended before it could."""

@@ -62,6 +62,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)
+        rest.setdefault("floaters", "keep")
         rest.setdefault("start", {"name": BARE_START})
         rest.setdefault("metrics", [{"name": name} for name in METRICS_OF_0_1.split("+")])
     return rest

@@ -6,6 +6,7 @@ from typing import Any
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
+from crossgrad_core.training.floaters import removes_floaters
 from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
@@ -49,6 +50,7 @@ def resolved(setup: Setup) -> RunConfig:
             "sh_every": setup.schedule.sh_every,
             "final_decay": _final_decay(config, setup),
             "average": average_of(config),
+            "floaters": "remove" if removes_floaters(config, setup.densifier) else "keep",
             "growth": growth_of(setup),
             "max_gaussians": bound_of(setup),
         }

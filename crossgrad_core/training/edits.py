@@ -32,6 +32,17 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     return True
 
 
+def keep(setup: Setup, state: TrainState, rows: Tensor) -> None:
+    """Keeps these primitives only, as they are: what a backbone derives is not renewed.
+
+    Args:
+        setup: The run.
+        state: Its state.
+        rows: [M] int64, in rising order.
+    """
+    _apply(setup, state, Edit(rows))
+
+
 def put_in_order(setup: Setup, state: TrainState) -> None:
     """Puts the primitives in the order in which they are kept, when a step has edited them."""
     rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)

@@ -12,6 +12,7 @@ from torch import Tensor
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate, Parameters
 from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -101,6 +102,22 @@ def _add(setup: Setup, state: TrainState) -> None:
 def restart(state: TrainState) -> None:
     """Forgets the average: the primitives are others now, or their values were overwritten."""
     state.states.pop(STATE, None)
+
+
+def with_rows(setup: Setup, state: TrainState, rows: Tensor) -> None:
+    """Takes the average over to a set of fewer primitives.
+
+    Args:
+        setup: The run.
+        state: Its state before that edit.
+        rows: [M] int64, the primitives that are kept.
+    """
+    held = state.states.get(STATE)
+    if held is not None:
+        sums = {**state.parameters, **held.tensors}
+        kept = apply_to_parameters(Edit(rows), setup.blocks, sums)
+        tensors = {name: kept[name] for name in held.tensors}
+        state.commit({STATE: PluginState(held.values, tensors)})
 
 
 def shown(state: TrainState) -> Parameters:

@@ -11,11 +11,15 @@ import pytest
 import torch
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.contract.contexts import Densified
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.scene import photos_ahead
+from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 STEPS, FAILS_IN = 8, 5
 RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}
@@ -26,11 +30,11 @@ def scene(tmp_path_factory):
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9)
 
 
-def run(scene, out):
+def run(scene, out, **further):
     settings = {"scene": str(scene), "out": str(out), "steps": STEPS, "eval_every": 4, "threads": 1}
     # A filled start would look at all photos before the first step.
     settings["start"] = {"name": "sfm"}
-    settings |= {"sampler": {"name": "random"}, "views": 2}
+    settings |= {"sampler": {"name": "random"}, "views": 2, **further}
     return app.run(settings, verbosity=-1)
 
 
@@ -359,3 +363,36 @@ class FirstViews:
     def crossgrad_sample_views(self, context):
         sampled = yield
         return replace(sampled, draw=replace(sampled.draw, views=(0, 1)))
+
+
+class Leaves:
+    """Puts the first three primitives behind a camera, and opaque, in every step."""
+
+    @hookimpl
+    def crossgrad_after_step(self, context):
+        camera = context.scene.train_views[0].camera
+        backwards = -camera.world_to_camera[2, :3]
+        centers = (camera.center + 0.02 * backwards).float().repeat(3, 1)
+        rows = torch.arange(3)
+        sizes, opaque = torch.full((3, 3), -6.0), torch.full((3,), 5.0)
+        values = {"means": centers, "scales": sizes, "opacities": opaque}
+        return Densified(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
+
+
+def test_floaters_are_removed_when_a_run_is_finished(scene, tmp_path, with_plugin):
+    with_plugin["leaves"] = Leaves()
+    cleaned, stopped, kept = tmp_path / "cleaned", tmp_path / "stopped", tmp_path / "kept"
+    assert run(scene, cleaned) == 0
+    assert run(scene, stopped, stop_after=3) == 0
+    assert run(scene, kept, floaters="keep") == 0
+    count = summary(kept)["primitives"]
+    assert summary(stopped)["primitives"] == count
+    assert summary(cleaned)["primitives"] == count - 3
+    for out, primitives in ((cleaned, count - 3), (kept, count)):
+        assert len(read_ply(out / "point_cloud.ply").means) == primitives
+        assert read_metrics(out)[-1]["primitives"] == primitives
+    said = "floaters: 3 primitives were removed that no training photo shows"
+    assert said in (cleaned / "log.txt").read_text()
+    assert not any("floaters: 3" in (each / "log.txt").read_text() for each in (stopped, kept))
+    assert resumed(stopped) == 0
+    assert_same(stopped, cleaned)

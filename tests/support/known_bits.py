@@ -40,6 +40,7 @@ USUAL: Mapping[str, Any] = {
     "sampler": "random",
     "views": 2,
     "beta2": 0.999,
+    "floaters": "keep",
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.
