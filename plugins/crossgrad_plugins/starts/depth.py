@@ -1,11 +1,16 @@
 """How deep a photo is where none of its SfM points lies: a plane, and what is near it bends it."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Camera
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 #: Neighbours whose distance from the plane counts.
 _NEIGHBOURS = 8
@@ -56,12 +61,16 @@ class Depth:
         rest, median = inverse - _on(plane, around), float(np.median(depth[ahead]))
         return cls(around, rest, plane, median, near, far / _FARTHEST)
 
-    def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N] depths at pixels [N, 2], in units of the longer side from the middle."""
+    @cached_property
+    def _tree(self) -> "cKDTree":
         from scipy.spatial import cKDTree
 
+        return cKDTree(self.pixels)
+
+    def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N] depths at pixels [N, 2], in units of the longer side from the middle."""
         count = min(_NEIGHBOURS, len(self.rest))
-        distances, rows = cKDTree(self.pixels).query(around, k=[*range(1, count + 1)])
+        distances, rows = self._tree.query(around, k=[*range(1, count + 1)])
         weights = 1.0 / (distances**2 + _BLUR**2)
         bent = (weights * self.rest[rows]).sum(axis=1) / (weights.sum(axis=1) + _REACH**-2)
         inverse = np.clip(_on(self.plane, around) + bent, self.farthest, self.nearest)

@@ -1,6 +1,6 @@
 """Large Gaussians where photos show something that no SfM point stands for, and around them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 from weakref import WeakKeyDictionary
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import Field, MorePoints, Scene, Start, View
+from crossgrad_core.plugin import Camera, Field, MorePoints, Scene, Start, View
 from crossgrad_plugins.starts.cells import Cells
 from crossgrad_plugins.starts.depth import Depth, from_the_middle
 
@@ -18,6 +18,8 @@ FEWEST: Final = 8
 #: Standard deviation of an added Gaussian over the side of its cell.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
+#: What is so many times farther away than a picture is deep there is hidden, not shown.
+_BEHIND: Final = 1.5
 
 
 @dataclass(eq=False)
@@ -99,18 +101,20 @@ class Filled(Start):
 
     def _filled(self, scene: Scene) -> _Filling:
         filling = _Filling(scene.points, _spacings(scene.points))
-        views = _spread(scene.train_views, self.views)
-        deep = {view: Depth.of(view.camera, scene.points[view.seen], FEWEST) for view in views}
-        known = [(view, depth) for view, depth in deep.items() if depth is not None]
+        views, margin = _spread(scene.train_views, self.views), round(self.margin * self.cells)
+        deep = {
+            view: Depth.of(view.camera, scene.points[view.seen], FEWEST)
+            for view in (scene.train_views if margin else views)
+        }
+        known = [(view, depth) for view in views if (depth := deep[view]) is not None]
         filling.left_aside = len(views) - len(known)
         # What is near is filled finely first, and needs nothing coarse behind it any more.
         known.sort(key=lambda each: each[1].median)
         for view, depth in known:
             self._fill(filling, view, depth, 0, None)
         filling.inside = len(filling.points) - len(scene.points)
-        margin = round(self.margin * self.cells)
         if margin:
-            pictures = _Pictures.of(scene.train_views)
+            pictures = _Pictures.of(deep)
             for view, depth in reversed(known):
                 self._fill(filling, view, depth, margin, pictures)
         return filling
@@ -165,27 +169,53 @@ def _behind(
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The pictures of some views.
+    """The pictures of some views, as deep as they are.
 
     Attributes:
+        cameras: Of the views.
+        depths: Of each view; None where nothing tells: its picture has no end then.
         matrices: [V, 3, 4] homogeneous points of the local frame to pixels times depth.
-        ends: [V, 2] width and height.
+        ends: [V, 1, 2] width and height.
+        limits: [V, 2] depths up to which a picture shows everything, and beyond which nothing.
     """
 
+    cameras: Sequence[Camera]
+    depths: Sequence[Depth | None]
     matrices: NDArray[np.float64]
     ends: NDArray[np.float64]
+    limits: NDArray[np.float64]
 
     @classmethod
-    def of(cls, views: Sequence[View]) -> "_Pictures":
-        cameras = [view.camera for view in views]
-        matrices = [(each.matrix @ each.world_to_camera[:3]).numpy() for each in cameras]
-        return cls(np.stack(matrices), np.array([[each.width, each.height] for each in cameras]))
+    def of(cls, depths: Mapping[View, Depth | None]) -> "_Pictures":
+        cameras = [view.camera for view in depths]
+        endless = (np.inf, np.inf)
+        limits = [
+            endless if deep is None else (_BEHIND / deep.nearest, _BEHIND / deep.farthest)
+            for deep in depths.values()
+        ]
+        return cls(
+            cameras,
+            list(depths.values()),
+            np.stack([(each.matrix @ each.world_to_camera[:3]).numpy() for each in cameras]),
+            np.array([[[each.width, each.height]] for each in cameras]),
+            np.array(limits),
+        )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether a point [N, 3] lies in one of the pictures."""
+        """[N] whether a point [N, 3] lies in one of the pictures, and not far behind it."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
-        depth = around[..., 2:]
+        pixels, depth = around[..., :2], around[..., 2]
         # Both sides times the depth: nothing is divided by zero.
-        inside = (around[..., :2] >= 0.0) & (around[..., :2] <= self.ends[:, None] * depth)
-        return np.asarray((inside.all(axis=2) & (depth[..., 0] > 0.0)).any(axis=0))
+        inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
+        inside &= depth > 0.0
+        shown = (inside & (depth <= self.limits[:, :1])).any(axis=0)
+        open_yet = inside & (depth <= self.limits[:, 1:]) & ~shown
+        for view in map(int, np.flatnonzero(open_yet.any(axis=1))):
+            rows, deep = np.flatnonzero(open_yet[view] & ~shown), self.depths[view]
+            if deep is not None and len(rows):
+                at = from_the_middle(
+                    self.cameras[view], pixels[view, rows] / depth[view, rows, None]
+                )
+                shown[rows] = depth[view, rows] <= _BEHIND * deep.at(at)
+        return np.asarray(shown)

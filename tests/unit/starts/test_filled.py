@@ -179,7 +179,7 @@ def test_what_is_full_stays_as_it_is():
     assert Filled(margin=0.0).begun(scene) is scene
 
 
-def test_the_margin_is_where_no_training_photo_looks():
+def test_the_margin_is_where_no_training_photo_looks_that_shows_as_far():
     scene = ground_scene(LEFT)
     inner = Filled(margin=0.0).more_points(scene)
     more = Filled(margin=0.5).more_points(scene)
@@ -197,6 +197,28 @@ def test_the_margin_is_where_no_training_photo_looks():
         f"start: {len(inner.positions)} Gaussians fill what photos show without points, "
         f"{len(beyond)} stand beyond their edges",
     )
+
+
+@pytest.mark.parametrize(("away", "hides"), [(0.5, True), (20.0, False)])
+def test_the_margin_goes_on_behind_what_another_photo_sees_before_it(away, hides):
+    # A camera in the street looks over all the ground beyond the left edges, at a wall or far away.
+    rng, street = np.random.default_rng(1), np.array([-6.0, 1.5, 0.3])
+    wall = street + np.column_stack(
+        [np.full(200, away), *(away * rng.uniform(-0.5, 0.5, (2, 200)))]
+    )
+    alone = ground_scene(LEFT)
+    low = posed_view(street, "low.png", forward=[1.0, 0.0, 0.0], seen=len(LEFT) + np.arange(200))
+    camera = replace(alone.train_views[0].camera, world_to_camera=low.camera.world_to_camera)
+    low = replace(low, camera=camera, photo=Picture(camera))
+    both = posed_scene([*alone.train_views, low], np.concatenate([LEFT, wall]))
+    inner = len(Filled(margin=0.0).more_points(alone).positions)
+    beyond = Filled(margin=0.5).more_points(alone).positions[inner:]
+    pixels, depth = camera.project(beyond)
+    over = ((pixels >= 0) & (pixels <= [WIDTH, HEIGHT])).all(axis=1) & (depth > 0)
+    assert over.sum() > 5
+    filled = Filled(margin=0.5).more_points(both).positions
+    apart = np.abs(beyond[over][:, None] - filled[None]).max(axis=2).min(axis=1)
+    assert (apart < 1e-9).all() if hides else (apart > 1e-9).all()
 
 
 def test_photos_that_say_nothing_are_left_aside():
