@@ -3,8 +3,7 @@
     crossgrad run SCENE --seconds 600 --floaters keep --out RUN
     python benchmarks/floaters.py RUN ...
 
-Floaters of all runs are sought in the same way, whatever the run was asked to do with them; a run
-that removed them has none left. Nothing is written to the runs.
+A run that removed its floaters has none left. Nothing is written to the runs.
 """
 
 import argparse
@@ -18,12 +17,15 @@ from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.export import renderer
 from crossgrad_core.run.opening import opened
-from crossgrad_core.training.floaters import EMPTY, floaters, in_empty_space, remove_floaters
+from crossgrad_core.training.edits import keep
+from crossgrad_core.training.floaters import EMPTY, in_empty_space, rows_without_floaters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import shown
 
 _METRICS = ("psnr", "psnr_cc")
+#: Changes of a photo below it are not shown, dB.
+SMALLEST = 0.005
 
 
 def measured(setup: Setup, state: TrainState) -> EvaluationResult:
@@ -43,19 +45,26 @@ def row(folder: Path, empty: float) -> Sequence[str]:
     positions = shown(state)[setup.backbone.positions].detach().double().cpu().numpy()
     near = int(in_empty_space(positions, setup.scene, empty).sum())
     before = measured(setup, state)
-    floaters(setup, state, empty)  # Compiles what is to be timed.
+    rows_without_floaters(setup, state, empty)  # Compiles what is to be timed.
     start = perf_counter()
-    removed = remove_floaters(setup, state, empty)
+    rows = rows_without_floaters(setup, state, empty)
+    if rows is not None:
+        keep(setup, state, rows)
     seconds = perf_counter() - start
     after = measured(setup, state)
     pairs = zip(before.views, after.views, strict=True)
     changes = [float(b.values["psnr"] or 0.0) - float(a.values["psnr"] or 0.0) for a, b in pairs]
-    means = [f"{result.overall[name]:.2f}" for name in _METRICS for result in (before, after)]
-    counts = f"{primitives:,}", f"{near:,}", f"{removed:,}"
-    return [
-        setup.scene.name, str(state.step), *counts, f"{seconds:.2f}", *means,
-        f"{min(changes):+.2f} to {max(changes):+.2f}",
-    ]  # fmt: skip
+    known = {figure.name for figure in before.figures}
+    means = [
+        f"{result.overall[name]:.2f}" if name in known else ""
+        for name in _METRICS
+        for result in (before, after)
+    ]
+    counts = f"{primitives:,}", f"{near:,}", f"{primitives - state.primitives(setup):,}"
+    changed = max(map(abs, changes)) >= SMALLEST
+    single = f"{min(changes):+.2f} to {max(changes):+.2f}" if changed else ""
+    trained = f"{state.clock.train:.0f}"
+    return [setup.scene.name, trained, *counts, f"{seconds:.2f}", *means, single]
 
 
 def main() -> None:
@@ -64,12 +73,12 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument(
         "--empty", type=float, default=EMPTY, metavar="SHARE",
-        help="of the way to the nearest that a camera sees; inf: everywhere",
+        help="of the way to the nearest point that a camera sees; 1e9: everywhere",
     )  # fmt: skip
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
     print(
-        "| scene | steps | primitives | before cameras | floaters | s | PSNR with | without "
+        "| scene | seconds | primitives | in empty space | floaters | s | PSNR with | without "
         "| after colour correction, with | without | single photos |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import Final
+from typing import Final, TypeVar
 
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
@@ -18,7 +18,9 @@ from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.training.budget import Length
-from crossgrad_core.training.floaters import remove_floaters, removes_floaters, told_of
+from crossgrad_core.training.clock import Laps
+from crossgrad_core.training.edits import keep
+from crossgrad_core.training.floaters import removes_floaters, rows_without_floaters, told_of
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
@@ -28,6 +30,7 @@ from crossgrad_core.training.stopper import Stopper
 #: A run that ends so many decibels below its best evaluation says so; where few photos are held out
 #: single evaluations differ by less all the time.
 WORSE: Final = 0.3
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,9 @@ class Course:
         Part by part: none that fails costs another, and the ending says which did.
         """
         self._attempt("", lambda: self._train(length))
+        config, densifier = self.setup.config, self.setup.densifier
+        if self.ending.status == "finished" and removes_floaters(config, densifier):
+            self._attempt("floaters are left", self._remove_floaters)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.state.step > 0:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
@@ -99,8 +105,6 @@ class Course:
                 ended = train(self.setup, state, self.session, self.stopper, length.due, keeper)
                 if ended != "paused":
                     self.ending = Ending(ended)
-                    if ended == "finished":
-                        self._remove_floaters()
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
@@ -111,11 +115,16 @@ class Course:
                 self.setup = revised
 
     def _remove_floaters(self) -> None:
-        setup = self.setup
-        if removes_floaters(setup.config, setup.densifier):
-            count = remove_floaters(setup, self.state)
-            if count > 0:
-                setup.hook.crossgrad_message(text=told_of(count))
+        setup, state = self.setup, self.state
+        state.laps = Laps()
+        rows = self._unless_interrupted(partial(rows_without_floaters, setup, state))
+        if rows is not None:
+            count = state.primitives(setup) - len(rows)
+            keep(setup, state, rows)
+            self.session.renew(setup, state.step)
+            setup.hook.crossgrad_message(text=told_of(count))
+        state.laps.lap("density_control")
+        state.clock.count(state.laps)
 
     def _catch_up(self) -> None:
         """Evaluates where an earlier session ended before it could."""
@@ -134,12 +143,12 @@ class Course:
         for missing, write in parts:
             self._attempt(missing, partial(self._unless_interrupted, write))
 
-    def _unless_interrupted(self, write: Callable[[], None]) -> None:
+    def _unless_interrupted(self, part: Callable[[], _T]) -> _T:
         with self.stopper.interruptible():
             if self.stopper.at_once:
                 raise KeyboardInterrupt
             try:
-                write()
+                return part()
             except Exception as error:
                 # Compiled code makes an error of its own of an interrupt that it was met by.
                 if self.stopper.at_once:

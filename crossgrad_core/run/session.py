@@ -120,6 +120,12 @@ class Session:
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1
 
+    def renew(self, setup: Setup, step: int) -> None:
+        """Drops the row of `step`, whose state has changed, and lets it be saved once more."""
+        if self.has_row(step):
+            self._table = MetricsCsv.resume(self.folder, columns_of(setup), step - 1)
+        self._saved_step = self._evaluated_step = -1
+
     def align(self, setup: Setup, state: TrainState) -> None:
         """Drops what was recorded after the state's step, if anything was."""
         if max(self._saved_step, self._evaluated_step) > state.step:

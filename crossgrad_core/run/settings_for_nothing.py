@@ -16,6 +16,7 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
+from crossgrad_core.training.floaters import cameras_that_tell
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
@@ -197,13 +198,18 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """What is said about rates that fade, where none does."""
+    """What is said about rates that fade and about floaters, where there can be none."""
     fades = final_decay_of(config) > 0.0
     if config.final_rate != RunConfig.model_fields["final_rate"].default and not fades:
         yield "final_rate", "no rate fades with --final-decay 0, which --preset inria has by itself"
     if config.final_decay and all(block.lr.decays for block in setup.trained_blocks):
         name = setup.selection.names["backbone"]
         yield "final_decay", f"backbone {name} has no constant rates"
+    if config.floaters == "remove":
+        if not setup.backbone.positions:
+            yield "floaters", f"backbone {setup.selection.names['backbone']} names no positions"
+        if not cameras_that_tell(setup.scene):
+            yield "floaters", "no photo observes enough points to say what around it is empty"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

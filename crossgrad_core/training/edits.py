@@ -1,5 +1,7 @@
 """Applying a topology edit to everything that counts primitives."""
 
+from dataclasses import replace
+
 from torch import Tensor
 
 from crossgrad_core.contract.state import PluginState
@@ -12,6 +14,8 @@ from crossgrad_core.contract.topology import (
 from crossgrad_core.training.order import in_order
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.steady import STATE as AVERAGE
+from crossgrad_core.training.steady import with_rows
 
 
 def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
@@ -35,12 +39,29 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
 def keep(setup: Setup, state: TrainState, rows: Tensor) -> None:
     """Keeps these primitives only, as they are: what a backbone derives is not renewed.
 
+    What ends it halfway leaves the state as it was.
+
     Args:
         setup: The run.
         state: Its state.
         rows: [M] int64, in rising order.
     """
-    _apply(setup, state, Edit(rows))
+    edit, adam, before = Edit(rows), state.adam, state.primitives(setup)
+    names = [n for block in setup.blocks if block.per_primitive for n in block.tensors]
+    first, second = (
+        {**moments, **{n: apply_to_moment(edit, n, moments[n]) for n in names if n in moments}}
+        for moments in (adam.exp_avg, adam.exp_avg_sq)
+    )
+    tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
+    source, fresh = gather_indices(edit, before, rows.device)
+    states = {
+        name: with_rows(setup, state, old, rows)
+        if name == AVERAGE
+        else _gathered(name, old, source, fresh, before)
+        for name, old in state.states.items()
+    }
+    state.moments = replace(adam, exp_avg=first, exp_avg_sq=second)
+    state.tensors, state.states = tensors, states
 
 
 def put_in_order(setup: Setup, state: TrainState) -> None:

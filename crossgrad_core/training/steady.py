@@ -104,20 +104,18 @@ def restart(state: TrainState) -> None:
     state.states.pop(STATE, None)
 
 
-def with_rows(setup: Setup, state: TrainState, rows: Tensor) -> None:
-    """Takes the average over to a set of fewer primitives.
+def with_rows(setup: Setup, state: TrainState, average: PluginState, rows: Tensor) -> PluginState:
+    """The average of fewer primitives.
 
     Args:
         setup: The run.
-        state: Its state before that edit.
+        state: Its state.
+        average: The average of all of its primitives.
         rows: [M] int64, the primitives that are kept.
     """
-    held = state.states.get(STATE)
-    if held is not None:
-        sums = {**state.parameters, **held.tensors}
-        kept = apply_to_parameters(Edit(rows), setup.blocks, sums)
-        tensors = {name: kept[name] for name in held.tensors}
-        state.commit({STATE: PluginState(held.values, tensors)})
+    sums = {**state.tensors, **average.tensors}
+    kept = apply_to_parameters(Edit(rows), setup.blocks, sums)
+    return PluginState(average.values, {name: kept[name] for name in average.tensors})
 
 
 def shown(state: TrainState) -> Parameters:

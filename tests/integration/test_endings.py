@@ -15,7 +15,7 @@ from crossgrad_core.contract.contexts import Densified
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import app, assemble, session
+from crossgrad_core.run import app, assemble, ending, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.scene import photos_ahead
@@ -377,6 +377,31 @@ class Leaves:
         sizes, opaque = torch.full((3, 3), -6.0), torch.full((3,), 5.0)
         values = {"means": centers, "scales": sizes, "opacities": opaque}
         return Densified(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("by zero")])
+def test_what_ends_the_removal_of_floaters_loses_nothing(
+    scene, tmp_path, with_plugin, monkeypatch, error
+):
+    with_plugin["leaves"] = Leaves()
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    assert run(scene, whole) == 0
+
+    def broken(setup, state):
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ending, "rows_without_floaters", broken)
+        assert run(scene, out) == (0 if isinstance(error, KeyboardInterrupt) else 1)
+    stopped = isinstance(error, KeyboardInterrupt)
+    assert summary(out)["status"] == ("stopped" if stopped else "failed")
+    if not stopped:
+        assert summary(out)["error"].startswith("floaters are left: ZeroDivisionError: by zero")
+    assert read_metrics(out)[-1]["primitives"] == summary(whole)["primitives"] + 3
+    assert resumed(out) == 0
+    assert_same(out, whole)
+    assert read_metrics(out)[-1]["primitives"] == summary(whole)["primitives"]
+    assert len(read_ply(out / "point_cloud.ply").means) == summary(whole)["primitives"]
 
 
 def test_floaters_are_removed_when_a_run_is_finished(scene, tmp_path, with_plugin):

@@ -34,16 +34,14 @@ class Depth:
 
     Attributes:
         pixels: [S, 2] of the points, in units of the longer side from the middle.
-        rest: [S] their inverse depths less the plane's.
-        plane: [3] inverse depth over (x, y, 1).
+        inverse: [S] their inverse depths.
         median: Median of their depths.
         nearest: Largest inverse depth of an added point.
         farthest: Smallest inverse depth of an added point.
     """
 
     pixels: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    plane: NDArray[np.float64]
+    inverse: NDArray[np.float64]
     median: float
     nearest: float
     farthest: float
@@ -56,10 +54,19 @@ class Depth:
         if np.count_nonzero(ahead) < fewest:
             return None
         around, inverse = from_the_middle(camera, pixels[ahead]), 1.0 / depth[ahead]
-        plane = _plane(around, inverse)
         far, near = np.quantile(inverse, [_TAIL, 1.0 - _TAIL])
-        rest, median = inverse - _on(plane, around), float(np.median(depth[ahead]))
-        return cls(around, rest, plane, median, near, far / _FARTHEST)
+        median = float(np.median(depth[ahead]))
+        return cls(around, inverse, median, near, far / _FARTHEST)
+
+    @cached_property
+    def plane(self) -> NDArray[np.float64]:
+        """[3] inverse depth over (x, y, 1)."""
+        return _plane(self.pixels, self.inverse)
+
+    @cached_property
+    def rest(self) -> NDArray[np.float64]:
+        """[S] the points' inverse depths less the plane's."""
+        return self.inverse - _on(self.plane, self.pixels)
 
     @cached_property
     def _tree(self) -> "cKDTree":

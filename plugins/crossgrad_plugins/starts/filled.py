@@ -18,7 +18,7 @@ FEWEST: Final = 8
 #: Standard deviation of an added Gaussian over the side of its cell.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
-#: What is so many times farther away than a picture is deep there is hidden, not shown.
+#: A picture shows nothing that is so many times as far away as it is deep there.
 _BEHIND: Final = 1.5
 
 
@@ -202,7 +202,7 @@ class _Pictures:
         )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether a point [N, 3] lies in one of the pictures, and not far behind it."""
+        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]

@@ -8,18 +8,22 @@ import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import (
     EMPTY,
     FEWEST_SEEN,
     floaters,
     in_empty_space,
-    remove_floaters,
+    rows_without_floaters,
     told_of,
 )
 from crossgrad_core.training.start import first_state
@@ -49,6 +53,14 @@ def scattered(setup, seed=0, share=0.7):
     return state
 
 
+def cleaned(setup, state):
+    """How many floaters were removed from the state."""
+    rows, before = rows_without_floaters(setup, state), state.primitives(setup)
+    if rows is not None:
+        keep(setup, state, rows)
+    return before - state.primitives(setup)
+
+
 def images(setup, parameters, step=0):
     phase = setup.phase(step, training=False)
     with torch.no_grad():
@@ -67,7 +79,7 @@ def expected(setup, state):
     for row, position in enumerate(positions):
         ways = [np.linalg.norm(v.camera.center.numpy() - position) for v in setup.train_views]
         camera = setup.train_views[int(np.argmin(ways))].camera
-        nearest = np.percentile(camera.local(setup.scene.points)[:, 2], 1.0)
+        nearest = np.percentile(camera.local(setup.scene.points)[:, 2], 1)
         if min(ways) < EMPTY * nearest and not touched[row]:
             found.append(row)
     return found
@@ -95,14 +107,14 @@ def test_photos_stay_as_they_are(backbone):
     primitives, gone = state.primitives(setup), floaters(setup, state)
     kept = np.setdiff1d(np.arange(primitives), gone.numpy())
     tensors = {name: t.detach().clone() for name, t in state.parameters.items()}
-    assert remove_floaters(setup, state) == len(gone) > 0
+    assert cleaned(setup, state) == len(gone) > 0
     for block in setup.blocks:
         if block.per_primitive:
             for name in block.tensors:
                 assert torch.equal(state.parameters[name].detach(), tensors[name][kept]), name
     after = [render.image for _, render in images(setup, state.parameters)]
     assert all(torch.equal(one, two) for one, two in zip(before, after, strict=True))
-    assert remove_floaters(setup, state) == 0
+    assert cleaned(setup, state) == 0
     assert state.primitives(setup) == primitives - len(gone)
 
 
@@ -111,17 +123,41 @@ def test_moments_states_and_the_average_come_along():
     state = scattered(setup)
     for _ in range(3):
         take_step(setup, state)
+    rows = torch.arange(state.primitives(setup))
+    state.commit({"other": PluginState(per_primitive={"rows": rows})})
     gone = floaters(setup, state)
     kept = np.setdiff1d(np.arange(state.primitives(setup)), gone.numpy())
     wanted = {name: t.detach()[kept] for name, t in shown(state).items()}
     moments = {name: t[kept] for name, t in state.adam.exp_avg_sq.items()}
-    seconds = state.clock.train
-    assert remove_floaters(setup, state) == len(gone) > 0
+    assert cleaned(setup, state) == len(gone) > 0
     assert state.states[STATE].values == {"count": 3}
+    assert state.states["other"].per_primitive["rows"].tolist() == kept.tolist()
     assert all(torch.equal(shown(state)[name].detach(), t) for name, t in wanted.items())
     assert all(torch.equal(state.adam.exp_avg_sq[name], t) for name, t in moments.items())
-    assert state.clock.train > seconds
     take_step(setup, state)
+
+
+def test_it_is_the_average_that_is_looked_at_where_it_is_shown():
+    setup = setup_of(average=1.0)
+    state = scattered(setup)
+    take_step(setup, state)
+    gone = floaters(setup, state)
+    assert len(gone) > 0
+    # The parameters go back among what all cameras see, the average stays behind.
+    state.parameters["means"].detach()[:] = 0.0
+    assert torch.equal(floaters(setup, state), gone)
+
+
+def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
+    setup = setup_of()
+    state = scattered(setup)
+    take_step(setup, state)
+    state.commit({"wrong": PluginState(per_primitive={"rows": torch.zeros(3)})})
+    tensors, moments, before = state.tensors, state.moments, state.primitives(setup)
+    with pytest.raises(RuntimeError, match="'rows' of wrong has 3 rows"):
+        cleaned(setup, state)
+    assert state.tensors is tensors and state.moments is moments
+    assert {len(t) for t in moments.exp_avg.values()} == {before}
 
 
 def test_a_set_of_which_nothing_would_be_left_stays():
@@ -130,21 +166,46 @@ def test_a_set_of_which_nothing_would_be_left_stays():
     behind = setup.train_views[0].camera
     positions = state.parameters["means"].detach()
     # Behind this camera, and beyond what the others see of that place.
-    positions[:] = (behind.center + 0.3 * behind.center / behind.center.norm()).float()
-    everything = len(floaters(setup, state)) == len(positions)
-    assert everything and remove_floaters(setup, state) == 0
-    assert state.primitives(setup) == len(positions)
+    positions[:] = (behind.center + 0.2 * behind.center / behind.center.norm()).float()
+    assert len(floaters(setup, state)) == len(positions)
+    assert rows_without_floaters(setup, state) is None
 
 
-def test_the_empty_space_ends_half_way_to_the_nearest_point():
+def looking(name, points, seen=None, forward=(0, 1, 0)):
+    rows = range(len(points)) if seen is None else seen
+    return posed_view((0, 0, 0), name, forward=forward, seen=rows)
+
+
+def test_the_empty_space_is_a_share_of_the_way_to_the_nearest_point():
     points = [(0.1 * x, 2.0 + 0.01 * x, 0.0) for x in range(FEWEST_SEEN)]
-    seen = range(FEWEST_SEEN)
-    one = posed_view((0, 0, 0), "one.png", forward=(0, 1, 0), seen=seen)
-    scene = posed_scene([one, replace(one, name="two.png", seen=np.arange(1))], points)
-    places = np.array([(0, 0.99, 0), (0, 1.01, 0), (0.99, 0, 0), (0, -0.99, 0), (0, 0, 1.01)])
+    scene = posed_scene([looking("one.png", points)], points)
+    near, far = 1.99 * EMPTY, 2.01 * EMPTY
+    places = np.array([(0, near, 0), (0, far, 0), (near, 0, 0), (0, -near, 0), (0, 0, far)])
     assert in_empty_space(places, scene).tolist() == [True, False, True, True, False]
-    few = posed_scene([replace(one, seen=np.arange(FEWEST_SEEN - 1))], points)
+    few = posed_scene([looking("one.png", points, range(FEWEST_SEEN - 1))], points)
     assert not in_empty_space(places, few).any()
+
+
+def test_a_point_at_a_wrong_place_and_points_that_others_see_do_not_count():
+    points = [(0.01 * x, 2.0, 0.0) for x in range(200)]
+    points[7] = (0.0, 0.1, 0.0)  # Half a percent.
+    others = [(0.0, 0.2, 0.1 * x) for x in range(50)]
+    one = looking("one.png", points)
+    scene = posed_scene([one], [*points, *others])
+    places = np.array([(0, 1.9 * EMPTY, 0), (0, 2.1 * EMPTY, 0)])
+    assert in_empty_space(places, scene).tolist() == [True, False]
+    backwards = posed_scene([looking("one.png", points, forward=(0, -1, 0))], points)
+    assert not in_empty_space(places, backwards).any()
+
+
+def test_ground_below_a_level_camera_stays():
+    # 1.6 high, with a vertical field of view of 50 degrees, it sees the ground from 3.4 on.
+    ground = [(x, 1.6 / np.tan(np.radians(25.0)) + y, -1.6) for x in (-1, 0, 1) for y in range(30)]
+    scene = posed_scene([looking("level.png", ground)], ground)
+    assert in_empty_space(np.array([(0.0, 0.0, -1.6), (0.0, 0.0, -0.9)]), scene).tolist() == [
+        False,
+        True,
+    ]
 
 
 def test_nothing_floats_where_nothing_says_what_is_empty():
@@ -154,6 +215,8 @@ def test_nothing_floats_where_nothing_says_what_is_empty():
     )
     setup = setup_of(scene=blind)
     assert len(floaters(setup, scattered(setup))) == 0
+    with pytest.raises(UserError, match="no photo observes enough points"):
+        refuse_settings_for_nothing(setup.config.model_copy(update={"floaters": "remove"}), setup)
 
 
 @pytest.mark.parametrize(
