@@ -32,8 +32,8 @@ class Backbone(Component):
             holds for the very class that says so, not for those that inherit from it.
         positions: Tensor [N, 3] of the primitives' positions in the local frame, by which they are
             put in order in memory, before the first step and after steps that edit: all rows of all
-            per-primitive tensors together, and without a call of `prepare`. At the end of a run rows
-            are removed in the same way, after `decode` was asked what some of them alone give
+            per-primitive tensors together, and without a call of `prepare`. At the end of a run
+            rows are removed likewise, after `decode` was asked what some of them alone give
             (floaters). Where it is empty, only edits move or remove rows.
     """
 
