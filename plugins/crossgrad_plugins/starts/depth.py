@@ -19,6 +19,8 @@ _NEIGHBOURS = 8
 _BLUR, _REACH = 0.02, 0.1
 #: Farther than so many times its farthest points a photo is not deep.
 _FARTHEST = 2.0
+#: Of the farthest camera or point: where the sky is, so that it stands before no camera.
+_SKY = 2.0
 #: Share of the points that may lie nearer, or farther, than any added one.
 _TAIL = 0.02
 #: Huber's constant, for 95 % of the efficiency of least squares.
@@ -26,18 +28,54 @@ _HUBER, _PASSES = 1.345, 10
 
 
 @dataclass(frozen=True, eq=False)
+class Sky:
+    """Where the sky of a scene is.
+
+    Attributes:
+        up: [3] the scene's upward axis, unit, local frame.
+        centers: [V, 3] of the cameras.
+        points: [P, 3] SfM points, or some of them.
+        most: Share of the points that do not lie astray.
+    """
+
+    up: NDArray[np.float64]
+    centers: NDArray[np.float64]
+    points: NDArray[np.float64]
+    most: float
+
+    def depth(self, camera: Camera) -> float:
+        """How far away it is: behind everything that the camera could see of the scene."""
+        center = camera.center.numpy()
+        far = float(np.linalg.norm(self.centers - center, axis=1).max())
+        if len(self.points):
+            ways = np.linalg.norm(self.points - center, axis=1)
+            far = max(far, float(np.quantile(ways, self.most)))
+        return _SKY * far
+
+    def rise(self, camera: Camera) -> NDArray[np.float64]:
+        """[3] over (x, y, 1) of `from_the_middle`: how steeply the rays through pixels go up."""
+        across, down, ahead = camera.world_to_camera[:3, :3].numpy() @ self.up
+        side = max(camera.width, camera.height)
+        x, y = camera.width / 2.0 - camera.cx, camera.height / 2.0 - camera.cy
+        upright = ahead + across * x / camera.fx + down * y / camera.fy
+        return np.array([across * side / camera.fx, down * side / camera.fy, upright])
+
+
+@dataclass(frozen=True, eq=False)
 class Depth:
     """Depth of a photo, from the points that it observed.
 
     Of a plane in space the inverse depth is a plane over the pixels, so that ground goes on beyond
-    its last point, up to the horizon; where that is behind the camera, something far away stands.
+    its last point, up to the horizon. Rays that go up and do not meet the plane end in the sky.
 
     Attributes:
         pixels: [S, 2] of the points, in units of the longer side from the middle.
         inverse: [S] their inverse depths.
         median: Median of their depths.
         nearest: Largest inverse depth of an added point.
-        farthest: Smallest inverse depth of an added point.
+        farthest: Smallest inverse depth of an added point that is not of the sky.
+        rise: [3] how steeply rays go up, over (x, y, 1).
+        sky: Depth of the sky.
     """
 
     pixels: NDArray[np.float64]
@@ -45,9 +83,13 @@ class Depth:
     median: float
     nearest: float
     farthest: float
+    rise: NDArray[np.float64]
+    sky: float
 
     @classmethod
-    def of(cls, camera: Camera, points: NDArray[np.float64], fewest: int) -> "Depth | None":
+    def of(
+        cls, camera: Camera, points: NDArray[np.float64], fewest: int, sky: Sky
+    ) -> "Depth | None":
         """From the points [S, 3] that were observed; None with fewer than `fewest` in front."""
         pixels, depth = camera.project(points)
         ahead = depth > 0.0
@@ -55,8 +97,9 @@ class Depth:
             return None
         around, inverse = from_the_middle(camera, pixels[ahead]), 1.0 / depth[ahead]
         far, near = np.quantile(inverse, [_TAIL, 1.0 - _TAIL])
-        median = float(np.median(depth[ahead]))
-        return cls(around, inverse, median, near, far / _FARTHEST)
+        median, farthest = float(np.median(depth[ahead])), far / _FARTHEST
+        far_away = max(sky.depth(camera), 1.0 / farthest)
+        return cls(around, inverse, median, near, farthest, sky.rise(camera), far_away)
 
     @cached_property
     def plane(self) -> NDArray[np.float64]:
@@ -80,8 +123,9 @@ class Depth:
         distances, rows = self._tree.query(around, k=[*range(1, count + 1)])
         weights = 1.0 / (distances**2 + _BLUR**2)
         bent = (weights * self.rest[rows]).sum(axis=1) / (weights.sum(axis=1) + _REACH**-2)
-        inverse = np.clip(_on(self.plane, around) + bent, self.farthest, self.nearest)
-        return np.asarray(1.0 / inverse)
+        inverse = _on(self.plane, around) + bent
+        ground = 1.0 / np.clip(inverse, self.farthest, self.nearest)
+        return np.where((inverse > 0.0) | (_on(self.rise, around) <= 0.0), ground, self.sky)
 
 
 def from_the_middle(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

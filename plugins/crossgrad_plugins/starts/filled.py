@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import Camera, Field, MorePoints, Scene, Start, View
+from crossgrad_plugins.groupings.heights import upward
 from crossgrad_plugins.starts.cells import Cells
-from crossgrad_plugins.starts.depth import Depth, from_the_middle
+from crossgrad_plugins.starts.depth import Depth, Sky, from_the_middle
 
 #: A photo needs so many observed points to say how deep it is.
 FEWEST: Final = 8
@@ -20,6 +21,10 @@ _SIZE: Final = 0.8
 _NEAREST: Final = 3
 #: A picture shows nothing that is so many times as far away as it is deep there.
 _BEHIND: Final = 1.5
+#: A camera so many times as far away as a photo is deep there stands on its ground.
+_GROUND: Final = 0.75
+#: Points that are looked at to find how far the scene goes, and the share that is not stray.
+_POINTS, _NOT_STRAY = 1000, 0.98
 
 
 @dataclass(eq=False)
@@ -102,27 +107,44 @@ class Filled(Start):
     def _filled(self, scene: Scene) -> _Filling:
         filling = _Filling(scene.points, _spacings(scene.points))
         views, margin = _spread(scene.train_views, self.views), round(self.margin * self.cells)
+        if not views:
+            return filling
+        some = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
+        sky = Sky(upward(scene)[0], scene.centers, some, _NOT_STRAY)
         deep = {
-            view: Depth.of(view.camera, scene.points[view.seen], FEWEST)
+            view: Depth.of(view.camera, scene.points[view.seen], FEWEST, sky)
             for view in (scene.train_views if margin else views)
         }
         known = [(view, depth) for view in views if (depth := deep[view]) is not None]
         filling.left_aside = len(views) - len(known)
         # What is near is filled finely first, and needs nothing coarse behind it any more.
         known.sort(key=lambda each: each[1].median)
+        air = _Air.of(known)
         for view, depth in known:
-            self._fill(filling, view, depth, 0, None)
+            self._fill(filling, view, depth, air, 0, None)
         filling.inside = len(filling.points) - len(scene.points)
         if margin:
             pictures = _Pictures.of(deep)
-            for view, depth in reversed(known):
-                self._fill(filling, view, depth, margin, pictures)
+            # What is around a camera on the ground of another photo, this one shows, or hides.
+            low = pictures.show(scene.centers, from_=_GROUND)
+            high = {view for view, inside in zip(scene.train_views, low, strict=True) if not inside}
+            for view, depth in reversed([each for each in known if each[0] in high]):
+                self._fill(filling, view, depth, air, margin, pictures)
         return filling
 
     def _fill(
-        self, filling: _Filling, view: View, depth: Depth, margin: int, seen: "_Pictures | None"
+        self,
+        filling: _Filling,
+        view: View,
+        depth: Depth,
+        air: "_Air",
+        margin: int,
+        seen: "_Pictures | None",
     ) -> None:
-        """Fills a photo, or with a margin what is beyond its edges and in no picture `seen`."""
+        """Fills a photo, or with a margin what is beyond its edges and in no picture `seen`.
+
+        What would stand in the air is the photo's sky; beyond the edges nothing is there.
+        """
         camera = view.camera
         cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
         empty = ~cells.covered(filling.points, filling.sizes)
@@ -134,9 +156,15 @@ class Filled(Start):
         rows = np.flatnonzero(empty & has_pixels)
         depths = depth.at(from_the_middle(camera, cells.pixels[rows]))
         points = _behind(view, cells.pixels[rows], depths)
-        unseen = np.ones(len(points), dtype=np.bool_) if seen is None else ~seen.show(points)
+        floats = air.holds(points)
+        added = np.ones(len(points), dtype=np.bool_)
+        if seen is None:
+            depths = np.where(floats, depth.sky, depths)
+            points = _behind(view, cells.pixels[rows], depths)
+        else:
+            added = ~(floats | seen.show(points))
         sizes = _SIZE * cells.size * depths / camera.fx
-        filling.add(points[unseen], sizes[unseen], colors[rows][unseen])
+        filling.add(points[added], sizes[added], colors[rows][added])
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
@@ -168,6 +196,30 @@ def _behind(
 
 
 @dataclass(frozen=True, eq=False)
+class _Air:
+    """The space around cameras that is nearer than what they see.
+
+    Attributes:
+        centers: [K, 3] of the cameras.
+        reach: [K] distance of the nearest that each sees.
+    """
+
+    centers: NDArray[np.float64]
+    reach: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, known: Sequence[tuple[View, Depth]]) -> "_Air":
+        centers = [view.camera.center.numpy() for view, _ in known]
+        reach = [1.0 / depth.nearest for _, depth in known]
+        return cls(np.array(centers).reshape(-1, 3), np.array(reach))
+
+    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[N] whether points [N, 3] lie in it; what rounds to the border does not."""
+        ways = np.linalg.norm(points[:, None] - self.centers, axis=2)
+        return np.asarray((ways < 0.999 * self.reach).any(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
 class _Pictures:
     """The pictures of some views, as deep as they are.
 
@@ -190,7 +242,7 @@ class _Pictures:
         cameras = [view.camera for view in depths]
         endless = (np.inf, np.inf)
         limits = [
-            endless if deep is None else (_BEHIND / deep.nearest, _BEHIND / deep.farthest)
+            endless if deep is None else (_BEHIND / deep.nearest, _BEHIND * deep.sky)
             for deep in depths.values()
         ]
         return cls(
@@ -201,21 +253,29 @@ class _Pictures:
             np.array(limits),
         )
 
-    def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind."""
+    def show(self, points: NDArray[np.float64], from_: float = 0.0) -> NDArray[np.bool_]:
+        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind.
+
+        Args:
+            points: Local frame.
+            from_: Share of the picture's depth there that the point is away at least.
+        """
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
         # Both sides times the depth: nothing is divided by zero.
         inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
         inside &= depth > 0.0
-        shown = (inside & (depth <= self.limits[:, :1])).any(axis=0)
-        open_yet = inside & (depth <= self.limits[:, 1:]) & ~shown
+        near, far = self.limits[:, :1], self.limits[:, 1:]
+        surely = inside & (depth <= near) if from_ == 0.0 else np.zeros_like(inside)
+        shown = surely.any(axis=0)
+        open_yet = inside & (depth <= far) & ~shown
         for view in map(int, np.flatnonzero(open_yet.any(axis=1))):
             rows, deep = np.flatnonzero(open_yet[view] & ~shown), self.depths[view]
             if deep is not None and len(rows):
                 at = from_the_middle(
                     self.cameras[view], pixels[view, rows] / depth[view, rows, None]
                 )
-                shown[rows] = depth[view, rows] <= _BEHIND * deep.at(at)
+                share = depth[view, rows] / deep.at(at)
+                shown[rows] = (from_ <= share) & (share <= _BEHIND)
         return np.asarray(shown)

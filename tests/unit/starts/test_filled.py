@@ -14,7 +14,7 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.starts.cells import Cells
-from crossgrad_plugins.starts.depth import Depth, from_the_middle
+from crossgrad_plugins.starts.depth import Depth, Sky, from_the_middle
 from crossgrad_plugins.starts.filled import Filled
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
@@ -79,6 +79,11 @@ def some_ground(count, x, y, seed=0):
 LEFT = some_ground(400, (-2.5, 0.0), (-1.0, 4.0))
 
 
+def depth_of(camera, points, fewest=8, centers=((0.0, 0.0, 4.0),)):
+    sky = Sky(np.array([0.0, 0.0, 1.0]), np.array(centers), points, 0.98)
+    return Depth.of(camera, points, fewest, sky)
+
+
 def test_depth_of_a_plane_is_exact_far_from_its_points_and_through_outliers():
     camera = looking_down(0.0, 0.0).camera
     points = LEFT[camera.project(LEFT)[1] > 0]
@@ -87,19 +92,44 @@ def test_depth_of_a_plane_is_exact_far_from_its_points_and_through_outliers():
     pixels = np.array([[2.0, 3.0], [24.0, 18.0], [47.0, 35.0], [70.0, 40.0]])
     true = camera.local(on_ground(camera, pixels))[:, 2]
     around = from_the_middle(camera, pixels)
-    np.testing.assert_allclose(Depth.of(camera, points, 8).at(around), true, rtol=1e-9)
-    np.testing.assert_allclose(Depth.of(camera, wrong, 8).at(around), true, rtol=0.12)
+    np.testing.assert_allclose(depth_of(camera, points).at(around), true, rtol=1e-9)
+    np.testing.assert_allclose(depth_of(camera, wrong).at(around), true, rtol=0.12)
 
 
-def test_depth_stays_between_near_and_twice_as_far_as_the_points():
-    camera = looking_down(0.0, 0.0, tilt=3.0).camera  # The horizon is in the picture.
+def test_ground_is_between_near_and_twice_as_far_as_the_points_and_the_sky_beyond_everything():
+    camera = looking_down(0.0, 0.0, tilt=3.0).camera
     ahead = some_ground(300, (-3.0, 3.0), (4.0, 20.0))
     depths = camera.project(ahead)[1]
-    up = np.column_stack([np.linspace(0, WIDTH, 50), np.zeros(50)])
-    found = Depth.of(camera, ahead, 8).at(from_the_middle(camera, up))
-    assert found.min() >= np.quantile(depths, 0.02) * 0.99
-    assert found.max() <= 2.0 * np.quantile(depths, 0.98) * 1.01
-    assert Depth.of(camera, ahead[:7], 8) is None
+    horizon = HEIGHT / 2 - FOCAL / 3.0  # It is in the picture, for the camera looks down by 1 : 3.
+    across = np.linspace(0, WIDTH, 50)
+    above, below = (
+        from_the_middle(camera, np.column_stack([across, np.full(50, horizon + way)]))
+        for way in (-0.5, 0.5)
+    )
+    found = depth_of(camera, ahead, centers=((0.0, 0.0, 4.0), (0.0, 0.0, 34.0)))
+    assert found.at(above) == pytest.approx(2.0 * 30.0)
+    assert found.at(below).min() >= np.quantile(depths, 0.02) * 0.99
+    assert found.at(below).max() <= 2.0 * np.quantile(depths, 0.98) * 1.01
+    # Points are farther away than any camera, but for the last 2 %.
+    ways = np.linalg.norm(ahead - camera.center.numpy(), axis=1)
+    near = depth_of(camera, ahead)
+    assert near.at(above) == pytest.approx(2.0 * np.quantile(ways, 0.98), rel=1e-9)
+    assert depth_of(camera, ahead[:7]) is None
+
+
+@pytest.mark.parametrize("shifted", [0.0, 9.0])
+def test_beyond_a_wall_is_sky_only_where_rays_go_up(shifted):
+    # Along a wall on its left, whose plane vanishes in the middle of the picture.
+    rng = np.random.default_rng(2)
+    wall = np.column_stack([np.full(300, -1.0), rng.uniform(2, 9, 300), rng.uniform(-1, 3, 300)])
+    camera = posed_view([0.0, 0.0, 1.0], "w.png", forward=[0.0, 1.0, 0.0]).camera
+    size = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2}
+    camera = replace(camera, **size, cy=HEIGHT / 2 + shifted)
+    found = depth_of(camera, wall, centers=((0.0, 0.0, 1.0), (0.0, 50.0, 1.0)))
+    right = np.full(9, 0.9 * WIDTH)
+    up = from_the_middle(camera, np.column_stack([right, camera.cy - np.linspace(1, 9, 9)]))
+    down = from_the_middle(camera, np.column_stack([right, camera.cy + np.linspace(1, 9, 9)]))
+    assert found.at(up) == pytest.approx(100.0) and found.at(down).max() < 20.0
 
 
 def covered_by_hand(cells, points, sizes):
@@ -170,6 +200,63 @@ def test_ground_without_points_is_filled_where_it_is_in_its_colours():
     np.testing.assert_allclose(more.colors[:, :2], seen, atol=6)
     # Each covers about its cell: an eighth of the photo's longer side, at its depth.
     assert ((more.sizes > 0.2) & (more.sizes < 0.8)).all()
+
+
+def test_the_sky_stands_before_no_camera():
+    # One camera on the ground looks along it; the others look down from above and beyond.
+    ahead = some_ground(400, (-1.0, 1.0), (2.0, 6.0))
+    down = ground_scene(ahead, [(0.0, 3.0), (40.0, 3.0)])
+    level = posed_view([0.0, 0.0, 0.5], "l.png", forward=[0.0, 1.0, 0.0], seen=range(400))
+    camera = replace(down.train_views[0].camera, world_to_camera=level.camera.world_to_camera)
+    level = replace(level, camera=camera, photo=Picture(camera))
+    scene = posed_scene([*down.train_views, level], ahead)
+    more = Filled(margin=0.0).more_points(scene)
+    sky = more.positions[more.positions[:, 2] > 1.0]
+    assert len(sky) > 10
+    ways = np.linalg.norm(sky[:, None] - scene.centers[None], axis=2)
+    # The farthest camera is 40 away, and the sky twice as far.
+    assert ways.min() > 40.0 and camera.project(sky)[1] == pytest.approx(2.0 * 40.25, rel=0.01)
+    assert Filled().more_points(replace(scene, train=())) is None
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.5])
+def test_nothing_is_added_nearer_to_a_camera_than_what_it_sees(margin):
+    # Beside the top of a tower, at its depth, nothing is but air: another camera looks down there.
+    ground = some_ground(400, (-6.0, 6.0), (3.0, 20.0))
+    tower = np.column_stack([np.zeros(60), np.full(60, 10.0), np.linspace(0.0, 7.0, 60)])
+    points = np.concatenate([ground, tower])
+    level = posed_view([0.0, 0.0, 1.0], "l.png", forward=[0.0, 1.0, 0.3], seen=range(460))
+    above = replace(looking_down(3.0, 8.0, 9.0, seen=range(400)), name="above.png")
+    camera = replace(above.camera, world_to_camera=level.camera.world_to_camera)
+    scene = posed_scene([above, replace(level, camera=camera, photo=Picture(camera))], points)
+    more = Filled(margin=margin).more_points(scene)
+    reach = np.quantile(above.camera.local(ground)[:, 2], 0.02)
+    ways = np.linalg.norm(more.positions - above.camera.center.numpy(), axis=1)
+    assert ways.min() > 0.99 * reach > 6.0
+    pixels, depth = camera.project(more.positions)
+    shown = ((pixels >= 0) & (pixels <= [WIDTH, HEIGHT])).all(axis=1)
+    assert (depth[shown] > 30.0).sum() > 20  # The sky.
+
+
+def test_a_camera_on_the_ground_of_another_photo_has_no_margin():
+    high = ground_scene(LEFT)
+    pixels = high.train_views[0].camera.project(LEFT)[0]
+    middle = LEFT[np.argmin(np.abs(pixels - [WIDTH / 2, HEIGHT / 2]).sum(axis=1))]
+    margins = []
+    for above in (0.2, 9.0):
+        center = middle + np.array([0.0, 0.0, above])
+        low = posed_view(center, "low.png", forward=[0.0, 1.0, -0.5], seen=range(len(LEFT)))
+        camera = replace(high.train_views[0].camera, world_to_camera=low.camera.world_to_camera)
+        low = replace(low, camera=camera, photo=Picture(camera))
+        scene = posed_scene([*high.train_views, low], LEFT)
+        inner = Filled(margin=0.0).more_points(scene)
+        more = Filled(margin=0.5).more_points(scene)
+        alone = Filled(margin=0.5).more_points(high)
+        beyond = more.positions[len(inner.positions) :]
+        apart = np.abs(beyond[:, None] - alone.positions[None]).max(axis=2).min(axis=1)
+        margins.append(int((apart > 1e-9).sum()))
+    # High above it adds its own; from the ground only what the high ones would.
+    assert margins[0] == 0 < margins[1]
 
 
 def test_what_is_full_stays_as_it_is():
