@@ -258,7 +258,7 @@ class RunConfig(BaseModel):
         le=0.9,
         description="Share of the Gaussians that each training view is drawn without. Default: "
         "0.3 where a point lies in at most 5 training photos (median), 0.1 in runs that show each "
-        "at least 150 times; else, and with --preset inria, 0.",
+        "photo at least 150 times; else, and with --preset inria, 0.",
     )
     device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
         "cpu", description="Where tensors live. Default: cpu."

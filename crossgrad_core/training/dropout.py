@@ -21,7 +21,7 @@ from crossgrad_core.training.state import TrainState
 #: The share of runs that name none, where at most so many training photos show a point.
 DROPOUT: Final = 0.3
 FEW_PHOTOS: Final = 5
-#: Where more photos show it, the share of runs that show each photo at least so many times.
+#: Else the share of runs that show each training photo at least so many times.
 LONG_DROPOUT: Final = 0.1
 MANY_TIMES: Final = 150
 #: The random stream of what is left out.
@@ -44,15 +44,17 @@ def with_dropout(config: RunConfig, scene: Scene, notes: list[str], views: int |
     if config.preset == "inria":
         return config.model_copy(update={"dropout": 0.0})
     photos, count = photos_per_point(scene), len(scene.train)
-    share = usual_dropout(photos, (views or 0) / max(1, count))
+    times = (views or 0) / max(1, count)
+    share = usual_dropout(photos, times)
     if share == 0.0 and views is None:
         return config
-    few = f"a point lies in {photos:g} of {count} training photos (median)"
-    long = f"each of {count} training photos is shown {(views or 0) / max(1, count):.0f} times"
     if share:
+        why = f"each of {count} training photos is shown {times:.0f} times"
+        if is_of_few(photos):
+            why = f"a point lies in {photos:g} of {count} training photos (median)"
         notes.append(
-            f"dropout: {few if is_of_few(photos) else long}, and a view is drawn without "
-            f"{share:.0%} of the Gaussians (--dropout 0: with all)"
+            f"dropout: {why}, and a view is drawn without {share:.0%} of the Gaussians "
+            "(--dropout 0: with all)"
         )
     return config.model_copy(update={"dropout": share})
 

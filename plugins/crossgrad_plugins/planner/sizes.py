@@ -165,15 +165,19 @@ def dropout(evidence: Evidence) -> Decision:
     views = 0 if steps is None else views_of_steps(evidence).paced(steps).views(steps)
     times = views / max(1, len(evidence.scene.train_views))
     share = usual_dropout(photos, times)
+    known = {} if steps is None else {"times_shown": times}
     choice = f"{share:g}" if share else "none"
     plain = Decision(part, choice, "default", "", rule, _FEW, "--dropout SHARE")
+    if steps is None and not share:
+        return plain.found("the length follows the clock, and the share the length")
+    often = f"each photo is shown {times:.0f} times"
     if not photos:
-        return plain.found("no SfM points tell how many photos show the same")
+        return plain.found(f"no SfM points tell how many photos show the same; {often}")
     shown = f"a point lies in {photos:g} of {len(evidence.scene.train_views)} photos (median)"
     if steps is not None:
-        shown += f", each of which is shown {times:.0f} times"
+        shown += f"; {often}"
     saved = NOTHING if share else "a random number for each Gaussian of a view"
-    figures = {"photos_of_a_point": photos, "times_shown": times}
+    figures = {"photos_of_a_point": photos, **known}
     return plain.found(shown, decided=True, saved=saved, figures=figures)
 
 

@@ -19,7 +19,7 @@ _NEIGHBOURS = 8
 _BLUR, _REACH = 0.02, 0.1
 #: Farther than so many times its farthest points a photo is not deep.
 _FARTHEST = 2.0
-#: Of the farthest camera or point: where the sky is, so that it stands before no camera.
+#: Of the farthest camera or point: how far away the sky is.
 _SKY = 2.0
 #: Share of the points that may lie nearer, or farther, than any added one.
 _TAIL = 0.02
@@ -117,6 +117,10 @@ class Depth:
 
         return cKDTree(self.pixels)
 
+    def rises(self, around: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[N] whether rays through pixels [N, 2], as of `from_the_middle`, go up."""
+        return _on(self.rise, around) > 0.0
+
     def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N] depths at pixels [N, 2], in units of the longer side from the middle."""
         count = min(_NEIGHBOURS, len(self.rest))
@@ -125,7 +129,7 @@ class Depth:
         bent = (weights * self.rest[rows]).sum(axis=1) / (weights.sum(axis=1) + _REACH**-2)
         inverse = _on(self.plane, around) + bent
         ground = 1.0 / np.clip(inverse, self.farthest, self.nearest)
-        return np.where((inverse > 0.0) | (_on(self.rise, around) <= 0.0), ground, self.sky)
+        return np.where((inverse <= 0.0) & self.rises(around), self.sky, ground)
 
 
 def from_the_middle(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

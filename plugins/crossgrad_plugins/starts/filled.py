@@ -21,8 +21,9 @@ _SIZE: Final = 0.8
 _NEAREST: Final = 3
 #: A picture shows nothing that is so many times as far away as it is deep there.
 _BEHIND: Final = 1.5
-#: A camera so many times as far away as a photo is deep there stands on its ground.
-_GROUND: Final = 0.75
+#: A camera at least so many times as far away as a photo is deep there stands on its ground, if the
+#: way down to it is as steep as this (sine).
+_GROUND, _STEEP = 0.75, 0.3
 #: Points that are looked at to find how far the scene goes, and the share that is not stray.
 _POINTS, _NOT_STRAY = 1000, 0.98
 
@@ -123,12 +124,13 @@ class Filled(Start):
         for view, depth in known:
             self._fill(filling, view, depth, air, 0, None)
         filling.inside = len(filling.points) - len(scene.points)
-        if margin:
+        if margin and known:
             pictures = _Pictures.of(deep)
-            # What is around a camera on the ground of another photo, this one shows, or hides.
-            low = pictures.show(scene.centers, from_=_GROUND)
-            high = {view for view, inside in zip(scene.train_views, low, strict=True) if not inside}
-            for view, depth in reversed([each for each in known if each[0] in high]):
+            # What is around a camera that another photo looks down on, this one shows, or hides.
+            centers = np.stack([view.camera.center.numpy() for view, _ in known])
+            low = pictures.look_down_on(centers, sky.up)
+            high = [each for each, inside in zip(known, low, strict=True) if not inside]
+            for view, depth in reversed(high):
                 self._fill(filling, view, depth, air, margin, pictures)
         return filling
 
@@ -143,7 +145,8 @@ class Filled(Start):
     ) -> None:
         """Fills a photo, or with a margin what is beyond its edges and in no picture `seen`.
 
-        What would stand in the air is the photo's sky; beyond the edges nothing is there.
+        What rays that go up would place in the air is the photo's sky; beyond its edges nothing is
+        added there.
         """
         camera = view.camera
         cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
@@ -154,9 +157,10 @@ class Filled(Start):
             return
         colors, has_pixels = cells.colors(view)
         rows = np.flatnonzero(empty & has_pixels)
-        depths = depth.at(from_the_middle(camera, cells.pixels[rows]))
+        at = from_the_middle(camera, cells.pixels[rows])
+        depths = depth.at(at)
         points = _behind(view, cells.pixels[rows], depths)
-        floats = air.holds(points)
+        floats = depth.rises(at) & air.holds(points)
         added = np.ones(len(points), dtype=np.bool_)
         if seen is None:
             depths = np.where(floats, depth.sky, depths)
@@ -215,8 +219,10 @@ class _Air:
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """[N] whether points [N, 3] lie in it; what rounds to the border does not."""
-        ways = np.linalg.norm(points[:, None] - self.centers, axis=2)
-        return np.asarray((ways < 0.999 * self.reach).any(axis=1))
+        held = np.zeros(len(points), dtype=np.bool_)
+        for center, reach in zip(self.centers, self.reach, strict=True):
+            held |= np.linalg.norm(points - center, axis=1) < 0.999 * reach
+        return held
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,29 +259,52 @@ class _Pictures:
             np.array(limits),
         )
 
-    def show(self, points: NDArray[np.float64], from_: float = 0.0) -> NDArray[np.bool_]:
-        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind.
+    def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind."""
+        pixels, depth, inside = self._seen(points)
+        shown = np.asarray((inside & (depth <= self.limits[:, :1])).any(axis=0))
+        open_yet = inside & (depth <= self.limits[:, 1:])
+        for view in map(int, np.flatnonzero((open_yet & ~shown).any(axis=1))):
+            rows, deep = np.flatnonzero(open_yet[view] & ~shown), self.depths[view]
+            if deep is not None:
+                way = depth[view, rows]
+                shown[rows] = way <= _BEHIND * self._at(view, pixels[view, rows] / way[:, None])
+        return shown
+
+    def look_down_on(
+        self, points: NDArray[np.float64], up: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """[N] whether one of the pictures shows from above the ground on which a point stands.
 
         Args:
-            points: Local frame.
-            from_: Share of the picture's depth there that the point is away at least.
+            points: [N, 3].
+            up: [3] the upward axis.
         """
+        pixels, depth, inside = self._seen(points)
+        low = np.zeros(len(points), dtype=np.bool_)
+        for view in map(int, np.flatnonzero(inside.any(axis=1))):
+            rays = points - self.cameras[view].center.numpy()
+            steep = -(rays @ up) >= _STEEP * np.linalg.norm(rays, axis=1)
+            rows = np.flatnonzero(inside[view] & steep & ~low)
+            if self.depths[view] is not None and len(rows):
+                way = depth[view, rows]
+                share = way / self._at(view, pixels[view, rows] / way[:, None])
+                low[rows] = (share >= _GROUND) & (share <= _BEHIND)
+        return low
+
+    def _seen(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """[V, N, 2] pixels times depth, [V, N] depths, and whether points lie in pictures."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
         # Both sides times the depth: nothing is divided by zero.
         inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
-        inside &= depth > 0.0
-        near, far = self.limits[:, :1], self.limits[:, 1:]
-        surely = inside & (depth <= near) if from_ == 0.0 else np.zeros_like(inside)
-        shown = surely.any(axis=0)
-        open_yet = inside & (depth <= far) & ~shown
-        for view in map(int, np.flatnonzero(open_yet.any(axis=1))):
-            rows, deep = np.flatnonzero(open_yet[view] & ~shown), self.depths[view]
-            if deep is not None and len(rows):
-                at = from_the_middle(
-                    self.cameras[view], pixels[view, rows] / depth[view, rows, None]
-                )
-                share = depth[view, rows] / deep.at(at)
-                shown[rows] = (from_ <= share) & (share <= _BEHIND)
-        return np.asarray(shown)
+        return pixels, depth, np.asarray(inside & (depth > 0.0))
+
+    def _at(self, view: int, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N] depths of a picture that has some, at pixels [N, 2]."""
+        deep = self.depths[view]
+        assert deep is not None
+        return deep.at(from_the_middle(self.cameras[view], pixels))

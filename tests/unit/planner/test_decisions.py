@@ -525,6 +525,8 @@ def test_dropout_where_few_photos_show_a_point(photos, choice):
     assert found.figures == {"photos_of_a_point": photos, "times_shown": 100 / photos}
     long = plan_for(orbit(photos), steps=150 * photos).of_part("dropout")
     assert long.choice == ("0.3" if choice == "0.3" else "0.1")
+    timed = plan_for(orbit(photos), seconds=9.0, max_views=None, schedule="absolute", reference=100)
+    assert timed.of_part("dropout").basis == ("decided" if choice == "0.3" else "default")
     preset = plan_for(orbit(photos), preset="fast", steps=100)
     assert preset.of_part("dropout").choice == choice
     assert plan_for(orbit(photos), dropout=0.2).of_part("dropout").basis == "given"

@@ -238,6 +238,43 @@ def test_nothing_is_added_nearer_to_a_camera_than_what_it_sees(margin):
     assert (depth[shown] > 30.0).sum() > 20  # The sky.
 
 
+def test_rays_that_go_down_end_on_the_ground_however_near_a_camera():
+    # Along a street, 1.6 high, 3 apart; each sees the ground from 5 on.
+    ground = some_ground(3000, (-8.0, 8.0), (5.0, 60.0))
+    views = []
+    for number in range(10):
+        center = np.array([0.0, 3.0 * number, 1.6])
+        ahead = np.flatnonzero(ground[:, 1] > center[1] + 5.0)
+        view = posed_view(center, f"{number}.png", forward=[0.0, 1.0, 0.0], seen=ahead)
+        camera = replace(looking_down(0.0, 0.0).camera, world_to_camera=view.camera.world_to_camera)
+        views.append(replace(view, camera=camera, photo=Picture(camera)))
+    # Most of the road has no points of its own.
+    kept = np.flatnonzero(np.abs(ground[:, 0]) > 4.0)
+    order = np.full(len(ground), -1)
+    order[kept] = np.arange(len(kept))
+    views = [replace(v, seen=order[v.seen][order[v.seen] >= 0]) for v in views]
+    more = Filled(margin=0.0).more_points(posed_scene(views, ground[kept]))
+    low = more.positions[more.positions[:, 2] < 5.0]
+    assert len(low) > 10 and low[:, 2].min() > -1.0
+    assert (more.positions[:, 2] >= 5.0).any()
+
+
+def test_cameras_around_an_object_have_margins_though_they_see_each_other():
+    rng, views = np.random.default_rng(3), []
+    walls = rng.uniform(0.0, 2.0 * np.pi, 2000)
+    room = np.column_stack([4.5 * np.cos(walls), 4.5 * np.sin(walls), rng.uniform(0, 2.5, 2000)])
+    for number in range(8):
+        angle = number * np.pi / 4.0
+        center = np.array([3.0 * np.cos(angle), 3.0 * np.sin(angle), 1.5])
+        view = posed_view(center, f"{number}.png", forward=-center * [1, 1, 0], seen=range(2000))
+        camera = replace(looking_down(0.0, 0.0).camera, world_to_camera=view.camera.world_to_camera)
+        views.append(replace(view, camera=camera, photo=Picture(camera)))
+    scene = posed_scene(views, room)
+    inner = Filled(margin=0.0).more_points(scene)
+    more = Filled(margin=0.5).more_points(scene)
+    assert len(more.positions) > (0 if inner is None else len(inner.positions)) + 20
+
+
 def test_a_camera_on_the_ground_of_another_photo_has_no_margin():
     high = ground_scene(LEFT)
     pixels = high.train_views[0].camera.project(LEFT)[0]

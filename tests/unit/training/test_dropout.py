@@ -144,7 +144,8 @@ def test_a_run_within_seconds_decides_once_its_length_is_planned(monkeypatch, le
     setup = setup_of(steps=None, seconds=5.0)
     assert setup.config.dropout is None
     state = first_state(setup)
-    assert dropped(setup, state, decoded(setup, state)) is not None
+    whole = decoded(setup, state)
+    assert dropped(setup, state, whole) is whole
     steps = 9 * MANY_TIMES - less
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (steps, "planned", 0.6))
     planned = app._within(setup, 5.0)
@@ -165,7 +166,7 @@ def test_few_photos_that_are_shown_many_times_have_the_share_of_few():
 def test_what_is_said_of_the_default_is_the_default():
     said = RunConfig.model_fields["dropout"].description
     assert f"{DROPOUT} where a point lies in at most {FEW_PHOTOS} training photos" in said
-    assert f"{LONG_DROPOUT} in runs that show each at least {MANY_TIMES} times" in said
+    assert f"{LONG_DROPOUT} in runs that show each photo at least {MANY_TIMES} times" in said
 
 
 def test_a_run_goes_on_with_the_same_bits():
