@@ -257,8 +257,8 @@ class RunConfig(BaseModel):
         ge=0,
         le=0.9,
         description="Share of the Gaussians that each training view is drawn without. Default: "
-        "0.3 where a point lies in at most 5 training photos (median), 0.1 in runs that show each "
-        "photo at least 150 times; else, and with --preset inria, 0.",
+        "0.3 where a point lies in at most 5 training photos (median); else, and with --preset "
+        "inria, 0.",
     )
     device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
         "cpu", description="Where tensors live. Default: cpu."

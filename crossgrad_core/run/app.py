@@ -49,7 +49,6 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
-from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.photo_parameters import known_starts
 from crossgrad_core.training.rates import note_on_plan
@@ -237,11 +236,9 @@ def _within(setup: Setup, seconds: float) -> Setup:
     given = {"planned_seconds": seconds, "planned_views": setup.config.max_views}
     config = setup.config.model_copy(update={**update, **given})
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
-    notes = [note]
-    config = with_dropout(config, setup.scene, notes, schedule.pace.views(steps))
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
     idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
-    told = (*notes, *note_on_plan(setup), *notes_on_length(setup), *idle)
+    told = (note, *note_on_plan(setup), *notes_on_length(setup), *idle)
     return replace(setup, notes=(*setup.notes, *told))
 
 

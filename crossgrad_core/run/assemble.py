@@ -182,7 +182,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     answers = manager.hook.crossgrad_objections(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
-    config = _with_steps(config, selection.views)
+    config = with_dropout(_with_steps(config, selection.views), scene, notes)
     counting = counting_of(
         config,
         selection.views,
@@ -190,9 +190,6 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         budgeted=selection.densifier.budgeted,
     )
     steps = config.steps or DEFAULT_STEPS
-    schedule = schedule_of(config, selection.densifier, steps, counting)
-    views = None if config.seconds is not None else schedule.pace.views(steps)
-    config = with_dropout(config, scene, notes, views)
     setup = Setup(
         config=config,
         scene=scene,
@@ -200,7 +197,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         manager=manager,
         plugins=plugins,
         groups=groups,
-        schedule=schedule,
+        schedule=schedule_of(config, selection.densifier, steps, counting),
         device=choose_device(config.device),
         notes=tuple(notes),
         scaled_photos=_photos(config),

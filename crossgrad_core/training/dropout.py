@@ -1,4 +1,4 @@
-"""Gaussians left out of training views at random, so that photos are not learnt by heart.
+"""Gaussians left out of training views at random, so that few photos are not learnt by heart.
 
 Source: DropGaussian (Park et al. 2025), whose share grows with the steps; that it stays, and where
 it is used, is ours (docs/few-photos.md).
@@ -21,59 +21,35 @@ from crossgrad_core.training.state import TrainState
 #: The share of runs that name none, where at most so many training photos show a point.
 DROPOUT: Final = 0.3
 FEW_PHOTOS: Final = 5
-#: Else the share of runs that show each training photo at least so many times.
-LONG_DROPOUT: Final = 0.1
-MANY_TIMES: Final = 150
 #: The random stream of what is left out.
 STREAM: Final = "dropout"
 #: Points that are looked at, spread over all.
 _POINTS: Final = 1000
 
 
-def with_dropout(config: RunConfig, scene: Scene, notes: list[str], views: int | None) -> RunConfig:
+def with_dropout(config: RunConfig, scene: Scene, notes: list[str]) -> RunConfig:
     """The configuration with the share that each training view is drawn without.
 
     Args:
         config: The configuration.
         scene: Its scene.
         notes: Gets a line where that was decided here and is not 0.
-        views: Of the whole run; None: it is yet to be planned, and if they decide, so is the share.
     """
     if config.dropout is not None:
         return config
-    if config.preset == "inria":
-        return config.model_copy(update={"dropout": 0.0})
-    photos, count = photos_per_point(scene), len(scene.train)
-    times = (views or 0) / max(1, count)
-    share = usual_dropout(photos, times)
-    if share == 0.0 and views is None:
-        return config
+    photos = 0.0 if config.preset == "inria" else photos_per_point(scene)
+    share = usual_dropout(photos)
     if share:
-        why = f"each of {count} training photos is shown {times:.0f} times"
-        if is_of_few(photos):
-            why = f"a point lies in {photos:g} of {count} training photos (median)"
         notes.append(
-            f"dropout: {why}, and a view is drawn without {share:.0%} of the Gaussians "
-            "(--dropout 0: with all)"
+            f"dropout: a point lies in {photos:g} of {len(scene.train)} training photos (median), "
+            f"each of which is drawn without {share:.0%} of the Gaussians (--dropout 0: with all)"
         )
     return config.model_copy(update={"dropout": share})
 
 
-def usual_dropout(photos: float, times: float = 0.0) -> float:
-    """The share of a run that names none.
-
-    Args:
-        photos: In how many training photos a point lies; 0: not known.
-        times: How often the run shows each training photo.
-    """
-    if is_of_few(photos):
-        return DROPOUT
-    return LONG_DROPOUT if times >= MANY_TIMES else 0.0
-
-
-def is_of_few(photos: float) -> bool:
-    """Whether a point that lies in so many training photos lies in few of them."""
-    return 0.0 < photos <= FEW_PHOTOS
+def usual_dropout(photos: float) -> float:
+    """The share where a point lies in so many training photos; 0: not known."""
+    return DROPOUT if 0.0 < photos <= FEW_PHOTOS else 0.0
 
 
 def photos_per_point(scene: Scene) -> float:

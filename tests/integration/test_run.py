@@ -140,7 +140,6 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
     run(scene, tmp_path / "timed", steps=None, seconds=1.5, **GROWTH)
     stored = read_config(tmp_path / "timed")
     assert (stored["steps"], stored["seconds"], stored["planned_seconds"]) == (40, None, 1.5)
-    assert stored["dropout"] == 0.0
     last = load(latest(tmp_path / "timed")).step
     assert stored["revisions"][-1][1] == last == 60
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0

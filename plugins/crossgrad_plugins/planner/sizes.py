@@ -160,25 +160,16 @@ def dropout(evidence: Evidence) -> Decision:
     part, config = "dropout", evidence.config
     if evidence.is_given("dropout") or config.preset == "inria":
         return given(part, config.dropout or "none", "--dropout SHARE")
-    rule = "some where a point lies in few photos, and where each photo is shown many times"
-    photos, steps = photos_per_point(evidence.scene), _steps(evidence)
-    views = 0 if steps is None else views_of_steps(evidence).paced(steps).views(steps)
-    times = views / max(1, len(evidence.scene.train_views))
-    share = usual_dropout(photos, times)
-    known = {} if steps is None else {"times_shown": times}
+    rule = "some where a point lies in at most 5 photos; where more show it, no gain was measured"
+    photos = photos_per_point(evidence.scene)
+    share = usual_dropout(photos)
     choice = f"{share:g}" if share else "none"
     plain = Decision(part, choice, "default", "", rule, _FEW, "--dropout SHARE")
-    if steps is None and not share:
-        return plain.found("the length follows the clock, and the share the length")
-    often = f"each photo is shown {times:.0f} times"
     if not photos:
-        return plain.found(f"no SfM points tell how many photos show the same; {often}")
+        return plain.found("no SfM points tell how many photos show the same")
     shown = f"a point lies in {photos:g} of {len(evidence.scene.train_views)} photos (median)"
-    if steps is not None:
-        shown += f"; {often}"
     saved = NOTHING if share else "a random number for each Gaussian of a view"
-    figures = {"photos_of_a_point": photos, **known}
-    return plain.found(shown, decided=True, saved=saved, figures=figures)
+    return plain.found(shown, decided=True, saved=saved, figures={"photos_of_a_point": photos})
 
 
 def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:

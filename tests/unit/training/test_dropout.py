@@ -8,21 +8,13 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import Draw
-from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.dropout import (
-    DROPOUT,
-    FEW_PHOTOS,
-    LONG_DROPOUT,
-    MANY_TIMES,
-    dropped,
-    photos_per_point,
-)
+from crossgrad_core.training.dropout import DROPOUT, FEW_PHOTOS, dropped, photos_per_point
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
@@ -117,56 +109,9 @@ def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share)
     assert len(noted) == (share > 0.0 and "dropout" not in given)
 
 
-@pytest.mark.parametrize(
-    ("given", "share"),
-    [
-        ({"steps": 9 * MANY_TIMES}, LONG_DROPOUT),
-        ({"steps": 9 * MANY_TIMES - 1}, 0.0),
-        (
-            {"steps": 5 * MANY_TIMES, "views_per_step": "2", "sampler": {"name": "random"}},
-            LONG_DROPOUT,
-        ),
-        ({"max_views": 9 * MANY_TIMES}, LONG_DROPOUT),
-        ({"steps": 9 * MANY_TIMES, "preset": "inria"}, 0.0),
-        ({"steps": 9 * MANY_TIMES, "dropout": 0.0}, 0.0),
-        ({"steps": None}, LONG_DROPOUT),
-    ],
-)
-def test_photos_that_are_shown_many_times_have_it(given, share):
-    setup = setup_of(**given)
-    assert len(setup.train_views) == 9 and resolved(setup).dropout == share
-    noted = [note for note in setup.notes if note.startswith("dropout")]
-    assert len(noted) == (share > 0.0)
-
-
-@pytest.mark.parametrize(("less", "share"), [(0, LONG_DROPOUT), (1, 0.0)])
-def test_a_run_within_seconds_decides_once_its_length_is_planned(monkeypatch, less, share):
-    setup = setup_of(steps=None, seconds=5.0)
-    assert setup.config.dropout is None
-    state = first_state(setup)
-    whole = decoded(setup, state)
-    assert dropped(setup, state, whole) is whole
-    steps = 9 * MANY_TIMES - less
-    monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (steps, "planned", 0.6))
-    planned = app._within(setup, 5.0)
-    assert planned.config.dropout == share
-    noted = [note for note in planned.notes if note.startswith("dropout")]
-    assert len(noted) == (share > 0.0)
-    few = setup_of(with_photos(FEW_PHOTOS), steps=None, seconds=5.0)
-    assert few.config.dropout == DROPOUT == app._within(few, 5.0).config.dropout
-
-
-def test_few_photos_that_are_shown_many_times_have_the_share_of_few():
-    setup = setup_of(with_photos(FEW_PHOTOS), steps=FEW_PHOTOS * MANY_TIMES)
-    assert setup.config.dropout == DROPOUT
-    (note,) = (note for note in setup.notes if note.startswith("dropout"))
-    assert note.startswith(f"dropout: a point lies in {FEW_PHOTOS} of {FEW_PHOTOS} training photos")
-
-
 def test_what_is_said_of_the_default_is_the_default():
     said = RunConfig.model_fields["dropout"].description
     assert f"{DROPOUT} where a point lies in at most {FEW_PHOTOS} training photos" in said
-    assert f"{LONG_DROPOUT} in runs that show each photo at least {MANY_TIMES} times" in said
 
 
 def test_a_run_goes_on_with_the_same_bits():
