@@ -113,7 +113,10 @@ def test_photos_stay_as_they_are(backbone):
             for name in block.tensors:
                 assert torch.equal(state.parameters[name].detach(), tensors[name][kept]), name
     after = [render.image for _, render in images(setup, state.parameters)]
-    assert all(torch.equal(one, two) for one, two in zip(before, after, strict=True))
+    # Networks multiply as many rows as there are, and may round accordingly.
+    close = {"rtol": 0.0, "atol": 1e-5 if backbone in {"octree", "scaffold"} else 0.0}
+    for one, two in zip(before, after, strict=True):
+        torch.testing.assert_close(two, one, **close)
     assert cleaned(setup, state) == 0
     assert state.primitives(setup) == primitives - len(gone)
 
@@ -161,7 +164,7 @@ def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
 
 
 def test_a_set_of_which_nothing_would_be_left_stays():
-    setup = setup_of()
+    setup = setup_of(start=ComponentChoice(name="sfm"))
     state = first_state(setup)
     behind = setup.train_views[0].camera
     positions = state.parameters["means"].detach()
