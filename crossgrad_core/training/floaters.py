@@ -21,7 +21,7 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import shown
 
 #: Around a camera this share of the distance to the nearest point that it sees is taken to be
-#: empty: less than what a level camera is above ground that it sees from some way off on.
+#: empty. The ground below a level camera, which sees it from some way off on, is farther away.
 EMPTY: Final = 0.3
 #: The percentile of the depths of its SfM points that counts as nearest: single points lie wrong.
 NEAREST: Final = 1.0

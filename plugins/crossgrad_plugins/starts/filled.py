@@ -161,14 +161,13 @@ class Filled(Start):
         depths = depth.at(at)
         points = _behind(view, cells.pixels[rows], depths)
         floats = depth.rises(at) & air.holds(points)
-        added = np.ones(len(points), dtype=np.bool_)
         if seen is None:
             depths = np.where(floats, depth.sky, depths)
             points = _behind(view, cells.pixels[rows], depths)
         else:
             added = ~(floats | seen.show(points))
-        sizes = _SIZE * cells.size * depths / camera.fx
-        filling.add(points[added], sizes[added], colors[rows][added])
+            rows, depths, points = rows[added], depths[added], points[added]
+        filling.add(points, _SIZE * cells.size * depths / camera.fx, colors[rows])
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
