@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp, log
-from typing import Literal, TypeAlias
+from math import exp, inf, log
+from typing import Literal, TypeAlias, get_args
 
 from torch import Tensor
 
@@ -22,6 +22,18 @@ class LearningRate:
 
     initial: float
     final: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses rates that no schedule can follow.
+
+        Raises:
+            ValueError: A rate is negative or not finite, or fades to 0, which no logarithm has.
+        """
+        rates = [rate for rate in (self.initial, self.final) if rate is not None]
+        if not all(0.0 <= rate < inf for rate in rates):
+            raise ValueError(f"learning rates are finite and not negative; found {rates}")
+        if self.initial > 0.0 and self.final == 0.0:
+            raise ValueError("a learning rate cannot fade to 0 log-linearly; name a small one")
 
     @property
     def decays(self) -> bool:
@@ -44,7 +56,7 @@ class Block:
         name: Name of the block.
         tensors: Names of its tensors in `Parameters`; a single-tensor block carries its name.
         per_primitive: Whether the first dimension of every tensor counts primitives.
-        kind: Geometry, appearance or neutral (for `group` granularity and per-block dispatch).
+        kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
         lr: Learning rate of all its tensors; 0 freezes the block: its tensors get no gradient,
             may be of any type, and take part in topology edits and checkpoints only.
         rests: Whether its tensors are details of the colour, such as spherical harmonics of higher
@@ -57,6 +69,19 @@ class Block:
     kind: BlockKind
     lr: LearningRate
     rests: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses what only later would go wrong.
+
+        Raises:
+            ValueError: The kind is none.
+            TypeError: The names of the tensors are no tuple, or the rate is a bare number.
+        """
+        if self.kind not in get_args(BlockKind):
+            kinds = get_args(BlockKind)
+            raise ValueError(f"block {self.name}: the kind {self.kind!r} is none of {kinds}")
+        if not isinstance(self.tensors, tuple) or not isinstance(self.lr, LearningRate):
+            raise TypeError(f"block {self.name}: tensors is a tuple of names, lr a LearningRate")
 
     @property
     def frozen(self) -> bool:

@@ -1,10 +1,15 @@
 """Components: frozen pydantic models whose fields are their options."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 from typing_extensions import override
+
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.errors import UserError
+
+A = TypeVar("A")
 
 
 class Component(BaseModel):
@@ -22,6 +27,43 @@ class Component(BaseModel):
     )
 
     slot: ClassVar[str]
+
+
+def answered(answer: object, kind: type[A], component: Component, method: str) -> A:
+    """What a method of a component answered, if it is of its kind.
+
+    Raises:
+        UserError: It is not; names the method.
+    """
+    if isinstance(answer, kind):
+        return answer
+    raise _wrong_answer(component, method, kind.__name__, answer)
+
+
+def with_state(
+    answer: object, kind: type[A], component: Component, method: str
+) -> tuple[A, PluginState]:
+    """The two parts of what a method of a component answered.
+
+    Raises:
+        UserError: It is no pair of these types; names the method.
+    """
+    match answer:
+        case (first, PluginState() as state) if isinstance(first, kind):
+            return first, state
+    raise _wrong_answer(component, method, f"a pair: {kind.__name__}, PluginState", answer)
+
+
+def _wrong_answer(component: Component, method: str, expected: str, answer: object) -> UserError:
+    own = type(component)
+    parts = [type(each).__name__ for each in answer] if isinstance(answer, tuple) else []
+    return UserError(
+        f"{own.__name__}.{method} gave a wrong answer",
+        where=f"{own.__module__}:{own.__qualname__}.{method}",
+        expected=expected,
+        found=f"a tuple: {', '.join(parts)}" if parts else type(answer).__name__,
+        todo="repair the plugin, or choose another one",
+    )
 
 
 @dataclass(frozen=True)

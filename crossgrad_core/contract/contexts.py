@@ -486,7 +486,7 @@ class OperatorContext:
     Attributes:
         step: 1-based number of the step.
         blocks: [B] name of each Gramian's block (`geometry`, `appearance` under granularity
-            `group`, `all` under `global`; under `gaussian` one name for all rows of a block).
+            `kind`, `all` under `global`; under `gaussian` one name for all rows of a block).
         kinds: [B] kind of each.
         losses: [K] float64.
         labels: K group labels, or None.

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from typing import ClassVar
 
 from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.component import Component, with_state
 from crossgrad_core.contract.contexts import Densified, DensifyContext
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.schedule import Schedule
@@ -61,5 +61,6 @@ class Densifier(Component):
     @hookimpl
     def crossgrad_densify(self, context: DensifyContext) -> Densified:
         """Answers the seam with this densifier's edit."""
-        edit, state = self.densify(context, context.state(STATE))
+        answer = self.densify(context, context.state(STATE))
+        edit, state = with_state(answer, Edit, self, "densify")
         return Densified(edit, states={STATE: state})

@@ -84,6 +84,29 @@ class Gaussians:
         """The same Gaussians without their graph."""
         return self.mapped(torch.Tensor.detach)
 
+    def misfit(self) -> str | None:
+        """What is wrong with the shape of a tensor, such as `colors is [5, 1], not [5, 3]`."""
+        if (self.colors is None) == (self.sh_dc is None):
+            return "both or none of colors and sh_dc are given"
+        number, rest = len(self), self.sh_rest
+        higher = 0 if rest is None or rest.ndim == 1 else rest.shape[1]
+        shapes: dict[str, tuple[int, ...]] = {
+            "means": (number, 3),
+            "quats": (number, 4),
+            "scales": (number, 3),
+            "opacities": (number,),
+            "colors": (number, 3),
+            "sh_dc": (number, 1, 3),
+            "sh_rest": (number, max(higher, (self.sh_degree + 1) ** 2 - 1), 3),
+            "origin": (number,),
+            "slot": (number,),
+        }
+        for name, shape in shapes.items():
+            tensor = getattr(self, name)
+            if tensor is not None and tuple(tensor.shape) != shape:
+                return f"{name} is {list(tensor.shape)}, not {list(shape)}"
+        return None
+
     def whole(self) -> "Gaussians":
         """The same Gaussians for those who know nothing of rows on demand."""
         return self if self.on_demand is None else _Whole(**vars(self))

@@ -11,6 +11,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block, BlockKind
+from crossgrad_core.contract.component import answered, with_state
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.operator import Operator
@@ -105,7 +106,10 @@ class Weighting(GramianOperator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        return diagonals(self.weights(gramians, context)), state
+        weights = answered(self.weights(gramians, context), np.ndarray, self, "weights")
+        if weights.shape != gramians.shape[:2]:
+            raise _misfit(self, gramians, weights)
+        return diagonals(weights), state
 
 
 def diagonals(weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,7 +140,10 @@ def aggregate_by_gramians(
     gramians = gradients.gramians(granularity)
     present = gradients.present(granularity)
     given = operator_context(context, granularity, present)
-    matrices, state = operator.transform(gramians, given, state, context.rng)
+    answer = operator.transform(gramians, given, state, context.rng)
+    matrices, state = with_state(answer, np.ndarray, operator, "transform")
+    if matrices.shape[::2] != gramians.shape[::2]:
+        raise _misfit(operator, gramians, matrices)
     weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
@@ -215,6 +222,19 @@ def _counts(
 def _some(flags: NDArray[np.bool_]) -> int:
     """In how many blocks any flag is set."""
     return int(flags.reshape(len(flags), -1).any(axis=1).sum()) if flags.size else 0
+
+
+def _misfit(
+    operator: Operator, gramians: NDArray[np.float64], found: NDArray[np.float64]
+) -> UserError:
+    blocks, views = gramians.shape[:2]
+    return UserError(
+        f"operator {type(operator).__name__} gave an array of a wrong shape",
+        where=f"{blocks} blocks, {views} views",
+        expected=f"[{blocks}, {views}] weights, or [{blocks}, R, {views}] matrices",
+        found=f"{list(found.shape)}",
+        todo="repair the plugin, or choose another operator",
+    )
 
 
 def _not_finite(

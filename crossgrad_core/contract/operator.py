@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.contract.component import Component, ViewCounts
+from crossgrad_core.contract.component import Component, ViewCounts, with_state
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.state import PluginState
@@ -77,6 +77,7 @@ class Operator(Component):
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> Aggregated:
         """Answers the seam with this operator's directions."""
-        aggregated, state = self.aggregate(context, context.state(STATE))
+        answer = self.aggregate(context, context.state(STATE))
+        aggregated, state = with_state(answer, Aggregated, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}
         return Aggregated(aggregated.gradients, aggregated.counts, states=states)

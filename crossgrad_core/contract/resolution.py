@@ -1,10 +1,11 @@
 """The resolution slot: at which scale the views of a step are rendered and compared."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from math import log2
 from typing import ClassVar
 
-from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.component import Component, with_state
 from crossgrad_core.contract.contexts import ScaleContext, Scaled
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.scene import Scene
@@ -63,5 +64,6 @@ class Resolution(Component):
     @hookimpl
     def crossgrad_choose_scales(self, context: ScaleContext) -> Scaled:
         """Answers with this resolution's scales."""
-        scales, state = self.scales(context, context.state(STATE))
-        return Scaled(scales, states={STATE: state})
+        answer = self.scales(context, context.state(STATE))
+        scales, state = with_state(answer, Sequence, self, "scales")
+        return Scaled(tuple(scales), states={STATE: state})

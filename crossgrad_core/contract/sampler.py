@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from typing import ClassVar
 
-from crossgrad_core.contract.component import Component, ViewCounts
+from crossgrad_core.contract.component import Component, ViewCounts, with_state
 from crossgrad_core.contract.contexts import Draw, SampleContext, Sampled
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.state import PluginState
@@ -57,5 +57,6 @@ class Sampler(Component):
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
         """Answers the seam with this sampler's draw."""
-        draw, state = self.sample(context, context.state(STATE))
+        answer = self.sample(context, context.state(STATE))
+        draw, state = with_state(answer, Draw, self, "sample")
         return Sampled(draw, states={STATE: state})

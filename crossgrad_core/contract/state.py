@@ -4,10 +4,25 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import torch
 from torch import Tensor
+
+#: Names of states that belong to slots or to the core itself: no other plugin may use them.
+TAKEN: Final = frozenset(
+    {
+        "average",
+        "budget",
+        "densifier",
+        "grouping",
+        "operator",
+        "photos",
+        "resolution",
+        "sampler",
+        "thinned",
+    }
+)
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 

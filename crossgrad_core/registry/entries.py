@@ -6,12 +6,12 @@ the wrong kind are errors that name the plugin and its distribution.
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
 from inspect import isabstract
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
     #: The base class of a slot.
     C = TypeVar("C", bound=Component)
+
+
+#: The distribution whose own plugins these are.
+OURS: Final = "crossgrad"
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,11 @@ class Entry:
     def package(self) -> str:
         """The import package or module that holds its class."""
         return self.value.partition(":")[0].partition(".")[0].strip()
+
+    @property
+    def file(self) -> str | None:
+        """The source file of its module, once that is imported."""
+        return getattr(sys.modules.get(self.value.partition(":")[0].strip()), "__file__", None)
 
     @property
     def origin(self) -> str:
@@ -86,12 +95,16 @@ def find(slot: str, name: str) -> Entry:
     if not found:
         raise _unknown(slot, name)
     if len(found) > 1:
+        others = [entry.distribution for entry in found if entry.distribution != OURS]
+        ours = len(others) < len(found)
         raise UserError(
             f"{len(found)} installed packages offer a {singular(slot)} named {name!r}",
             where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in found),
-            todo="uninstall all but one of them",
+            todo=f"rename it in {listed(others)}, or uninstall that: the name is crossgrad's own"
+            if ours
+            else "uninstall all but one of them",
         )
     return found[0]
 
@@ -145,15 +158,33 @@ def resolve_entry(entry: Entry) -> object:
 
 def failed_plugin(error: Exception) -> UserError | None:
     """What to say of an exception that came out of another package's code; None of our own."""
-    for entry in (entry for slot in OFFERED for entry in offers(slot)):
-        if entry.distribution != "crossgrad" and (place := raised_at(error, entry.package)):
-            return UserError(
-                f"a plugin of {entry.distribution} {entry.version} failed",
-                where=place,
-                found=in_one_line(error),
-                todo=f"repair or uninstall {entry.distribution}, or choose other components",
-            )
-    return None
+    others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
+    found = [(entry, place) for entry in others if (place := raised_at(error, entry.package))]
+    if not found:
+        return None
+    # Of two distributions that share a package, the one whose module it is.
+    entry, place = next((one for one in found if one[1].startswith(f"{one[0].file}:")), found[0])
+    return UserError(
+        f"a plugin of {entry.distribution} {entry.version} failed",
+        where=place,
+        found=in_one_line(error),
+        todo=f"repair or uninstall {entry.distribution}, or choose other components",
+    )
+
+
+def from_elsewhere(names: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """A note on each distribution but crossgrad's own that components come from.
+
+    Args:
+        names: Slot -> names of components.
+    """
+    chosen = (entries(slot).get(name) for slot, several in names.items() for name in several)
+    by_origin: dict[str, list[str]] = {}
+    for entry in chosen:
+        if entry is not None and entry.distribution != OURS:
+            origin = f"{entry.distribution} {entry.version}"
+            by_origin.setdefault(origin, []).append(f"{singular(entry.slot)} {entry.name}")
+    return tuple(f"from {origin}: {listed(each)}" for origin, each in sorted(by_origin.items()))
 
 
 @overload

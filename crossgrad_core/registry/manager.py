@@ -7,12 +7,19 @@ plugin that answers first. All three are errors here, with the plugin's name.
 import inspect
 from collections.abc import Mapping
 from types import FunctionType, MemberDescriptorType, MethodType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import pluggy
+from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.contexts import Answer, Densified, Sampled, StepContext
+from crossgrad_core.contract.contexts import (
+    Answer,
+    Densified,
+    Regularized,
+    Sampled,
+    StepContext,
+)
 from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.marks import PROJECT
 from crossgrad_core.contract.topology import Edit
@@ -95,6 +102,30 @@ def call_seam(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) ->
     )
 
 
+def call_question(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
+    """The answers to a question, checked.
+
+    Args:
+        hook: One that all answer who have it, such as `manager.hook.crossgrad_after_step`.
+        context: What the plugins are offered.
+        answer: Type of the answers.
+
+    Raises:
+        UserError: An answer is of another type.
+    """
+    results: list[object] = hook(context=context)
+    for result in results:
+        if not isinstance(result, answer) or not _complete(result):
+            raise UserError(
+                f"a plugin answers {hook.name} with something else",
+                where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
+                expected=f"a value of type {answer.__name__}, or None",
+                found=repr(result),
+                todo="repair the plugin (docs/hooks.md), or leave it out",
+            )
+    return cast("list[A]", results)
+
+
 def _complete(answer: Answer) -> bool:
     """Whether an answer's own part is of its type: a None inside must not go unnoticed either."""
     match answer:
@@ -102,6 +133,8 @@ def _complete(answer: Answer) -> bool:
             return bool(answer.draw)
         case Densified():
             return isinstance(answer.edit, Edit)
+        case Regularized():
+            return isinstance(answer.loss, Tensor) and answer.loss.numel() == 1
         case _:
             return True
 

@@ -11,10 +11,10 @@ import torch
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.adam_state import MOST_VIEWS
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.component import Component, answered
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.exposure import Exposure
+from crossgrad_core.contract.exposure import Exposure, Fitted
 from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
@@ -38,7 +38,7 @@ from crossgrad_core.defaults import (
     START_ALONE,
 )
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.registry.entries import build, entries, find, load
+from crossgrad_core.registry.entries import build, entries, find, from_elsewhere, load
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.idle import idle_note
@@ -55,7 +55,7 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on as at_the_end
-from crossgrad_core.wording import in_one_line, listed, singular
+from crossgrad_core.wording import in_one_line, listed, plural, singular
 
 _LOG = logging.getLogger(__name__)
 #: The base class of a slot.
@@ -205,7 +205,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     )
     # The length of a run within a budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()
+    named = {plural(word): [name] for word, name in selection.names.items()}
     added = (
+        *from_elsewhere({**named, "metrics": [*selection.metrics], "observers": [*observers]}),
         *_linear_note(setup),
         *idle_note(setup),
         *at_the_end(config),
@@ -274,7 +276,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     sampler = _built(Sampler, config.sampler)
     operator, operator_name = operator_of(config)
     backbone = _built(Backbone, config.backbone)
-    backbone, left_out = backbone.fitted_to(scene)
+    backbone, left_out = answered(backbone.fitted_to(scene), tuple, backbone, "fitted_to")
     notes += left_out
     densifier_choice = _or_default(config.densifier, backbone.default_densifier)
     densifier = _built(Densifier, densifier_choice)
@@ -290,7 +292,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
-    fitted = _built(Exposure, config.exposure).fitted_to(scene)
+    exposure = _built(Exposure, config.exposure)
+    fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
     notes += fitted.notes
     names = {
         "backbone": config.backbone.name,

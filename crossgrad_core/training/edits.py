@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from crossgrad_core.contract.state import PluginState
@@ -11,6 +12,7 @@ from crossgrad_core.contract.topology import (
     apply_to_parameters,
     gather_indices,
 )
+from crossgrad_core.errors import UserError
 from crossgrad_core.training.order import in_order
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -23,11 +25,20 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
 
     Returns:
         Whether the set of primitives changed.
+
+    Raises:
+        UserError: The edit does not fit the parameters.
     """
     if edit.is_empty:
         return False
-    if unknown := edit.values.keys() - state.tensors.keys():
-        raise ValueError(f"an edit gives values of tensors that there are not: {sorted(unknown)}")
+    if misfit := _misfit(setup, state, edit):
+        raise UserError(
+            "a plugin's edit does not fit the primitives",
+            where=f"step {state.step}, densifier {setup.selection.names['densifier']} or a plugin "
+            "that acts after steps",
+            found=misfit,
+            todo="repair the plugin; `crossgrad plugins check` looks at its edits",
+        )
     _apply(setup, state, edit)
     if edit.source is None:
         return False
@@ -69,6 +80,34 @@ def put_in_order(setup: Setup, state: TrainState) -> None:
     rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
     if rows is not None:
         _apply(setup, state, Edit(source=rows))
+
+
+def _misfit(setup: Setup, state: TrainState, edit: Edit) -> str | None:
+    """What of an edit does not fit, in words; None where all does."""
+    before, source = state.primitives(setup), edit.source
+    after = before if source is None else len(source)
+    if source is not None:
+        if source.dtype != torch.int64 or source.ndim != 1:
+            return f"source is {list(source.shape)} of {source.dtype}, not [M] int64"
+        if after and not 0 <= int(source.min()) <= int(source.max()) < before:
+            return f"source leaves 0 to {before - 1}"
+    if edit.fresh is not None and edit.fresh.shape != (after,):
+        return f"fresh is {list(edit.fresh.shape)}, not {[after]}"
+    rows = {name for block in setup.blocks if block.per_primitive for name in block.tensors}
+    for name, new in edit.values.items():
+        if name not in rows:
+            return f"there is no tensor {name!r} with a row for each primitive"
+        count = after if new.rows is None else len(new.rows)
+        shape = (count, *state.tensors[name].shape[1:])
+        if not _fits(new.values, shape):
+            return f"the values of {name} are {list(new.values.shape)}, not {list(shape)}"
+    return None
+
+
+def _fits(values: Tensor, shape: tuple[int, ...]) -> bool:
+    """Whether values can be written to a tensor of a shape."""
+    pairs = zip(reversed(values.shape), reversed(shape), strict=False)
+    return values.ndim <= len(shape) and all(own in (1, size) for own, size in pairs)
 
 
 def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:

@@ -11,11 +11,13 @@ from typing_extensions import override
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.state import TAKEN, PluginState
+from crossgrad_core.errors import UserError
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.clock import Clock, Laps
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import listed
 
 
 @dataclass
@@ -104,7 +106,33 @@ class TrainState:
         return primitives_of(setup.blocks, self.tensors)
 
     def commit(self, states: Mapping[str, PluginState]) -> None:
-        """Takes over the plugin states that a seam answered with."""
+        """Takes over states of the core."""
+        self.states.update(states)
+
+    def accept(self, states: Mapping[str, PluginState], own: str = "") -> None:
+        """Takes over the states that plugins answered a hook with.
+
+        Args:
+            states: Name -> state.
+            own: The name in `TAKEN` that belongs to the slot which answers, if one does.
+
+        Raises:
+            UserError: A name belongs to a slot or to the core, or a state is none.
+        """
+        for name, held in states.items():
+            if name in TAKEN and name != own:
+                raise UserError(
+                    f"a plugin answers with a state called {name!r}, which belongs to crossgrad",
+                    expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
+                    todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
+                )
+            if not isinstance(held, PluginState):
+                raise UserError(
+                    f"a plugin answers with something else for its state {name!r}",
+                    expected="a PluginState",
+                    found=type(held).__name__,
+                    todo="repair the plugin (docs/hooks.md)",
+                )
         self.states.update(states)
 
 

@@ -21,7 +21,7 @@ from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.by_rows import dense, tidy
 from crossgrad_core.gradients.finite import is_finite
-from crossgrad_core.registry.manager import call_seam
+from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.density_views import observed_views
@@ -105,7 +105,7 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
 def _sample(setup: Setup, state: TrainState) -> Draw:
     context = sample_context(setup, state, state.step)
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
-    state.commit(answer.states)
+    state.accept(answer.states, "sampler")
     counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
     views = answer.draw.views
     known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
@@ -138,7 +138,7 @@ def _aggregate_context(
 
 def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Aggregated:
     answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
-    state.commit(answer.states)
+    state.accept(answer.states, "operator")
     state.counters.dropped += answer.counts.get("dropped", 0)
     return answer
 
@@ -203,7 +203,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         render=OnRequest(setup, state, counted=True),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
-    state.commit(answer.states)
+    state.accept(answer.states, "densifier")
     edited = apply_edit(setup, state, answer.edit)
     if edited or answer.edit.values:
         restart(state)
@@ -221,8 +221,8 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
         means_lr=means_rate_at(setup, state.step),
         edited=edited,
     )
-    for answer in setup.hook.crossgrad_after_step(context=context):
-        state.commit(answer.states)
+    for answer in call_question(setup.hook.crossgrad_after_step, context, Densified):
+        state.accept(answer.states)
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):
             restart(state)

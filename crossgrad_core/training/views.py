@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from pluggy import HookCaller
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.component import answered
 from crossgrad_core.contract.contexts import (
     Draw,
     PixelContext,
     RegularizeContext,
+    Regularized,
     ScaleContext,
     Scaled,
     ViewRecord,
@@ -29,7 +32,7 @@ from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
-from crossgrad_core.registry.manager import call_seam
+from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.operator_scale import Scale
@@ -37,6 +40,7 @@ from crossgrad_core.training.photo_parameters import Leaves, leaves_of
 from crossgrad_core.training.scaled_photos import Pair, on_device
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
 
 #: Tensor name -> gradient or None.
 TensorGradients = dict[str, Tensor | None]
@@ -83,7 +87,7 @@ def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
     """The scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
     answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
-    state.commit(answer.states)
+    state.accept(answer.states, "resolution")
     scales = answer.scales
     if len(scales) == len(draw.views) and all(0.0 < scale <= 1.0 for scale in scales):
         return scales
@@ -285,7 +289,8 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
     """What a view sees; rows of some tensors are brought up to date when they are drawn."""
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
-    gaussians = setup.backbone.decode(tensors, camera, phase)
+    answer = setup.backbone.decode(tensors, camera, phase)
+    gaussians = answered(answer, Gaussians, setup.backbone, "decode")
     names = {f: n for f, n in setup.by_rows.items() if getattr(gaussians, f) is tensors[n]}
     if names.keys() != {f for f in setup.by_rows if getattr(gaussians, f) is not None}:
         # It is not handed over as it is after all, and was read too early.
@@ -363,22 +368,28 @@ def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> T
         target=target.photo,
         mask=target.mask,
     )
-    factors = setup.hook.crossgrad_pixel_weights(context=context)
-    return _checked(reduce(torch.mul, factors), context) if factors else None
+    hook = setup.hook.crossgrad_pixel_weights
+    factors: list[object] = hook(context=context)
+    fitting = [_fitting(each, context, hook) for each in factors]
+    return reduce(torch.mul, fitting) if fitting else None
 
 
-def _checked(weights: Tensor, context: PixelContext) -> Tensor:
+def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor:
     """Pixel weights, if a loss can use them; of a GPU, which would be waited for, their shape."""
     shape = context.target.shape[:2]
-    fits = weights.shape == shape and weights.is_floating_point()
-    if fits and (not weights.is_cpu or bool(((weights >= 0) & (weights < inf)).all())):
-        return weights
-    least = f", the least {float(weights.min()):g}" if fits else ""
+    found, least = type(weights).__name__, ""
+    if isinstance(weights, Tensor):
+        found = f"{list(weights.shape)} of {weights.dtype}"
+        if weights.shape == shape and weights.is_floating_point():
+            if not weights.is_cpu or bool(((weights >= 0) & (weights < inf)).all()):
+                return weights
+            least = f", the least {float(weights.min()):g}"
+    who = listed(each.plugin_name for each in hook.get_hookimpls())
     raise UserError(
         "a plugin weighs pixels in a way that no loss can use",
-        where=f"hook crossgrad_pixel_weights, photo {context.view.name}",
+        where=f"hook crossgrad_pixel_weights of {who}, photo {context.view.name}",
         expected=f"finite numbers of 0 or more, floating point, {list(shape)}",
-        found=f"{list(weights.shape)} of {weights.dtype}{least}",
+        found=f"{found}{least}",
         todo="repair the plugin, or run without it",
     )
 
@@ -455,8 +466,8 @@ def add_regularization(
         gaussians=gaussians,
         view=view,
     )
-    for answer in setup.hook.crossgrad_regularize(context=context):
-        state.commit(answer.states)
+    for answer in call_question(setup.hook.crossgrad_regularize, context, Regularized):
+        state.accept(answer.states)
         _add(into, _gradients_of(answer.loss, state.tensors, keep=gaussians is not None))
 
 

@@ -316,14 +316,15 @@ class WeighingBy:
         (lambda ones: ones / 0.0, "the least inf"),
         (lambda ones: ones[:-1], "torch.float32"),
         (lambda ones: ones.int(), "torch.int32"),
+        (lambda ones: ones.numpy(), "ndarray"),
     ],
-    ids=["negative", "NaN", "infinite", "a row short", "whole numbers"],
+    ids=["negative", "NaN", "infinite", "a row short", "whole numbers", "an array of NumPy"],
 )
 def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
     with pytest.raises(UserError, match="a plugin weighs pixels") as refused:
         trained(1, WeighingBy(change))
     assert found in refused.value.found
-    assert refused.value.where.startswith("hook crossgrad_pixel_weights, photo ")
+    assert refused.value.where.startswith("hook crossgrad_pixel_weights of watch0, photo ")
 
 
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])

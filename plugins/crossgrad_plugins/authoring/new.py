@@ -29,7 +29,7 @@ name = "{name}"
 version = "0.1.0"
 description = "A {word} for crossgrad"
 requires-python = ">=3.11"
-dependencies = ["crossgrad>={version}"]
+dependencies = ["crossgrad>={version},<{next}"]
 
 [project.optional-dependencies]
 test = ["pytest"]
@@ -90,6 +90,7 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     kind = "".join(part.capitalize() for part in name.split("-"))
     member = module if slot == COMMANDS else kind
     source = (_TEMPLATES / f"{slot}.py").read_text(encoding="utf-8")
+    major, minor = VERSION.split(".")[:2]
     words = {
         "name": name,
         "module": module,
@@ -98,7 +99,8 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
         "word": singular(slot),
         "group": OFFERED[slot],
         "checks": f"{singular(slot).upper()}_CHECKS",
-        "version": ".".join(VERSION.split(".")[:2]),
+        "version": f"{major}.{minor}",
+        "next": f"{major}.{int(minor) + 1}",
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),

@@ -10,7 +10,15 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Response, Screen
+from crossgrad_core.plugin import (
+    Camera,
+    Gaussians,
+    Rasterizer,
+    Render,
+    Response,
+    Screen,
+    UserError,
+)
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
@@ -58,6 +66,7 @@ class NumbaRasterizer(Rasterizer):
             pixels="pixels" in outputs,
         )
         screen = Screen(radii=torch.empty(0, dtype=torch.int32))
+        _require_fitting(gaussians)
         call = _Call(_arrays(gaussians), camera, background, options, screen, outputs)
         tensors = [getattr(gaussians, name) for name in _INPUTS]
         image, alpha, depth = _Draw.apply(call, *tensors)  # type: ignore[no-untyped-call]
@@ -85,6 +94,18 @@ class _Call:
         self.directions = "directions" in outputs
         self.counts = "count" in outputs
         self.frame: Frame | None = None
+
+
+def _require_fitting(gaussians: Gaussians) -> None:
+    """Raises for tensors that do not fit each other: kernels read them without looking."""
+    if misfit := gaussians.misfit():
+        raise UserError(
+            "these Gaussians cannot be drawn",
+            where="what the backbone decodes",
+            expected="tensors with a row for each Gaussian (crossgrad_core.plugin.Gaussians)",
+            found=misfit,
+            todo="repair `decode` of the backbone; `crossgrad plugins check` looks at it",
+        )
 
 
 def _array(tensor: Tensor) -> NDArray[np.float32]:

@@ -126,6 +126,30 @@ def test_a_name_that_two_packages_offer_is_refused_with_both(good, install):
     assert "other-made-up 3.0" in error.found
 
 
+def test_a_name_of_crossgrads_own_is_to_be_changed_by_the_other_package(install):
+    install("made-up", {"samplers": {"random": "elsewhere:Good"}})
+    error = refusal("samplers", "random")
+    assert "rename it in made-up" in error.todo
+
+
+def test_what_comes_from_other_packages_is_said_with_their_versions(good):
+    names = {"groupings": ["good", "radial", "missing"], "samplers": ["random"]}
+    assert registry.from_elsewhere(names) == ("from made-up 1.0: grouping good",)
+    assert registry.from_elsewhere({"groupings": ["radial"]}) == ()
+
+
+def test_of_two_packages_in_one_folder_the_one_whose_module_failed_is_named(install):
+    source = GOOD + "\ndef fail():\n    raise ValueError('no')\n"
+    modules = {"made_up_of_two/a": GOOD, "made_up_of_two/b": source}
+    install("a-made-up", {"groupings": {"a": "made_up_of_two.a:Good"}}, modules)
+    install("b-made-up", {"groupings": {"b": "made_up_of_two.b:Good"}})
+    registry.load("groupings", "b")
+    with pytest.raises(ValueError, match="no") as failed:
+        sys.modules["made_up_of_two.b"].fail()
+    told = registry.failed_plugin(failed.value)
+    assert told is not None and "b-made-up" in told.what
+
+
 def test_of_two_copies_of_a_package_the_one_on_the_path_first_counts(install):
     install("made-up", {"observers": {"copy": "old:A"}}, version="1.0")
     install("made_up", {"observers": {"copy": "new:A"}}, version="1.1")
