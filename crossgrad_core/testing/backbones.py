@@ -9,8 +9,10 @@ from torch import Tensor
 
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.registry import entries as registry
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
@@ -49,6 +51,15 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
             require(found == rows, f"{name} has {found} rows for {rows} primitives")
 
 
+def the_default_densifier_is_there(make: Make[Backbone]) -> None:
+    """`default_densifier` names an installed densifier that finds its tensors in the blocks."""
+    backbone = make()
+    usual = registry.load(Densifier, backbone.default_densifier)
+    lacks = usual.tensors - {name for block in backbone.blocks() for name in block.tensors}
+    what = f"default_densifier: {backbone.default_densifier}"
+    require(not lacks, f"{what} needs the tensors {listed(sorted(lacks))}, which no block holds")
+
+
 def created_from_the_scene(make: Make[Backbone]) -> None:
     """Parameters are finite float32 leaves on the CPU, the same for the same seed."""
     with global_randomness_untouched():
@@ -73,12 +84,24 @@ def decoding_has_the_shape(make: Make[Backbone]) -> None:
 
 
 def _require_valid(gaussians: Gaussians, primitives: int) -> None:
-    number = len(gaussians)
-    shapes = {"means": (number, 3), "quats": (number, 4), "scales": (number, 3)}
-    for name, shape in {**shapes, "opacities": (number,)}.items():
-        tensor: Tensor = getattr(gaussians, name)
-        require(tuple(tensor.shape) == shape, f"{name} has the shape {list(tensor.shape)}")
-        require(tensor.isfinite().all(), f"{name} is not finite")
+    number, kind = len(gaussians), gaussians.means.dtype
+    require(kind.is_floating_point, f"means are {kind}, not of a floating type")
+    rest, degree = gaussians.sh_rest, gaussians.sh_degree
+    bands = 1 if rest is None else 1 + rest.shape[1]
+    known = bands in {4, 9, 16} or rest is None
+    told = f"sh_degree {degree} does not go with {bands} coefficients (1, 4, 9 or 16)"
+    require(known and degree >= 0 and (degree + 1) ** 2 <= bands, told)
+    shapes: dict[str, tuple[int, ...]] = {"means": (number, 3), "quats": (number, 4)}
+    shapes |= {"scales": (number, 3), "opacities": (number,), "colors": (number, 3)}
+    shapes |= {"sh_dc": (number, 1, 3), "sh_rest": (number, bands - 1, 3)}
+    shapes |= {"origin": (number,), "slot": (number,), "decoded": (primitives,)}
+    kinds = {"origin": torch.int64, "slot": torch.int64, "decoded": torch.bool}
+    for name, shape in shapes.items():
+        tensor: Tensor | None = getattr(gaussians, name)
+        if tensor is not None:
+            found, wanted = (tensor.dtype, tuple(tensor.shape)), (kinds.get(name, kind), shape)
+            require(found == wanted, f"{name} is {found}; expected {wanted}")
+            require(tensor.isfinite().all(), f"{name} is not finite")
     require((gaussians.scales > 0.0).all(), "a scale is not positive")
     inside = (gaussians.opacities >= 0.0).all() and (gaussians.opacities <= 1.0).all()
     require(inside, "an opacity is outside [0, 1]")
@@ -88,10 +111,18 @@ def _require_valid(gaussians: Gaussians, primitives: int) -> None:
     if origin is None:
         require(number == primitives, f"{number} Gaussians of {primitives} primitives, no origin")
     else:
-        good = origin.dtype == torch.int64 and tuple(origin.shape) == (number,)
-        require(good, "origin is not [N] int64")
         within = number == 0 or (int(origin.min()) >= 0 and int(origin.max()) < primitives)
         require(within, f"origin leaves 0 .. {primitives - 1}")
+
+
+def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
+    """`positions` is empty or names a tensor [N, 3] that has a row for each primitive."""
+    backbone = make()
+    parameters = created(backbone)
+    held = [name for block in backbone.blocks() if block.per_primitive for name in block.tensors]
+    fitting = [name for name in held if parameters[name].shape[1:] == (3,)]
+    known = f"positions is {backbone.positions!r}; tensors [N, 3] of primitives: {listed(fitting)}"
+    require(backbone.positions in {"", *fitting}, known)
 
 
 def gradients_reach_every_block(make: Make[Backbone]) -> None:
@@ -122,16 +153,18 @@ def _weighted(gaussians: Gaussians) -> Tensor:
 
 
 def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
-    """Parameters that were written and read decode to the same bits."""
+    """Parameters that were written and read decode to the same bits, and nothing is random."""
     backbone = make()
     parameters = created(backbone)
     written = save({name: tensor.detach().contiguous() for name, tensor in parameters.items()})
-    phase = sample_phase(training=False)
-    one = backbone.decode(parameters, sample_camera(), phase)
-    other = make().decode(load(written), sample_camera(), phase)
-    for name in ("means", "quats", "scales", "opacities"):
-        same = torch.equal(getattr(one, name), getattr(other, name))
-        require(same, f"{name} differs after a checkpoint; keep everything in the parameters")
+    for training in (True, False):
+        phase = sample_phase(training=training)
+        with global_randomness_untouched():
+            one = backbone.decode(parameters, sample_camera(), phase)
+            other = make().decode(load(written), sample_camera(), phase)
+        for name in (name for name, value in vars(one).items() if isinstance(value, Tensor)):
+            same = torch.equal(getattr(one, name), getattr(other, name))
+            require(same, f"{name} differs after a checkpoint; keep everything in the parameters")
 
 
 def edits_keep_rows_together(make: Make[Backbone]) -> None:
@@ -221,8 +254,10 @@ def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
 BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     *COMPONENT_CHECKS,
     blocks_cover_the_parameters,
+    the_default_densifier_is_there,
     created_from_the_scene,
     decoding_has_the_shape,
+    positions_are_those_of_primitives,
     gradients_reach_every_block,
     checkpoints_give_the_same_gaussians,
     edits_keep_rows_together,

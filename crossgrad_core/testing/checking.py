@@ -44,23 +44,34 @@ def checks_of(slot: str) -> tuple[AnyCheck, ...]:
 
 def check_entry(entry: registry.Entry) -> list[Result]:
     """Loads a plugin and runs every check of its slot; stops early where it cannot be loaded."""
+    taken = _taken(entry)
+    names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
         where = raised_at(error, entry.package) or _announced_at(entry)
-        return [Result("it can be loaded", failure=f"{error.found or error.what}", where=where)]
+        lost = Result("it can be loaded", failure=f"{error.found or error.what}", where=where)
+        return [*names, lost]
     if entry.slot == COMMANDS:
         where, package = _announced_at(entry), entry.package
-        if entry.name in OWN_COMMANDS:
-            taken = f"the core has a command {entry.name}, which is called instead"
-            return [Result("its name is free", failure=taken, where=entry.origin)]
     else:
         where, package = defined_at(loaded), loaded.__module__.partition(".")[0]
         try:
             loaded()
-        except Exception as error:
-            return [_failed("it can be made with default options", error, package, where)]
-    return [_result(check, loaded, package, where) for check in checks_of(entry.slot)]
+        except (Exception, SystemExit) as error:
+            return [*names, _failed("it can be made with default options", error, package, where)]
+    return [*names, *(_result(check, loaded, package, where) for check in checks_of(entry.slot))]
+
+
+def _taken(entry: registry.Entry) -> str:
+    """Why users cannot choose the plugin by its name; empty where they can."""
+    if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
+        return f"the core has a command {entry.name}, which is called instead"
+    try:
+        registry.find(entry.slot, entry.name)
+    except UserError as error:
+        return f"{error.what}: {error.found}"
+    return ""
 
 
 def _announced_at(entry: registry.Entry) -> str:
@@ -73,7 +84,7 @@ def _announced_at(entry: registry.Entry) -> str:
     return own or getattr(loaded, "__file__", None) or entry.origin
 
 
-def _failed(check: str, error: Exception, package: str, where: str) -> Result:
+def _failed(check: str, error: BaseException, package: str, where: str) -> Result:
     """A failure at the innermost line of the package, or else at `where`."""
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
@@ -87,6 +98,6 @@ def _result(check: AnyCheck, subject: object, package: str, where: str) -> Resul
         check(subject)
     except SkipTest as reason:
         return Result(name, skipped=str(reason))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return _failed(name, error, package, where)
     return Result(name)

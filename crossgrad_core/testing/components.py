@@ -6,7 +6,7 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.testing.contract import Check, ContractError, Make, require
-from crossgrad_core.wording import in_one_line, listed
+from crossgrad_core.wording import in_one_line, listed, sentences
 
 
 def options_are_frozen(make: Make[Component]) -> None:
@@ -51,12 +51,18 @@ def options_are_described(make: Make[Component]) -> None:
     )
 
 
+def options_can_be_set(make: Make[Component]) -> None:
+    """No option is called `name`: that key chooses the component."""
+    clear = "name" not in type(make()).model_fields
+    require(clear, "the option `name` cannot be set, as that key chooses the component: rename it")
+
+
 def hooks_exist(make: Make[Component]) -> None:
     """Every hook that it implements exists, is marked and takes the hook's arguments."""
     try:
         make_manager({"component": make()})
     except UserError as error:
-        raise ContractError(f"{error.what}: {error.todo or error.found}") from error
+        raise ContractError(f"{error.what}: {sentences(error.found, error.todo)}") from error
 
 
 COMPONENT_CHECKS: tuple[Check[Component], ...] = (
@@ -64,5 +70,6 @@ COMPONENT_CHECKS: tuple[Check[Component], ...] = (
     unknown_options_are_refused,
     options_survive_the_configuration_file,
     options_are_described,
+    options_can_be_set,
     hooks_exist,
 )

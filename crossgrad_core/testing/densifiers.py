@@ -1,6 +1,5 @@
 """Contract checks of densifiers, on a real backbone with made-up screen statistics."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.blocks import Block, Parameters, primitives_of
 from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
@@ -16,7 +15,6 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
-from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
@@ -32,6 +30,7 @@ from crossgrad_core.testing.contract import (
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
 from crossgrad_core.testing.records import view_record
 from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.wording import listed
 
 #: Steps of the published schedule around its second and third edit, at 600 and 700.
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
@@ -119,9 +118,8 @@ class DensifierRun:
             )
 
     def _apply(self, edit: Edit) -> None:
-        _require_good(edit, self.primitives, self.parameters)
-        before = self.primitives
-        blocks = self.backbone.blocks()
+        blocks, before = self.backbone.blocks(), self.primitives
+        require_good(edit, blocks, self.parameters)
         self.parameters = apply_to_parameters(edit, blocks, self.parameters)
         if edit.source is not None:
             source, fresh = gather_indices(edit, before, edit.source.device)
@@ -162,10 +160,17 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """An installed backbone that takes this densifier by default, or has the tensors it edits."""
     fitting = []
-    for backbone in _backbones():
-        have = {tensor for block in backbone.blocks() for tensor in block.tensors}
-        if densifier.tensors <= have:
+    # Of backbones that fit equally well the first is taken: crossgrad's own.
+    known = sorted(entries("backbones").values(), key=lambda each: each.distribution != "crossgrad")
+    for entry in sorted(known, key=lambda each: each.name != BACKBONE):
+        try:
+            backbone = build(Backbone, entry.name, {})
+            have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             usual = load("densifiers", backbone.default_densifier)
+        except (Exception, SystemExit):
+            # A broken backbone of another package is not this densifier's fault.
+            continue
+        if densifier.tensors <= have:
             fitting.append((type(densifier) is not usual, backbone))
     if not fitting:
         wanted = ", ".join(sorted(densifier.tensors))
@@ -173,16 +178,11 @@ def _backbone_for(densifier: Densifier) -> Backbone:
     return min(fitting, key=lambda each: each[0])[1]
 
 
-def _backbones() -> Iterator[Backbone]:
-    for name in sorted(entries("backbones"), key=lambda each: (each != BACKBONE, each)):
-        try:
-            yield build(Backbone, name, {})
-        except UserError:
-            # A broken backbone of another package is not this densifier's fault.
-            continue
-
-
-def _require_good(edit: Edit, primitives: int, parameters: Parameters) -> None:
+def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
+    """Requires of an edit that it can be applied: indices in range, finite values that fit."""
+    primitives = primitives_of(blocks, parameters)
+    arrays = [name for name in ("source", "fresh") if isinstance(getattr(edit, name), np.ndarray)]
+    require(not arrays, f"edit.{' and edit.'.join(arrays)} is a NumPy array, not a tensor")
     source, fresh = gather_indices(edit, primitives, torch.device("cpu"))
     rows = source.shape[0]
     require(source.dtype == torch.int64, f"edit.source is {source.dtype}, not int64")
@@ -192,15 +192,23 @@ def _require_good(edit: Edit, primitives: int, parameters: Parameters) -> None:
         fresh.dtype == torch.bool and fresh.shape[0] == rows,
         f"edit.fresh is {fresh.dtype} {list(fresh.shape)}, expected bool [{rows}]",
     )
+    editable = {name for block in blocks if block.per_primitive for name in block.tensors}
     for name, overwrite in edit.values.items():
-        require(name in parameters, f"edit.values names {name}, which is no parameter")
-        wanted = rows if overwrite.rows is None else overwrite.rows.shape[0]
-        found = overwrite.values.shape[0]
-        require(found == wanted, f"edit.values has {found} values for {wanted} rows of {name}")
-        indices = overwrite.rows
-        good = indices is None or indices.numel() == 0 or int(indices.max()) < rows
-        require(good, f"edit.values overwrites rows of {name} beyond the last one, {rows - 1}")
-        require(overwrite.values.isfinite().all(), f"edit.values of {name} is not finite")
+        require(name in editable, f"edit.values names {name}, which is no tensor of primitives")
+        values, indices = overwrite.values, overwrite.rows
+        wanted = [rows if indices is None else indices.shape[0], *parameters[name].shape[1:]]
+        found = list(values.shape)
+        require(found == wanted, f"edit.values of {name} has the shape {found}, expected {wanted}")
+        good = indices is None or ((indices >= 0) & (indices < rows)).all()
+        require(good, f"edit.values overwrites rows of {name} outside 0 .. {rows - 1}")
+        require(values.isfinite().all(), f"edit.values of {name} is not finite")
+
+
+def its_needs_are_statistics(make: Make[Densifier]) -> None:
+    """`needs` names optional outputs that rasterizers may have; another one refuses every run."""
+    known = ("depth", "pixels", "abs_gradient", "directions", "count")
+    more = sorted(make().needs.difference(known))
+    require(not more, f"needs names {listed(more)}; rasterizers may provide {listed(known)}")
 
 
 def quiet_before_its_time(make: Make[Densifier]) -> None:
@@ -284,6 +292,7 @@ def inputs_stay_untouched(make: Make[Densifier]) -> None:
 
 DENSIFIER_CHECKS: tuple[Check[Densifier], ...] = (
     *COMPONENT_CHECKS,
+    its_needs_are_statistics,
     quiet_before_its_time,
     edits_keep_everything_aligned,
     never_outgrows_the_room,

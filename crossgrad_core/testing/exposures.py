@@ -5,13 +5,26 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.exposure import Exposure
+from crossgrad_core.contract.exposure import Exposure, Fitted
+from crossgrad_core.registry.entries import load
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import sample_scene
 
 #: How far a second projection may move what was projected already.
 _ROUNDING = 1e-5
+
+
+def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
+    """`fitted_to` answers with a `Fitted`: an exposure, the name of another one, and notes."""
+    exposure = make()
+    fitted = exposure.fitted_to(sample_scene())
+    require(isinstance(fitted, Fitted), f"fitted_to() answers {fitted!r}, not a Fitted")
+    told = isinstance(fitted.notes, tuple) and all(isinstance(note, str) for note in fitted.notes)
+    require(told, f"the notes of fitted_to() are {fitted.notes!r}, not a tuple of sentences")
+    kind = type(exposure) if fitted.name is None else load(Exposure, fitted.name)
+    right = type(fitted.exposure) is kind
+    require(right, f"fitted_to() gives {fitted.exposure!r} under the name {fitted.name!r}")
 
 
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
@@ -110,6 +123,7 @@ def _noise(like: Tensor) -> Tensor:
 
 EXPOSURE_CHECKS: tuple[Check[Exposure], ...] = (
     *COMPONENT_CHECKS,
+    fitting_gives_an_installed_one,
     every_photo_has_a_start,
     an_image_stays_an_image,
     gradients_reach_render_and_values,

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.metric import Compared, Metric
+from crossgrad_core.registry.entries import load, offers
+from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, require
 from crossgrad_core.testing.fixtures import sample_scene
@@ -22,6 +24,15 @@ def names_its_figure(make: Make[Metric]) -> None:
     require(format(0.5, make().figure.form), f"the form {make().figure.form!r} shows nothing")
     told = make().described().name
     require(told == name, f"described() calls the figure {told!r}, figure calls it {name!r}")
+
+
+def its_columns_are_its_own(make: Make[Metric]) -> None:
+    """No column that crossgrad writes, for another of its metrics or for itself, has its name."""
+    metric = make()
+    ours = [load(Metric, e.name) for e in offers("metrics") if e.distribution == "crossgrad"]
+    others = [each.figure for each in ours if each is not type(metric)]
+    free = metric.figure.name not in {"name", "regime", *columns_for((), others)}
+    require(free, f"crossgrad writes a column {metric.figure.name!r} already: rename the figure")
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
@@ -75,6 +86,7 @@ def _render() -> Tensor:
 METRIC_CHECKS: tuple[Check[Metric], ...] = (
     *COMPONENT_CHECKS,
     names_its_figure,
+    its_columns_are_its_own,
     measures_a_finite_number,
     an_empty_mask_is_no_error,
     masked_pixels_do_not_count,

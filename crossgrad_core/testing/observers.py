@@ -8,10 +8,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias, cast
 
 import torch
+from torch import Tensor
 
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.contexts import (
+    AfterStepContext,
     AggregateContext,
     Aggregated,
     Answer,
@@ -20,9 +23,14 @@ from crossgrad_core.contract.contexts import (
     Draw,
     EvaluationReport,
     Model,
+    PixelContext,
+    RegularizeContext,
+    Regularized,
     RunInfo,
     SampleContext,
     Sampled,
+    ScaleContext,
+    Scaled,
     StepRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
@@ -31,15 +39,23 @@ from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.topology import NO_EDIT
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_core.run.assemble import select
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, require, revived
-from crossgrad_core.testing.densifiers import DensifierRun
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    global_randomness_untouched,
+    require,
+    revived,
+)
+from crossgrad_core.testing.densifiers import DensifierRun, require_good
 from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
 
 #: The hooks of one run's manager; pluggy gives them no types.
@@ -49,11 +65,15 @@ _VIEWS = (0, 4)
 
 
 class _Components:
-    """Stands in for the selected components: a fixed draw, the plain sum, no edit."""
+    """Stands in for the selected components: a fixed draw, full size, the plain sum, no edit."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
         return Sampled(Draw(_VIEWS))
+
+    @hookimpl
+    def crossgrad_choose_scales(self, context: ScaleContext) -> Scaled:
+        return Scaled((1.0,) * len(_VIEWS))
 
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> Aggregated:
@@ -91,8 +111,7 @@ def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
     record = StepRecord(step, _VIEWS, names, None, (0.2, 0.1), 40, counts, 0.01 * step)
     hooks.crossgrad_step_end(record=record)
     for answer in answers:
-        for state in answer.states.values():
-            revived(state)
+        _require_answer(answer, Answer)
 
 
 def survives_every_event(make: Make[Observer]) -> None:
@@ -138,9 +157,11 @@ def seams_stay_answered(make: Make[Observer]) -> None:
     """Around each seam the observer returns an answer of the right kind and shape."""
     with _hooks(make()) as hooks:
         _start(hooks, None)
-        sampled, aggregated, _ = _seams(hooks, 1)
-    draw = cast("Sampled", sampled).draw
+        sampled, scaled, aggregated, _ = _seams(hooks, 1)
+    draw, scales = cast("Sampled", sampled).draw, cast("Scaled", scaled).scales
     require(len(draw.views) == len(_VIEWS), f"{len(_VIEWS)} views became {len(draw.views)}")
+    good = len(scales) == len(_VIEWS) and all(0.0 < scale <= 1.0 for scale in scales)
+    require(good, f"{len(_VIEWS)} views get the scales {scales}; expected one in (0, 1] for each")
     gradients = sample_gradients(len(_VIEWS))[0]
     answered = cast("Aggregated", aggregated).gradients
     require(
@@ -153,6 +174,56 @@ def seams_stay_answered(make: Make[Observer]) -> None:
         require(fits, f"the aggregated gradient of {name} changes its shape")
         finite = gradient is None or gradient.isfinite().all()
         require(finite, f"the aggregated gradient of {name} is not finite")
+
+
+def questions_are_answered_in_kind(make: Make[Observer]) -> None:
+    """Objections, weights, loss terms and edits can be used; parameters change by edits only."""
+    config = RunConfig(scene="sample", device="cpu")
+    selection, _ = select(config, sample_scene(), reader="sample")
+    run = DensifierRun.of(build(Densifier, NO_DENSIFIER, {}))
+    kept = {name: tensor.detach().clone() for name, tensor in run.parameters.items()}
+    with _hooks(make()) as hooks, global_randomness_untouched():
+        for reasons in hooks.crossgrad_objections(selection=selection):
+            good = isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
+            require(good, f"crossgrad_objections answers {reasons!r}, not a list of sentences")
+        _start(hooks, None)
+        for step, scale in ((1, 1.0), (2, 0.5), (600, 1.0)):
+            _require_usable(hooks, run, step, scale)
+    for name, tensor in run.parameters.items():
+        same = torch.equal(tensor.detach(), kept[name])
+        require(same, f"the observer changes the parameters {name} itself; answer with an edit")
+
+
+def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) -> None:
+    shown, fields = run.context(step).render(0, scale), step_fields(step)
+    same = {name: getattr(shown, name) for name in ("view", "camera", "scale", "mask")}
+    pixels = PixelContext(**fields, **same, index=0, target=shown.photo)
+    for weights in hooks.crossgrad_pixel_weights(context=pixels):
+        size = shown.photo.shape[:2]
+        fits = isinstance(weights, Tensor) and weights.is_floating_point() and weights.shape == size
+        good = fits and ((weights >= 0.0) & weights.isfinite()).all()
+        wanted = f"finite numbers of 0 or more, floating point, {list(size)}"
+        require(good, f"crossgrad_pixel_weights answers {weights!r:.60}; expected {wanted}")
+    fields |= {"parameters": run.parameters, "backbone": run.backbone}
+    for gaussians, view in ((shown.gaussians, shown.view), (None, None)):
+        context = RegularizeContext(**fields, gaussians=gaussians, view=view)
+        for answer in hooks.crossgrad_regularize(context=context):
+            _require_answer(answer, Regularized)
+            loss = answer.loss
+            good = isinstance(loss, Tensor) and loss.ndim == 0 and loss.isfinite()
+            require(good, f"the loss of crossgrad_regularize is {loss!r:.60}, no finite scalar")
+    after = AfterStepContext(**fields, means_lr=1e-4, edited=False)
+    for answer in hooks.crossgrad_after_step(context=after):
+        _require_answer(answer, Densified)
+        require(isinstance(answer.edit, Edit), f"the edit is {answer.edit!r}, not an Edit")
+        require_good(answer.edit, run.backbone.blocks(), run.parameters)
+
+
+def _require_answer(answer: Answer, kind: type[Answer]) -> None:
+    require(isinstance(answer, kind), f"a hook answers {answer!r:.60}, not {kind.__name__}")
+    for name, state in answer.states.items():
+        require(isinstance(state, PluginState), f"the state of {name} is {state!r}, no PluginState")
+        revived(state)
 
 
 def _model(step: int) -> Model:
@@ -177,14 +248,16 @@ def _model(step: int) -> Model:
 
 
 def _seams(hooks: Hooks, step: int) -> list[Answer]:
-    """The answers of the three seams of a step, as the training loop asks for them."""
+    """The answers of the seams of a step, as the training loop asks for them."""
     centers = sample_scene().centers
     sample = SampleContext(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=None
     )
     quiet = build(Densifier, NO_DENSIFIER, {})
+    scale = ScaleContext(**step_fields(step), draw=Draw(_VIEWS), last=None)
     return [
         call_seam(hooks.crossgrad_sample_views, sample, Sampled),
+        call_seam(hooks.crossgrad_choose_scales, scale, Scaled),
         call_seam(
             hooks.crossgrad_aggregate_gradients,
             aggregate_context(sample_gradients(len(_VIEWS))),
@@ -200,4 +273,5 @@ OBSERVER_CHECKS: tuple[Check[Observer], ...] = (
     survives_an_early_end,
     the_model_stays_untouched,
     seams_stay_answered,
+    questions_are_answered_in_kind,
 )

@@ -181,12 +181,13 @@ def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatc
     code, out, err = ran("plugins", "check", "bad-package")
     flat = " ".join(out.split())
     assert (code, err) == (1, "")
-    assert "operator halving pass" in flat
+    assert "operator halving FAIL 1 of" in flat
+    assert "its name is free: 2 installed packages offer a" in flat
     assert "operator absolute FAIL" in flat
     assert "scales with the gradients" in flat
     assert "compare lengths with each other" in flat
     assert "it can be loaded: ModuleNotFoundError: No module named 'made_up_lost'" in flat
-    assert "1 of 3 plugins keep the contract" in flat
+    assert "0 of 3 plugins keep the contract" in flat
     places = [line.strip() for line in out.splitlines() if line.startswith("      at ")]
     assert max(len(line) for line in out.splitlines() if line.strip() not in places) <= 80
     file = third_party.parent / "good" / "made_up_cli.py"

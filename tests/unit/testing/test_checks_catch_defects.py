@@ -18,7 +18,10 @@ from crossgrad_core.testing import (
     backbones,
     components,
     densifiers,
+    exporters,
+    exposures,
     groupings,
+    metrics,
     observers,
     operators,
     rasterizers,
@@ -31,6 +34,9 @@ Vanilla = load("backbones", "vanilla")
 Torch = load("rasterizers", "torch")
 Radial = load("groupings", "radial")
 NoDensification = load("densifiers", "none")
+NoExposure = load("exposures", "none")
+Ply = load("exporters", "ply")
+PSNR = load("metrics", "psnr")
 
 
 class Adding(api.GramianOperator):
@@ -317,6 +323,96 @@ class NegativeScales(Vanilla):
         return replace(super().decode(parameters, camera, phase), scales=-parameters["means"].abs())
 
 
+class GreyColors(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        grey = gaussians.sh_dc[:, 0, :1]
+        return replace(gaussians, colors=grey, sh_dc=None, sh_rest=None, sh_degree=0)
+
+
+class FewerColors(GreyColors):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, colors=gaussians.colors.expand(-1, 3)[1:])
+
+
+class FlatBandZero(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, sh_dc=gaussians.sh_dc[:, 0])
+
+
+class TooFewBands(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, sh_rest=gaussians.sh_dc.expand(-1, 3, -1), sh_degree=3)
+
+
+class OddBands(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, sh_rest=gaussians.sh_dc.expand(-1, 5, -1), sh_degree=1)
+
+
+class TwoTypes(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, sh_dc=gaussians.sh_dc.double())
+
+
+class ShortSlots(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, slot=torch.zeros(len(gaussians) - 1, dtype=torch.int64))
+
+
+class CountsDecoded(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        return replace(gaussians, decoded=torch.arange(len(gaussians)))
+
+
+class Trembles(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        noise = 1e-3 * torch.rand_like(gaussians.means) if phase.training else 0.0
+        return replace(gaussians, means=gaussians.means + noise)
+
+
+class BrightensAtRandom(Vanilla):
+    def decode(self, parameters, camera, phase):
+        gaussians = super().decode(parameters, camera, phase)
+        chance = float(np.random.default_rng().random())
+        return replace(gaussians, sh_dc=gaussians.sh_dc + chance)
+
+
+class PositionsNowhere(Vanilla):
+    positions: ClassVar[str] = "centres"
+
+
+class PositionsOfFourColumns(Vanilla):
+    positions: ClassVar[str] = "quats"
+
+
+class PositionsOfAll(Vanilla):
+    positions: ClassVar[str] = "middle"
+
+    def create(self, scene, rng):
+        return super().create(scene, rng) | {"middle": torch.zeros(1, 3)}
+
+    def blocks(self):
+        middle = api.Block("middle", ("middle",), False, "neutral", api.LearningRate(0.0))
+        return (*super().blocks(), middle)
+
+
+class DensifierNowhere(Vanilla):
+    default_densifier: ClassVar[str] = "adx"
+
+
+class DensifierOfAnchors(Vanilla):
+    default_densifier: ClassVar[str] = "anchor"
+
+
 class FrozenQuats(Vanilla):
     def decode(self, parameters, camera, phase):
         gaussians = super().decode(parameters, camera, phase)
@@ -393,6 +489,27 @@ class BeyondTheRows(NoDensification):
         return api.Edit(values={"means": rows}), state
 
 
+class BeforeTheRows(NoDensification):
+    def densify(self, context, state):
+        means = context.parameters["means"].detach()
+        return api.Edit(values={"means": api.Rows(means[:1], torch.tensor([-1]))}), state
+
+
+class OneColumn(NoDensification):
+    def densify(self, context, state):
+        means = context.parameters["means"].detach()
+        return api.Edit(values={"means": api.Rows(means[:, :1])}), state
+
+
+class NumpySource(NoDensification):
+    def densify(self, context, state):
+        return api.Edit(source=np.arange(len(context.parameters["means"]))), state
+
+
+class NeedsNormals(NoDensification):
+    needs: ClassVar[frozenset[str]] = frozenset({"pixels", "normals"})
+
+
 class Greedy(NoDensification):
     def densify(self, context, state):
         number = len(context.parameters["means"])
@@ -463,10 +580,163 @@ class DropsAView(api.Observer):
         return replace(sampled, draw=api.Draw(sampled.draw.views[:1]))
 
 
+class ScalesBeyondOne(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_choose_scales(self, context):
+        scaled = yield
+        return replace(scaled, scales=tuple(2.0 * scale for scale in scaled.scales))
+
+
+class NoScale(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_choose_scales(self, context):
+        scaled = yield
+        return replace(scaled, scales=())
+
+
+class ObjectsInOneText(api.Observer):
+    @api.hookimpl
+    def crossgrad_objections(self, selection):
+        return f"{selection.names['backbone']} is not for me"
+
+
+class WeighsInFullSize(api.Observer):
+    @api.hookimpl
+    def crossgrad_pixel_weights(self, context):
+        return torch.ones(context.view.camera.height, context.view.camera.width)
+
+
+class WeighsInWholeNumbers(api.Observer):
+    @api.hookimpl
+    def crossgrad_pixel_weights(self, context):
+        return torch.ones_like(context.target[..., 0])
+
+
+class WeighsBelowZero(api.Observer):
+    @api.hookimpl
+    def crossgrad_pixel_weights(self, context):
+        return context.target[..., 0].float() - 1e3
+
+
+class BareLoss(api.Observer):
+    @api.hookimpl
+    def crossgrad_regularize(self, context):
+        return context.parameters["scales"].mean()
+
+
+class LossOfEachPrimitive(api.Observer):
+    @api.hookimpl
+    def crossgrad_regularize(self, context):
+        return api.Regularized(context.parameters["scales"].mean(dim=1))
+
+
+class LossOfNothing(api.Observer):
+    @api.hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is None:
+            return api.Regularized(context.parameters["scales"][:0].mean())
+        return None
+
+
+class BareState(api.Observer):
+    @api.hookimpl
+    def crossgrad_regularize(self, context):
+        term = api.Regularized(context.parameters["scales"].mean())
+        return term.with_state("bare", {"step": context.step})
+
+
+class StateOfSets(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        return api.Densified(api.NO_EDIT).with_state("sets", api.PluginState({"seen": {1}}))
+
+
+class BareEdit(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        return api.NO_EDIT
+
+
+class NoEditInside(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        return api.Densified(None)
+
+
+class ClampsWhatIsNotThere(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        scales = context.parameters["scales"].detach().clamp(max=0.0)
+        return api.Densified(api.Edit(values={"scale": api.Rows(scales)}))
+
+
+class TremblesByItself(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        means = context.parameters["means"].detach()
+        noise = 1e-3 * torch.randn_like(means)
+        return api.Densified(api.Edit(values={"means": api.Rows(means + noise)}))
+
+
+class ClampsInPlace(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        context.parameters["scales"].data.clamp_(max=-9.0)
+
+
 class Shifts(api.Observer):
     @api.hookimpl
     def crossgrad_model(self, model):
         model.parameters["means"].data.add_(1.0)
+
+
+class FitsToItself(NoExposure):
+    def fitted_to(self, scene):
+        return self
+
+
+class FitsToWhatIsNotThere(NoExposure):
+    def fitted_to(self, scene):
+        return api.Fitted(self, "gian")
+
+
+class FitsToAnotherName(NoExposure):
+    def fitted_to(self, scene):
+        return api.Fitted(load("exposures", "gain")(), "none")
+
+
+class FitsWithoutAName(NoExposure):
+    def fitted_to(self, scene):
+        return api.Fitted(load("exposures", "gain")())
+
+
+class OneNote(NoExposure):
+    def fitted_to(self, scene):
+        return api.Fitted(self, notes="nothing was found")
+
+
+class RoundsWhatItWrites(Ply):
+    def write(self, gaussians, similarity, path, comments):
+        gaussians.sh_rest.round_(decimals=1)
+        return super().write(gaussians, similarity, path, comments)
+
+
+class RoundsWhatItStores(Ply):
+    def stored(self, gaussians):
+        gaussians.sh_dc.round_(decimals=1)
+        return gaussians
+
+
+class CalledPSNR(PSNR):
+    pass
+
+
+class CalledStep(PSNR):
+    figure: ClassVar[api.Figure] = api.Figure("step", "step")
+
+
+class CalledRegime(PSNR):
+    figure: ClassVar[api.Figure] = api.Figure("regime", "regime")
 
 
 class Mutable(Adding):
@@ -499,9 +769,19 @@ class Silent(Adding):
     share: float = 0.5
 
 
+class Named(Adding):
+    name: str = api.Field("adding", description="what tables call it")
+
+
 class Misspelt(Adding):
     @api.hookimpl
     def crossgrad_densfy(self, context):
+        return None
+
+
+class MisspeltArgument(Adding):
+    @api.hookimpl
+    def crossgrad_step_end(self, recrod):
         return None
 
 
@@ -512,7 +792,9 @@ DEFECTS = [
     (components.options_survive_the_configuration_file, Rounds),
     (components.options_survive_the_configuration_file, ReadsNumbersOnly),
     (components.options_are_described, Silent),
+    (components.options_can_be_set, Named),
     (components.hooks_exist, Misspelt),
+    (components.hooks_exist, MisspeltArgument),
     (aggregation.every_tensor_is_answered, ForgetsATensor),
     (aggregation.equal_gradients_have_a_scale, HiddenCounter),
     (aggregation.absent_views_have_no_weight, CountsViewsThatAreNotThere),
@@ -557,18 +839,36 @@ DEFECTS = [
     (rasterizers.the_reference_draws_the_same, LessOpaque),
     (backbones.blocks_cover_the_parameters, LooseTensor),
     (backbones.created_from_the_scene, GlobalStart),
+    (backbones.the_default_densifier_is_there, DensifierOfAnchors),
     (backbones.decoding_has_the_shape, NegativeScales),
+    (backbones.decoding_has_the_shape, GreyColors),
+    (backbones.decoding_has_the_shape, FewerColors),
+    (backbones.decoding_has_the_shape, FlatBandZero),
+    (backbones.decoding_has_the_shape, TooFewBands),
+    (backbones.decoding_has_the_shape, OddBands),
+    (backbones.decoding_has_the_shape, TwoTypes),
+    (backbones.decoding_has_the_shape, ShortSlots),
+    (backbones.decoding_has_the_shape, CountsDecoded),
+    (backbones.positions_are_those_of_primitives, PositionsNowhere),
+    (backbones.positions_are_those_of_primitives, PositionsOfFourColumns),
+    (backbones.positions_are_those_of_primitives, PositionsOfAll),
     (backbones.gradients_reach_every_block, FrozenQuats),
     (backbones.checkpoints_give_the_same_gaussians, CountsOnItself),
+    (backbones.checkpoints_give_the_same_gaussians, Trembles),
+    (backbones.checkpoints_give_the_same_gaussians, BrightensAtRandom),
     (backbones.edits_keep_rows_together, SortsRows),
     (backbones.parameters_stay_untouched, Drifts),
     (backbones.passed_on_tensors_are_handed_over, ReadsWhatItPassesOn),
     (backbones.passed_on_tensors_are_handed_over, HandsOverACopy),
     (backbones.baking_gives_plain_gaussians, BakesAGraph),
     (backbones.fitting_respects_the_user, OverridesTheUser),
+    (densifiers.its_needs_are_statistics, NeedsNormals),
     (densifiers.quiet_before_its_time, Impatient),
     (densifiers.edits_keep_everything_aligned, WrongRows),
     (densifiers.edits_keep_everything_aligned, BeyondTheRows),
+    (densifiers.edits_keep_everything_aligned, BeforeTheRows),
+    (densifiers.edits_keep_everything_aligned, OneColumn),
+    (densifiers.edits_keep_everything_aligned, NumpySource),
     (densifiers.never_outgrows_the_room, Greedy),
     (densifiers.same_seed_same_edits, GlobalNoise),
     (densifiers.resumes_exactly, Forgets),
@@ -578,12 +878,39 @@ DEFECTS = [
     (readers.folders_stay_as_they_are, TakesAnything),
     (observers.the_model_stays_untouched, Shifts),
     (observers.seams_stay_answered, DropsAView),
+    (observers.seams_stay_answered, ScalesBeyondOne),
+    (observers.seams_stay_answered, NoScale),
+    (observers.questions_are_answered_in_kind, ObjectsInOneText),
+    (observers.questions_are_answered_in_kind, WeighsInFullSize),
+    (observers.questions_are_answered_in_kind, WeighsInWholeNumbers),
+    (observers.questions_are_answered_in_kind, WeighsBelowZero),
+    (observers.questions_are_answered_in_kind, BareLoss),
+    (observers.questions_are_answered_in_kind, LossOfEachPrimitive),
+    (observers.questions_are_answered_in_kind, LossOfNothing),
+    (observers.questions_are_answered_in_kind, BareState),
+    (observers.questions_are_answered_in_kind, StateOfSets),
+    (observers.questions_are_answered_in_kind, BareEdit),
+    (observers.questions_are_answered_in_kind, NoEditInside),
+    (observers.questions_are_answered_in_kind, ClampsWhatIsNotThere),
+    (observers.questions_are_answered_in_kind, TremblesByItself),
+    (observers.questions_are_answered_in_kind, ClampsInPlace),
+    (exposures.fitting_gives_an_installed_one, FitsToItself),
+    (exposures.fitting_gives_an_installed_one, FitsToAnotherName),
+    (exposures.fitting_gives_an_installed_one, FitsWithoutAName),
+    (exposures.fitting_gives_an_installed_one, OneNote),
+    (exporters.writes_one_file, RoundsWhatItWrites),
+    (exporters.the_stored_ones_can_be_drawn, RoundsWhatItStores),
+    (metrics.its_columns_are_its_own, CalledPSNR),
+    (metrics.its_columns_are_its_own, CalledStep),
+    (metrics.its_columns_are_its_own, CalledRegime),
 ]
 
 #: What the component itself raises is not caught by the check: `plugins check` reports it.
 RAISING = [
     (rasterizers.nothing_to_draw_is_no_error, NeedsGaussians, IndexError),
     (backbones.few_primitives_are_no_error, NeedsNeighbours, IndexError),
+    (backbones.the_default_densifier_is_there, DensifierNowhere, api.UserError),
+    (exposures.fitting_gives_an_installed_one, FitsToWhatIsNotThere, api.UserError),
     (observers.survives_every_event, NeedsAFolder, TypeError),
     (observers.survives_an_early_end, NeedsASession, ZeroDivisionError),
     (observers.seams_stay_answered, Swallows, api.UserError),
@@ -630,6 +957,19 @@ def test_every_check_has_a_defect_that_it_catches():
     }
     caught = {check for check, *_ in (*DEFECTS, *RAISING)}
     assert {check.__name__ for check in checks - caught} == set()
+
+
+@pytest.mark.parametrize(
+    ("check", "make", "words"),
+    [
+        (components.hooks_exist, MisspeltArgument, "recrod"),
+        (densifiers.edits_keep_everything_aligned, NumpySource, "edit.source is a NumPy array"),
+    ],
+    ids=name_of,
+)
+def test_it_says_what_was_found(check, make, words):
+    with pytest.raises(ContractError, match=words):
+        check(make)
 
 
 def test_a_check_that_does_not_apply_is_skipped():

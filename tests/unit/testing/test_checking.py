@@ -1,0 +1,108 @@
+"""What `plugins check` finds of a package beside others, and of plugins that end the program."""
+
+import sys
+
+import pytest
+from support.distributions import write_distribution
+
+from crossgrad_core.registry.entries import load, offers
+from crossgrad_core.testing.checking import check_entry
+from crossgrad_core.testing.densifiers import DENSIFIER_CHECKS, DensifierRun
+
+SAMPLER = """
+import sys
+from crossgrad_core.plugin import Draw, PluginState, Sampler, hookimpl
+
+class Fixed(Sampler):
+    '''Draws the first views.'''
+
+    def sample(self, context, state):
+        return Draw(tuple(range(context.views_per_step))), state
+
+class Ends(Fixed):
+    def sample(self, context, state):
+        sys.exit(0)
+
+class EndsWhenMade(Fixed):
+    def model_post_init(self, context):
+        sys.exit(0)
+"""
+BACKBONE = """
+import sys
+from crossgrad_core.registry.entries import load
+
+class Misspelt(load("backbones", "vanilla")):
+    default_densifier = "adx"
+
+class Ends(Misspelt):
+    def blocks(self):
+        sys.exit(0)
+
+class Sound(load("backbones", "vanilla")):
+    pass
+"""
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    def install(source, **plugins):
+        write_distribution(tmp_path, "made-up-check", plugins, {"made_up_check": source})
+        monkeypatch.syspath_prepend(tmp_path)
+
+    yield install
+    sys.modules.pop("made_up_check", None)
+
+
+def failures(slot, name, distribution="made-up-check"):
+    (entry,) = (e for e in offers(slot) if (e.name, e.distribution) == (name, distribution))
+    return {each.check: each.failure for each in check_entry(entry) if each.failure is not None}
+
+
+def test_a_name_that_another_package_has_is_not_free(installed):
+    installed(SAMPLER, samplers={"epoch": "made_up_check:Fixed", "made-up": "made_up_check:Fixed"})
+    found = failures("samplers", "epoch")
+    assert "2 installed packages offer a sampler named 'epoch'" in found["its name is free"]
+    assert "crossgrad " in found["its name is free"]
+    rest = {check for check in found if check != "its name is free"}
+    assert rest == failures("samplers", "made-up").keys()
+
+
+def test_the_name_of_a_command_of_the_core_is_not_free(installed):
+    source = 'def run():\n    """Runs."""\n'
+    installed(source, commands={"run": "made_up_check:run"})
+    assert failures("commands", "run") == {
+        "its name is free": "the core has a command run, which is called instead"
+    }
+
+
+def test_a_plugin_that_ends_the_program_fails_its_checks(installed):
+    installed(SAMPLER, samplers={"ends": "made_up_check:Ends"})
+    found = failures("samplers", "ends")
+    assert found["every view comes"] == "SystemExit: 0"
+    assert "options are frozen" not in found
+
+
+def test_a_plugin_that_ends_the_program_cannot_be_made(installed):
+    installed(SAMPLER, samplers={"ends": "made_up_check:EndsWhenMade"})
+    found = failures("samplers", "ends")
+    assert found == {"it can be made with default options": "SystemExit: 0"}
+
+
+@pytest.mark.parametrize("kind", ["Misspelt", "Ends"])
+def test_a_broken_backbone_of_another_package_fails_no_densifier(installed, kind):
+    installed(BACKBONE, backbones={"aaa": f"made_up_check:{kind}"})
+    for check in DENSIFIER_CHECKS:
+        check(load("densifiers", "adc"))
+
+
+def test_a_densifier_is_tried_on_a_backbone_of_crossgrad(installed):
+    installed(BACKBONE, backbones={"aaa": "made_up_check:Sound", "zzz": "made_up_check:Sound"})
+    for name in ("adc", "pixel", "none"):
+        backbone = DensifierRun.of(load("densifiers", name)()).backbone
+        assert type(backbone).__module__.startswith("crossgrad_backbones")
+
+
+def test_a_misspelt_default_densifier_is_told(installed):
+    installed(BACKBONE, backbones={"aaa": "made_up_check:Misspelt"})
+    assert list(failures("backbones", "aaa")) == ["the default densifier is there"]
+    assert "'adx'" in failures("backbones", "aaa")["the default densifier is there"]
