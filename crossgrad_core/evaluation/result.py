@@ -32,7 +32,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views; None where no view has the figure."""
+    """Means over `views` views that are not masked as a whole; None where none has the figure."""
 
     views: int
     values: Mapping[str, float | None]
@@ -79,7 +79,7 @@ def summarised(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> Evalu
 
 def _means(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> Means:
     means = {figure.name: _mean([view[figure.name] for view in views]) for figure in figures}
-    return Means(len(views), means)
+    return Means(sum(not view.masked for view in views), means)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

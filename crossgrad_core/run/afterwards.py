@@ -30,7 +30,7 @@ from crossgrad_core.run.export import (
 )
 from crossgrad_core.run.flight import FRAMES, LADDER, flight
 from crossgrad_core.run.opening import opened, require_checkpoint
-from crossgrad_core.run.results.film import film_files, write_film, write_frames
+from crossgrad_core.run.results.film import drop_frames, film_files, write_film, write_frames
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import ending, flat_names
@@ -274,10 +274,12 @@ def fly(
         along = flight(setup.scene, path, frames or FRAMES)
         if out is not None:
             check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
-        draw = camera_renderer(setup, state)
+        draw, own = camera_renderer(setup, state), out is None
         out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
         with torch.no_grad():
             files = write_frames(map(draw, along.cameras), out)
+        if own:
+            drop_frames(out, len(files))
         made = write_film(files, along.fps)
         print(f"{len(files)} frames in {out}" + (f", film {made}" if made else ""))  # noqa: T201
 

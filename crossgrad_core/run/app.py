@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.budget_clock import check_clock
@@ -59,6 +60,8 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.wording import listed
 
+#: Files of a finished run that `--resume` makes again where they are missing.
+_RESULTS: Final = ("per_view.csv", "point_cloud.ply")
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
 FAILED = 1
@@ -320,7 +323,9 @@ def resumed(
     with way_on(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, accept_scene=accept_scene)
         step, total = state.step, setup.schedule.total
-        if step >= total and summarised_step(folder, "finished") == step:
+        done = step >= total and summarised_step(folder, "finished") == step
+        kept = all((folder / name).is_file() for name in _RESULTS)
+        if done and (kept or setup.selection.names["exporter"] != EXPORTER):
             raise UserError(
                 "the run is finished",
                 where=folder,

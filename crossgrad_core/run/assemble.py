@@ -22,6 +22,7 @@ from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution
@@ -271,6 +272,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     start_choice = _or_default(config.start, _usual_start(config))
     start = _built(Start, start_choice)
     _require_points(config, scene, start)
+    _require_shown_points(config, scene)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
     sampler = _built(Sampler, config.sampler)
@@ -346,6 +348,19 @@ def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
             where=config.scene or scene.name,
             todo=f"find some in the photos (--start {START_ALONE}), or start from random ones "
             "(--init random) or from those of a file (--init FILE.ply)",
+        )
+
+
+def _require_shown_points(config: RunConfig, scene: Scene) -> None:
+    if not len(scene.points) or config.reading.init != "points":
+        return
+    if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
+        raise UserError(
+            "no training photo shows any of the scene's points: there is nothing to train",
+            where=config.scene or scene.name,
+            expected="points and cameras in one frame, with the cameras looking at the points",
+            found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
+            todo="mend the model, or start from random points (--init random)",
         )
 
 

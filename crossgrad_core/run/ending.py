@@ -10,6 +10,7 @@ from typing import Final, TypeVar
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
+from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
@@ -211,6 +212,8 @@ def last_words(course: Course) -> list[str]:
         lines += f"training failed: {ending.error}".splitlines()
     if ending.traced:
         lines.append(f"the traceback is in {folder / LOG}")
+    if not (folder / CONFIG).is_file():
+        return lines
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]

@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from pydantic import ValidationError
 
@@ -22,6 +22,7 @@ from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.run.results.scene_file import check_scene
+from crossgrad_core.run.results.summary import Status, summarised_step
 from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
@@ -31,6 +32,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.wording import listed
 
+#: How a run ended that wrote down its results, and a checkpoint with them.
+_WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 #: What a run says that has to begin again.
 BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
 
@@ -76,6 +79,24 @@ def set_up(
     return assemble(config, scene, reader), seconds
 
 
+def _refuse_lost_checkpoints(folder: Path) -> None:
+    """Keeps the results of a run whose checkpoints somebody removed: it must not begin again here.
+
+    Raises:
+        UserError: The run has results, so that it had checkpoints.
+    """
+    for status in _WITH_RESULTS:
+        if step := summarised_step(folder, status):
+            raise UserError(
+                "the checkpoints of the run are gone",
+                where=folder / CHECKPOINTS,
+                expected=f"step {step}, which the results in the folder are of",
+                found="none",
+                todo="its files are as they were, and --init point_cloud.ply starts from its "
+                "Gaussians; `crossgrad run --config FOLDER/config.yaml` repeats it elsewhere",
+            )
+
+
 def require_checkpoint(folder: Path) -> None:
     """Refuses a folder in which there is nothing to look at yet; writes nothing there.
 
@@ -84,6 +105,7 @@ def require_checkpoint(folder: Path) -> None:
     """
     read_config(folder)
     if not complete_checkpoints(folder / CHECKPOINTS):
+        _refuse_lost_checkpoints(folder)
         writer = writer_of(folder)
         raise UserError(
             "the run has no checkpoint yet",
@@ -137,6 +159,7 @@ def continued(
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
     if complete_checkpoints(folder / CHECKPOINTS):
         return _from(folder, settings, verbosity, check)
+    _refuse_lost_checkpoints(folder)
     setup, seconds = set_up(_config(folder, settings), verbosity)
     state = first_state(setup)
     state.clock.load = seconds

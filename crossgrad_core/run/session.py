@@ -7,12 +7,14 @@ from pathlib import Path
 from time import perf_counter
 
 from crossgrad_core.contract.contexts import EvaluationReport
+from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint.checkpoint import drop_later, save
 from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.persist import to_checkpoint
+from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
 from crossgrad_core.run.results.machine import Machine
@@ -84,6 +86,7 @@ class Session:
 
     def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
         """Evaluates the held-out views and records a row; draws `panels` of them."""
+        self._require_folder()
         start = perf_counter()
         writer = None
         if panels > 0:
@@ -110,9 +113,24 @@ class Session:
         """Writes a checkpoint."""
         if self._saved_step == state.step:
             return
+        self._require_folder()
         with reporting(state):
             save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
         self._saved_step = state.step
+
+    def _require_folder(self) -> None:
+        """Makes no second folder where that of the run was moved or removed meanwhile.
+
+        Raises:
+            UserError: It is not there.
+        """
+        if not (self.folder / CONFIG).is_file():
+            raise UserError(
+                "the folder of the run is gone",
+                where=self.folder,
+                expected=f"the folder that it began to write into, with its {CONFIG}",
+                todo="where it was moved, `crossgrad run --resume FOLDER` goes on from there",
+            )
 
     def rewind(self, setup: Setup, step: int) -> None:
         """Drops rows and checkpoints of steps that training went back behind."""

@@ -154,7 +154,11 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     start = perf_counter()
     setup.rasterizer.burn_in(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
-    steps = [1, *(schedule.step_of(schedule.sh_interval * degree) for degree in (1, 2, 3))]
+    # A run of one step has no second one to be tried out with.
+    steps = [
+        min(1, schedule.total - 1),
+        *(schedule.step_of(schedule.sh_interval * degree) for degree in (1, 2, 3)),
+    ]
     if setup.densifier.needs:
         # Once density control is over, its statistics are left out: other kernels.
         steps.append(schedule.step_of(schedule.densify_until))

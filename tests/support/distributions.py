@@ -19,7 +19,7 @@ def write_distribution(
         folder: Where to, as if it were site-packages; made where it is missing.
         name: Name of the distribution.
         plugins: Slot -> plugin name -> `module:Class`.
-        modules: Name of a top-level module -> its source.
+        modules: Name of a module, such as `top` or `package/module` -> its source.
         version: Version of the distribution.
     """
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
@@ -31,7 +31,9 @@ def write_distribution(
     ]
     (info / "entry_points.txt").write_text("\n\n".join(sections) + "\n")
     for module, source in (modules or {}).items():
-        (folder / f"{module}.py").write_text(source)
+        file = folder / f"{module}.py"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(source)
 
 
 def installed(

@@ -87,7 +87,11 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
     from safetensors.torch import save_file
 
     try:
+        path.touch()
+        mode = path.stat().st_mode
         save_file(packed, path)
+        # The library makes a file of its own, which nobody else may read.
+        path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
         number = _SYSTEM_ERROR.search(str(error))

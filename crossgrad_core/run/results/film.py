@@ -42,6 +42,14 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
     return files
 
 
+def drop_frames(folder: Path, count: int) -> None:
+    """Removes the frames from number `count` on, which a longer film left."""
+    number = count
+    while (frame := folder / f"{number:05d}.png").is_file():
+        frame.unlink()
+        number += 1
+
+
 def film_files(folder: Path) -> tuple[Path, Path]:
     """The film in a folder of frames: as an encoder writes it, and as Pillow does."""
     return folder / "film.mp4", folder / "film.webp"

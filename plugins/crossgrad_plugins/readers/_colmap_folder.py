@@ -80,7 +80,8 @@ def check_scene_folder(scene: Path) -> None:
             found=str(error),
             todo="check the permissions of the folder",
         ) from error
-    hint = f"did you mean {near}?" if near else "check the path"
+    check = "check the path (of a run that goes on: `scene:` in its config.yaml)"
+    hint = f"did you mean {near}?" if near else check
     raise UserError("the scene folder is not there", where=scene, todo=hint)
 
 

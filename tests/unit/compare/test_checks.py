@@ -110,7 +110,7 @@ def test_seconds_of_another_machine_are_not_drawn(tmp_path, environment):
     runs = RunFolder(environment=usual), RunFolder(seed=1, environment=environment)
     found = comparison(tmp_path, *runs)
     assert costs(found) == ["views", "steps"]
-    assert any("seconds are not compared" in note for note in found.notes)
+    assert any("seconds of the clock are not compared" in note for note in found.notes)
     with pytest.raises(UserError, match="seconds of these runs do not compare") as error:
         compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.WALL))
     assert "leave --clock out" in error.value.todo

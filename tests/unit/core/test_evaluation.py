@@ -14,7 +14,7 @@ from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.evaluation.evaluation import Evaluated, evaluate
-from crossgrad_core.evaluation.result import summarised
+from crossgrad_core.evaluation.result import ViewMetrics, summarised
 
 HEIGHT, WIDTH = 20, 32
 
@@ -177,3 +177,15 @@ def test_means_leave_out_what_is_not_known():
     assert result.regimes["x"]["psnr"] == 20.0
     assert result.regimes["x"].views == 2
     assert result.regimes["y"]["lpips"] is None
+
+
+def test_views_that_are_masked_as_a_whole_are_not_counted():
+    figure = Figure("psnr", "PSNR")
+    views = [
+        ViewMetrics("a", "near", {"psnr": 20.0}),
+        ViewMetrics("b", "near", {"psnr": None}, masked=True),
+        ViewMetrics("c", "far", {"psnr": None}, masked=True),
+    ]
+    result = summarised(views, [figure])
+    assert result.overall.as_data() == {"views": 1, "psnr": 20.0}
+    assert result.regimes["far"].views == 0

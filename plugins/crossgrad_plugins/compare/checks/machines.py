@@ -42,13 +42,15 @@ def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cos
     if clock is not ClockChoice.AUTO:
         left_out |= {SECONDS, CPU_SECONDS} - {wanted}
     notes = [
-        f"{cost.title} are not compared: {reason}"
+        f"{_CLOCK if cost is SECONDS else cost.title} are not compared: {reason}"
         for cost, reason in reasons.items()
         if reason and clock is ClockChoice.AUTO and reason != _NEVER_RECORDED
     ]
     return tuple(cost for cost in COSTS if cost not in left_out), notes
 
 
+#: Beside seconds of CPU, which may be compared all the same.
+_CLOCK: Final = "seconds of the clock"
 _NEVER_RECORDED: Final = "no run recorded them"
 
 

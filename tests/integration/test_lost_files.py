@@ -1,0 +1,119 @@
+"""Runs of which a folder or file was moved or removed: what there is stays, and no half is made."""
+
+import shutil
+
+import numpy as np
+import pytest
+from support.scenes import write_tiny_scene
+
+import crossgrad_core as cg
+from crossgrad_core.errors import UserError
+from crossgrad_core.run import afterwards, app
+from crossgrad_core.run.flight import LADDER
+from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.run.session import Session
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, scene):
+    out = tmp_path_factory.mktemp("whole") / "run"
+    settings = {"scene": str(scene), "out": str(out), "steps": 6, "eval_every": 2}
+    assert app.run(settings, verbosity=-1) == 0
+    return out
+
+
+@pytest.fixture
+def run(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "run")
+
+
+def contents(folder):
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "run.lock")
+    return {path.relative_to(folder): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("status", ["finished", "stopped"])
+def test_results_without_checkpoints_are_not_begun_again(run, status):
+    shutil.rmtree(run / "checkpoints")
+    summary = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(summary.replace('"finished"', f'"{status}"'))
+    before = contents(run)
+    for act in (
+        lambda: app.run({}, resume=run, verbosity=-1),
+        lambda: afterwards.evaluate(run),
+        lambda: afterwards.export(run, file_format="ply", out=None),
+    ):
+        with pytest.raises(UserError, match="the checkpoints of the run are gone") as refused:
+            act()
+        assert refused.value.expected.startswith("step 6")
+        assert contents(run) == before
+
+
+def test_a_run_that_failed_without_a_checkpoint_begins_again(run):
+    shutil.rmtree(run / "checkpoints")
+    summary = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(summary.replace('"finished"', '"failed"'))
+    assert app.run({}, resume=run, verbosity=-1) == 0
+    assert read_summary(run)["status"] == "finished"
+
+
+@pytest.mark.parametrize("name", ["per_view.csv", "point_cloud.ply"])
+def test_a_missing_file_is_added(run, name):
+    before = (run / name).read_bytes()
+    (run / name).unlink()
+    assert app.run({}, resume=run, verbosity=-1) == 0
+    assert (run / name).read_bytes() == before
+    with pytest.raises(UserError, match="the run is finished"):
+        app.run({}, resume=run, verbosity=-1)
+
+
+@pytest.mark.parametrize("act", ["evaluate", "save"])
+def test_a_folder_that_was_moved_is_not_made_again(run, act):
+    setup, state = cg.open(run)._open()
+    session = Session.resumed(run, setup, 5)
+    run.rename(run.with_name("moved"))
+    with pytest.raises(UserError, match="the folder of the run is gone"):
+        getattr(session, act)(setup, state)
+    assert not run.exists()
+
+
+def test_of_a_shorter_film_no_longer_one_is_left(run):
+    for frames, count in ((4, 4), (3, 3)):
+        afterwards.fly(run, path=LADDER, frames=frames, out=None)
+        assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
+
+
+def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
+    files = [path for path in run.rglob("*") if path.is_file() and path.name != "run.lock"]
+    assert any(path.name == "tensors.safetensors" for path in files)
+    (run / "fresh").touch()
+    assert {path.stat().st_mode for path in files} == {(run / "fresh").stat().st_mode}
+
+
+def shows(model, image, point):
+    where = model.images[image].project_point(point)
+    camera = model.cameras[model.images[image].camera_id]
+    return where is not None and bool(
+        (where >= 0).all() and (where <= (camera.width, camera.height)).all()
+    )
+
+
+def test_points_that_no_photo_shows_are_refused(scene, tmp_path):
+    import pycolmap
+
+    away = shutil.copytree(scene, tmp_path / "away")
+    model = pycolmap.Reconstruction(away / "sparse" / "0")
+    ends = [sign * 1e6 * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    hidden = next(end for end in ends if not any(shows(model, i, end) for i in model.images))
+    for point in model.points3D.values():
+        point.xyz = hidden
+    model.write(away / "sparse" / "0")
+    settings = {"scene": str(away), "out": str(tmp_path / "run"), "steps": 2}
+    with pytest.raises(UserError, match="no training photo shows any"):
+        app.run(settings, verbosity=-1)
+    assert not (tmp_path / "run").exists()
