@@ -2,13 +2,15 @@
 
 from dataclasses import asdict
 from math import nan
-from typing import Any, cast
+from typing import Any, Final, cast
 
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.contents import Checkpoint
+from crossgrad_core.system.version import VERSION
 from crossgrad_core.training import steady
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.photo_parameters import check_photos_are
@@ -17,10 +19,56 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed
 
+#: Settings that say nothing about what was trained, or that a run which goes on may have changed:
+#: where things lie, when there is a look at them, and a length that follows the clock.
+_LOOSE: Final = frozenset(
+    {
+        "device",
+        "eval_every",
+        "eval_from",
+        "exporter",
+        "exposure_from",
+        "max_views",
+        "metrics",
+        "observers",
+        "out",
+        "plan",
+        "planned_seconds",
+        "planned_views",
+        "reading",
+        "revisions",
+        "save_every",
+        "scene",
+        "seconds",
+        "stop_after",
+        "threads",
+    }
+)
 
-def to_checkpoint(state: TrainState) -> Checkpoint:
-    """The state as a checkpoint; tensors are shared, not copied."""
+
+def settings_of(config: RunConfig) -> dict[str, Json]:
+    """What trains a run, flat (`loss.ssim_weight`), and the version that does."""
+    data = config.model_dump(mode="json", exclude=set(_LOOSE))
+    if config.planned_seconds is not None:
+        del data["steps"]  # The clock may have changed them.
+    # What `opening` reads where a run that began with the usual ones has written none.
+    data |= {"sh_from": config.sh_from or 0, "sh_every": config.sh_every or 1}
+    flat: dict[str, Json] = {"crossgrad": VERSION}
+    for key, value in data.items():
+        inner = value.items() if isinstance(value, dict) else ()
+        flat |= {f"{key}.{name}": each for name, each in inner} or {key: value}
+    return flat
+
+
+def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpoint:
+    """The state as a checkpoint; tensors are shared, not copied.
+
+    Args:
+        state: The state.
+        config: What trained it, where that is to be held against what it is read with.
+    """
     scalars: dict[str, Any] = {
+        "settings": {} if config is None else settings_of(config),
         "clock": asdict(state.clock),
         "counters": asdict(state.counters),
         "rewinds": state.rewinds,
@@ -44,6 +92,7 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     Raises:
         UserError: It is not a state of this run: of another backbone, of other photos, or damaged.
     """
+    _check_settings(setup.config, checkpoint)
     _check_tensors(setup, checkpoint)
     try:
         state = _restored(setup, checkpoint)
@@ -54,6 +103,23 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     if average is not None and not steady.fits(average, state.parameters):
         raise _misfit(checkpoint, "sums in the shapes of the parameters", "another average")
     return state
+
+
+def _check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
+    """Refuses a state that other settings have trained: its figures would be filed under these."""
+    stored = checkpoint.scalars.get("settings")
+    if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
+        return  # Of a version that wrote none, or whose settings may have other names.
+    ours = settings_of(config)
+    changed = sorted(key for key in ours.keys() | stored.keys() if ours.get(key) != stored.get(key))
+    if changed:
+        raise UserError(
+            "config.yaml was changed since this run began",
+            where=f"settings {listed(changed)}; step {checkpoint.step}",
+            expected=listed(f"{key}: {stored.get(key)}" for key in changed),
+            found=listed(f"{key}: {ours.get(key)}" for key in changed),
+            todo="put them back, or start a new run with the changed file (--config)",
+        )
 
 
 def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:

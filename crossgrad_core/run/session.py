@@ -115,7 +115,9 @@ class Session:
             return
         self._require_folder()
         with reporting(state):
-            save(self.folder, to_checkpoint(state), Keep(every=setup.config.save_every))
+            save(
+                self.folder, to_checkpoint(state, setup.config), Keep(every=setup.config.save_every)
+            )
         self._saved_step = state.step
 
     def _require_folder(self) -> None:

@@ -117,3 +117,31 @@ def test_points_that_no_photo_shows_are_refused(scene, tmp_path):
     with pytest.raises(UserError, match="no training photo shows any"):
         app.run(settings, verbosity=-1)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("seed: 0", "seed: 3", "seed"),
+        ("ssim_weight: 0.2", "ssim_weight: 0.9", "loss.ssim_weight"),
+        ("background: black", "background: white", "background"),
+        ("steps: 6", "steps: 8", "steps"),
+    ],
+)
+def test_a_changed_configuration_is_refused(run, old, new, named):
+    text = (run / "config.yaml").read_text()
+    assert text.count(old) == 1
+    (run / "config.yaml").write_text(text.replace(old, new))
+    before = contents(run)
+    for act in (lambda: app.run({}, resume=run, verbosity=-1), lambda: afterwards.evaluate(run)):
+        with pytest.raises(UserError, match=r"config.yaml was changed since") as refused:
+            act()
+        assert refused.value.where == f"settings {named}; step 6"
+        assert contents(run) == before
+
+
+def test_what_does_not_train_may_be_changed(run):
+    text = (run / "config.yaml").read_text()
+    assert "eval_every: 2" in text
+    (run / "config.yaml").write_text(text.replace("eval_every: 2", "eval_every: 3"))
+    afterwards.evaluate(run)
