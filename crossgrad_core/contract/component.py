@@ -10,6 +10,7 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 
 A = TypeVar("A")
+B = TypeVar("B")
 
 
 class Component(BaseModel):
@@ -40,18 +41,26 @@ def answered(answer: object, kind: type[A], component: Component, method: str) -
     raise _wrong_answer(component, method, kind.__name__, answer)
 
 
-def with_state(
-    answer: object, kind: type[A], component: Component, method: str
-) -> tuple[A, PluginState]:
+def pair(
+    answer: object, first: type[A], second: type[B], component: Component, method: str
+) -> tuple[A, B]:
     """The two parts of what a method of a component answered.
 
     Raises:
         UserError: It is no pair of these types; names the method.
     """
     match answer:
-        case (first, PluginState() as state) if isinstance(first, kind):
-            return first, state
-    raise _wrong_answer(component, method, f"a pair: {kind.__name__}, PluginState", answer)
+        case (one, other) if isinstance(one, first) and isinstance(other, second):
+            return one, other
+    wanted = f"a pair: {first.__name__}, {second.__name__}"
+    raise _wrong_answer(component, method, wanted, answer)
+
+
+def with_state(
+    answer: object, kind: type[A], component: Component, method: str
+) -> tuple[A, PluginState]:
+    """As `pair`, of something and the new state."""
+    return pair(answer, kind, PluginState, component, method)
 
 
 def _wrong_answer(component: Component, method: str, expected: str, answer: object) -> UserError:

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 Response = Literal["plain", "antialiased", "analytic"]
+#: Of spherical harmonics.
+HIGHEST_DEGREE: Final = 3
 _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
@@ -88,7 +90,9 @@ class Gaussians:
         """What is wrong with the shape of a tensor, such as `colors is [5, 1], not [5, 3]`."""
         if (self.colors is None) == (self.sh_dc is None):
             return "both or none of colors and sh_dc are given"
-        number, rest = len(self), self.sh_rest
+        number, rest, degree = len(self), self.sh_rest, self.sh_degree
+        if self.sh_dc is not None and not 0 <= degree <= (0 if rest is None else HIGHEST_DEGREE):
+            return f"sh_degree is {degree}, {'without' if rest is None else 'with'} sh_rest"
         higher = 0 if rest is None or rest.ndim == 1 else rest.shape[1]
         shapes: dict[str, tuple[int, ...]] = {
             "means": (number, 3),
@@ -97,7 +101,7 @@ class Gaussians:
             "opacities": (number,),
             "colors": (number, 3),
             "sh_dc": (number, 1, 3),
-            "sh_rest": (number, max(higher, (self.sh_degree + 1) ** 2 - 1), 3),
+            "sh_rest": (number, max(higher, (degree + 1) ** 2 - 1), 3),
             "origin": (number,),
             "slot": (number,),
         }

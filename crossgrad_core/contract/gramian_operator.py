@@ -142,7 +142,7 @@ def aggregate_by_gramians(
     given = operator_context(context, granularity, present)
     answer = operator.transform(gramians, given, state, context.rng)
     matrices, state = with_state(answer, np.ndarray, operator, "transform")
-    if matrices.shape[::2] != gramians.shape[::2]:
+    if matrices.ndim != gramians.ndim or matrices.shape[::2] != gramians.shape[::2]:
         raise _misfit(operator, gramians, matrices)
     weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():

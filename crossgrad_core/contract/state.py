@@ -9,20 +9,10 @@ from typing import Any, Final, TypeAlias
 import torch
 from torch import Tensor
 
-#: Names of states that belong to slots or to the core itself: no other plugin may use them.
-TAKEN: Final = frozenset(
-    {
-        "average",
-        "budget",
-        "densifier",
-        "grouping",
-        "operator",
-        "photos",
-        "resolution",
-        "sampler",
-        "thinned",
-    }
-)
+#: Names of states that belong to the components of slots.
+SLOTS: Final = frozenset({"densifier", "operator", "resolution", "sampler"})
+#: These and the core's own: no other plugin may use them.
+TAKEN: Final = SLOTS | {"average", "budget", "grouping", "photos", "thinned"}
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 

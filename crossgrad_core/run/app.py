@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, cast
+from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.budget_clock import check_clock
@@ -34,11 +33,12 @@ from crossgrad_core.run.results.folder import (
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
+from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.plan_file import write_plan
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
-from crossgrad_core.run.session import Session, totals
+from crossgrad_core.run.session import CLOUD, Session, totals
 from crossgrad_core.run.settings_for_nothing import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
@@ -60,8 +60,6 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.wording import listed
 
-#: Files of a finished run that `--resume` makes again where they are missing.
-_RESULTS: Final = ("per_view.csv", "point_cloud.ply")
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
 FAILED = 1
@@ -299,7 +297,8 @@ def _train(
 
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
     print(table)  # noqa: T201 - the result of the command
-    print(f"results in {folder}")  # noqa: T201
+    if folder.is_dir():  # Nobody moved it meanwhile.
+        print(f"results in {folder}")  # noqa: T201
     for line in words:
         print(line, file=sys.stderr)  # noqa: T201
 
@@ -324,8 +323,8 @@ def resumed(
         setup, state = continued(folder, settings, way.verbosity, accept_scene=accept_scene)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
-        kept = all((folder / name).is_file() for name in _RESULTS)
-        if done and (kept or setup.selection.names["exporter"] != EXPORTER):
+        files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
+        if done and all((folder / name).is_file() for name in files):
             raise UserError(
                 "the run is finished",
                 where=folder,

@@ -11,7 +11,7 @@ import torch
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.adam_state import MOST_VIEWS
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.component import Component, answered
+from crossgrad_core.contract.component import Component, answered, pair
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.exposure import Exposure, Fitted
@@ -207,6 +207,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     # The length of a run within a budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
+    named["operators"] = [each.name for each in config.operators]
     added = (
         *from_elsewhere({**named, "metrics": [*selection.metrics], "observers": [*observers]}),
         *_linear_note(setup),
@@ -272,13 +273,14 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     start_choice = _or_default(config.start, _usual_start(config))
     start = _built(Start, start_choice)
     _require_points(config, scene, start)
-    _require_shown_points(config, scene)
+    _require_shown_points(config, scene, start)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
     sampler = _built(Sampler, config.sampler)
     operator, operator_name = operator_of(config)
     backbone = _built(Backbone, config.backbone)
-    backbone, left_out = answered(backbone.fitted_to(scene), tuple, backbone, "fitted_to")
+    fitting = backbone.fitted_to(scene)
+    backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
     densifier_choice = _or_default(config.densifier, backbone.default_densifier)
     densifier = _built(Densifier, densifier_choice)
@@ -351,8 +353,8 @@ def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
         )
 
 
-def _require_shown_points(config: RunConfig, scene: Scene) -> None:
-    if not len(scene.points) or config.reading.init != "points":
+def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None:
+    if not len(scene.points) or config.reading.init != "points" or start.alone:
         return
     if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
         raise UserError(
@@ -360,7 +362,7 @@ def _require_shown_points(config: RunConfig, scene: Scene) -> None:
             where=config.scene or scene.name,
             expected="points and cameras in one frame, with the cameras looking at the points",
             found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
-            todo="mend the model, or start from random points (--init random)",
+            todo=f"mend the model, or find points in the photos (--start {START_ALONE})",
         )
 
 

@@ -10,7 +10,6 @@ from typing import Final, TypeVar
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
-from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
@@ -81,6 +80,8 @@ class Course:
         if self.ending.status == "finished" and removes_floaters(config, densifier):
             self._attempt("floaters are left", self._remove_floaters)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
+        if self.session.gone:
+            return self.ending
         if self.state.step > 0:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
@@ -210,10 +211,10 @@ def last_words(course: Course) -> list[str]:
         lines.append(f"no primitive is left: look at densifier {name} and at the photos")
     if ending.error is not None:
         lines += f"training failed: {ending.error}".splitlines()
+    if course.session.gone:
+        return lines
     if ending.traced:
         lines.append(f"the traceback is in {folder / LOG}")
-    if not (folder / CONFIG).is_file():
-        return lines
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]

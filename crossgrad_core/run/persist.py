@@ -20,14 +20,17 @@ from crossgrad_core.training.state import Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed
 
 #: Settings that say nothing about what was trained, or that a run which goes on may have changed:
-#: where things lie, when there is a look at them, and a length that follows the clock.
+#: where things lie, what draws them on this machine, when there is a look at them, how many faults
+#: are borne, and a length that follows the clock.
 _LOOSE: Final = frozenset(
     {
+        "clock",
         "device",
         "eval_every",
         "eval_from",
         "exporter",
         "exposure_from",
+        "max_dropped",
         "max_views",
         "metrics",
         "observers",
@@ -35,6 +38,7 @@ _LOOSE: Final = frozenset(
         "plan",
         "planned_seconds",
         "planned_views",
+        "rasterizer",
         "reading",
         "revisions",
         "save_every",

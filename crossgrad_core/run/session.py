@@ -14,7 +14,6 @@ from crossgrad_core.run.checkpoint.checkpoint import drop_later, save
 from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.persist import to_checkpoint
-from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
 from crossgrad_core.run.results.machine import Machine
@@ -120,17 +119,22 @@ class Session:
             )
         self._saved_step = state.step
 
+    @property
+    def gone(self) -> bool:
+        """Whether the folder was moved or removed meanwhile."""
+        return not self.folder.is_dir()
+
     def _require_folder(self) -> None:
         """Makes no second folder where that of the run was moved or removed meanwhile.
 
         Raises:
             UserError: It is not there.
         """
-        if not (self.folder / CONFIG).is_file():
+        if self.gone:
             raise UserError(
                 "the folder of the run is gone",
                 where=self.folder,
-                expected=f"the folder that it began to write into, with its {CONFIG}",
+                expected="the folder that it began to write into",
                 todo="where it was moved, `crossgrad run --resume FOLDER` goes on from there",
             )
 
@@ -162,7 +166,8 @@ class Session:
         rows = read_metrics(self.folder)
         if rows:
             with reporting(state):
-                draw_curve(self.folder, rows, title(setup), view_counts(setup))
+                counts = view_counts(setup, self.result(state.step))
+                draw_curve(self.folder, rows, title(setup), counts)
 
     def export(self, setup: Setup, state: TrainState) -> None:
         """Writes the trained scene and says what the file is."""
@@ -230,8 +235,11 @@ def columns_of(setup: Setup) -> tuple[str, ...]:
     return columns_for(regimes_of(setup), [metric.figure for metric in setup.metrics])
 
 
-def view_counts(setup: Setup) -> dict[str, int]:
-    """Number of held-out views overall and per regime."""
+def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
+    """Number of held-out views overall and per regime: measured ones, where that is known."""
+    if result is not None:
+        regimes = {regime: means.views for regime, means in result.regimes.items()}
+        return {"overall": result.overall.views, **regimes}
     views = setup.scene.test_views
     counts = {regime: sum(v.regime == regime for v in views) for regime in regimes_of(setup)}
     return {"overall": len(views), **counts}

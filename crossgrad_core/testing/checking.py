@@ -46,6 +46,8 @@ def check_entry(entry: registry.Entry) -> list[Result]:
     """Loads a plugin and runs every check of its slot; stops early where it cannot be loaded."""
     taken = _taken(entry)
     names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
+    if taken and entry.slot == COMMANDS:
+        return names  # Nothing ever calls it.
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:

@@ -5,13 +5,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pluggy import HookCaller
 from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.state import TAKEN, PluginState
+from crossgrad_core.contract.state import SLOTS, TAKEN, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.clock import Clock, Laps
@@ -109,26 +110,38 @@ class TrainState:
         """Takes over states of the core."""
         self.states.update(states)
 
-    def accept(self, states: Mapping[str, PluginState], own: str = "") -> None:
+    def accept(self, states: Mapping[str, PluginState], hook: HookCaller) -> None:
         """Takes over the states that plugins answered a hook with.
 
         Args:
             states: Name -> state.
-            own: The name in `TAKEN` that belongs to the slot which answers, if one does.
+            hook: The hook; a slot's name is its component's where that has the hook.
 
         Raises:
             UserError: A name belongs to a slot or to the core, or a state is none.
         """
+        answering = [each.plugin_name for each in hook.get_hookimpls()]
+        where = f"{hook.name}, one of {listed(answering)}"
+        if not isinstance(states, Mapping):
+            raise UserError(
+                "a plugin answers with something else for its states",
+                where=where,
+                expected="a mapping of names to PluginState",
+                found=type(states).__name__,
+                todo="repair the plugin (docs/hooks.md)",
+            )
         for name, held in states.items():
-            if name in TAKEN and name != own:
+            if name in TAKEN - SLOTS.intersection(answering):
                 raise UserError(
                     f"a plugin answers with a state called {name!r}, which belongs to crossgrad",
+                    where=where,
                     expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
                     todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
                 )
             if not isinstance(held, PluginState):
                 raise UserError(
                     f"a plugin answers with something else for its state {name!r}",
+                    where=where,
                     expected="a PluginState",
                     found=type(held).__name__,
                     todo="repair the plugin (docs/hooks.md)",

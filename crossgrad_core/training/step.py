@@ -105,7 +105,7 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
 def _sample(setup: Setup, state: TrainState) -> Draw:
     context = sample_context(setup, state, state.step)
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
-    state.accept(answer.states, "sampler")
+    state.accept(answer.states, setup.hook.crossgrad_sample_views)
     counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
     views = answer.draw.views
     known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
@@ -138,7 +138,7 @@ def _aggregate_context(
 
 def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Aggregated:
     answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
-    state.accept(answer.states, "operator")
+    state.accept(answer.states, setup.hook.crossgrad_aggregate_gradients)
     state.counters.dropped += answer.counts.get("dropped", 0)
     return answer
 
@@ -203,7 +203,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         render=OnRequest(setup, state, counted=True),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
-    state.accept(answer.states, "densifier")
+    state.accept(answer.states, setup.hook.crossgrad_densify)
     edited = apply_edit(setup, state, answer.edit)
     if edited or answer.edit.values:
         restart(state)
@@ -222,7 +222,7 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
         edited=edited,
     )
     for answer in call_question(setup.hook.crossgrad_after_step, context, Densified):
-        state.accept(answer.states)
+        state.accept(answer.states, setup.hook.crossgrad_after_step)
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):
             restart(state)

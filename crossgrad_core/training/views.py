@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from math import inf, isfinite, nan
+from numbers import Real
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -87,9 +88,11 @@ def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
     """The scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
     answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
-    state.accept(answer.states, "resolution")
+    state.accept(answer.states, setup.hook.crossgrad_choose_scales)
     scales = answer.scales
-    if len(scales) == len(draw.views) and all(0.0 < scale <= 1.0 for scale in scales):
+    if len(scales) == len(draw.views) and all(
+        isinstance(each, Real) and 0.0 < each <= 1.0 for each in scales
+    ):
         return scales
     raise UserError(
         "the resolution does not give each view a scale",
@@ -467,7 +470,7 @@ def add_regularization(
         view=view,
     )
     for answer in call_question(setup.hook.crossgrad_regularize, context, Regularized):
-        state.accept(answer.states)
+        state.accept(answer.states, setup.hook.crossgrad_regularize)
         _add(into, _gradients_of(answer.loss, state.tensors, keep=gaussians is not None))
 
 

@@ -161,7 +161,7 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
         (("--loss", "infinite"), "the photometric loss is not finite"),
         (("--loss", "infinite", "--seconds", "1"), "the photometric loss is not finite"),
         (("--loss", "vector"), "a step that was tried out before the training failed"),
-        (("--densifier", "typo"), "an edit gives values of tensors that there are not: ['mean']"),
+        (("--densifier", "typo"), "there is no tensor 'mean' with a row for each primitive"),
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )

@@ -82,6 +82,25 @@ def test_a_folder_that_was_moved_is_not_made_again(run, act):
     assert not run.exists()
 
 
+def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkeypatch, capsys):
+    out, original = tmp_path / "run", Session.save
+
+    def moved(session, setup, state):
+        if out.exists():
+            out.rename(tmp_path / "moved")
+        original(session, setup, state)
+
+    monkeypatch.setattr(Session, "save", moved)
+    settings = {"scene": str(scene), "out": str(out), "steps": 6, "save_every": 3}
+    assert app.run(settings, verbosity=-1) == 1
+    said = capsys.readouterr()
+    assert "the folder of the run is gone" in said.err
+    for words in ("no curve.png", "the traceback", "continue with", "results in"):
+        assert words not in said.err + said.out
+    assert not out.exists()
+    assert app.run({}, resume=tmp_path / "moved", verbosity=-1) == 0
+
+
 def test_of_a_shorter_film_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
         afterwards.fly(run, path=LADDER, frames=frames, out=None)

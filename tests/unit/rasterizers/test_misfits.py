@@ -68,6 +68,14 @@ def test_a_degree_without_its_coefficients_is_refused():
         drawn(wrong)
 
 
+@pytest.mark.parametrize(("degree", "rest"), [(3, False), (1, False), (-1, True), (4, True)])
+def test_a_degree_that_there_is_not_is_refused(degree, rest):
+    some = complete(harmonics=True)
+    bands = torch.zeros((len(some), 24, 3)) if rest else None
+    with pytest.raises(UserError, match=f"sh_degree is {degree}"):
+        drawn(replace(some, sh_degree=degree, sh_rest=bands))
+
+
 @pytest.mark.parametrize("harmonics", [False, True])
 def test_what_fits_is_drawn(harmonics):
     some: Gaussians = complete(harmonics)

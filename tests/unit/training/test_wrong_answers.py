@@ -8,6 +8,7 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract import densifier, operator, resolution, sampler
+from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.contexts import Densified, Regularized
 from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting
@@ -87,6 +88,25 @@ def test_a_component_fitted_to_the_scene_comes_with_its_notes(monkeypatch):
         assemble(RunConfig(steps=10), sample_scene(), "none")
 
 
+@pytest.mark.parametrize("answer", [None, (1, 2), (1, 2, 3), (None, ())])
+def test_a_backbone_fitted_to_the_scene_comes_with_what_was_left_out(monkeypatch, answer):
+    original = assembling._built
+    wrong = of_slot("backbones", "vanilla", "fitted_to", answer)
+
+    def built(slot, choice):
+        return wrong if slot is Backbone else original(slot, choice)
+
+    monkeypatch.setattr(assembling, "_built", built)
+    with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
+        assemble(RunConfig(steps=10), sample_scene(), "none")
+
+
+@pytest.mark.parametrize("scales", ["a", (None,), ()])
+def test_scales_are_numbers(scales):
+    wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
+    assert refused(setup_of({"resolution": wrong})).what.startswith("the resolution does not give")
+
+
 @pytest.mark.parametrize("shape", [(2,), (6, 3), (5, 2), ()])
 def test_weights_of_another_shape_say_which(shape):
     class Own(Weighting):
@@ -101,12 +121,13 @@ def test_weights_of_another_shape_say_which(shape):
     assert error.found == str(list(shape))
 
 
-def test_matrices_of_another_shape_say_which():
+@pytest.mark.parametrize("tail", [(3,), (1, 2)])
+def test_matrices_of_another_shape_say_which(tail):
     class Own(GramianOperator):
         def transform(self, gramians, context, state, rng):
-            return np.ones((len(gramians), 1, 3)), state
+            return np.ones((len(gramians), 1, *tail)), state
 
-    assert refused(setup_of({"operator": Own()})).found == "[6, 1, 3]"
+    assert refused(setup_of({"operator": Own()})).found == str([6, 1, *tail])
 
 
 class Answers:
@@ -152,6 +173,27 @@ def test_names_of_others_are_refused(name):
     plugin = Answers(Densified(NO_EDIT, states={name: PluginState({"n": 1})}))
     error = refused(setup_of(stranger=plugin))
     assert repr(name) in error.what
+    assert error.where == "crossgrad_after_step, one of stranger"
+
+
+@pytest.mark.parametrize("states", [None, [PluginState()]])
+def test_states_are_a_mapping(states):
+    plugin = Answers(Densified(NO_EDIT, states=states))
+    assert refused(setup_of(stranger=plugin)).expected.startswith("a mapping")
+
+
+def test_a_component_keeps_its_own_state_in_every_hook_that_it_has():
+    kind = type(build("densifiers", "none", {}))
+
+    class Own(kind):
+        @hookimpl
+        def crossgrad_after_step(self, context):
+            return Densified(NO_EDIT, states={"densifier": PluginState({"n": context.step})})
+
+    setup = setup_of({"densifier": Own()})
+    state = first_state(setup)
+    take_step(setup, state)
+    assert state.states["densifier"].values == {"n": 1}
 
 
 def test_a_state_that_is_none_is_refused_at_once():
@@ -170,8 +212,17 @@ def test_the_names_of_the_core_are_those_that_it_uses():
     [
         (Edit(source=torch.arange(41)), "source leaves 0 to 39"),
         (Edit(source=torch.tensor([-1])), "source leaves 0 to 39"),
-        (Edit(source=torch.arange(40).int()), "not [M] int64"),
-        (Edit(source=torch.arange(3), fresh=torch.ones(4).bool()), "fresh is [4], not [3]"),
+        (Edit(source=torch.arange(40).int()), "not [M] of torch.int64"),
+        (Edit(source=torch.tensor(3)), "[] of torch.int64, not [M]"),
+        (Edit(source=[0, 1]), "builtins.list, not a tensor"),
+        (Edit(source=np.arange(40)), "numpy.ndarray, not a tensor"),
+        (Edit(source=torch.arange(3), fresh=torch.ones(3)), "fresh is [3] of torch.float32"),
+        (Edit(values={"means": torch.zeros(40, 3)}), "Tensor, not Rows"),
+        (Edit(values={"means": Rows(np.zeros((40, 3)))}), "not Rows of a tensor"),
+        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([40]))}), "rows leave 0 to 39"),
+        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([-1]))}), "rows leave 0 to 39"),
+        (Edit(values={"means": Rows(torch.zeros(3), torch.ones(40).bool())}), "rows are [40] of"),
+        (Edit(source=torch.arange(3), fresh=torch.ones(4).bool()), "fresh has 4 rows of 3"),
         (Edit(values={"mean": Rows(torch.zeros(40, 3))}), "no tensor 'mean'"),
         (Edit(values={"means": Rows(torch.zeros(40, 2))}), "[40, 2], not [40, 3]"),
         (Edit(values={"means": Rows(torch.zeros(39, 3))}), "[39, 3], not [40, 3]"),
