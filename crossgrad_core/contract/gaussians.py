@@ -2,15 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.numerics.spherical import COEFFICIENTS
+
 Response = Literal["plain", "antialiased", "analytic"]
-#: Of spherical harmonics.
-HIGHEST_DEGREE: Final = 3
 _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
@@ -91,7 +91,8 @@ class Gaussians:
         if (self.colors is None) == (self.sh_dc is None):
             return "both or none of colors and sh_dc are given"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree
-        if self.sh_dc is not None and not 0 <= degree <= (0 if rest is None else HIGHEST_DEGREE):
+        degrees = range(1 if rest is None else len(COEFFICIENTS))
+        if self.sh_dc is not None and degree not in degrees:
             return f"sh_degree is {degree}, {'without' if rest is None else 'with'} sh_rest"
         higher = 0 if rest is None or rest.ndim == 1 else rest.shape[1]
         shapes: dict[str, tuple[int, ...]] = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, Parameters
+from crossgrad_core.contract.blocks import Block, Parameters, primitives_of
 from crossgrad_core.contract.state import carried
 
 
@@ -53,6 +53,65 @@ class Edit:
 
 #: The explicit answer of a densifier that changes nothing in this step.
 NO_EDIT = Edit()
+
+
+def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> str:
+    """What of an edit does not fit the parameters, in words; empty where all does."""
+    before = primitives_of(blocks, parameters)
+    if wrong := _no_set(edit, before):
+        return wrong
+    after = before if edit.source is None else len(edit.source)
+    rows = {name for block in blocks if block.per_primitive for name in block.tensors}
+    for name, new in edit.values.items():
+        if name not in rows:
+            return f"there is no tensor {name!r} with a row for each primitive"
+        if wrong := _no_values(new, after, parameters[name].shape[1:]):
+            return f"values of {name}: {wrong}"
+    return ""
+
+
+def _no_set(edit: Edit, before: int) -> str:
+    """Why an edit of so many primitives gives no new set of them; empty where it does."""
+    source, fresh = edit.source, edit.fresh
+    if source is not None and (wrong := _no_list(source, torch.int64)):
+        return f"source is {wrong}"
+    after = before if source is None else len(source)
+    if source is not None and after and not 0 <= int(source.min()) <= int(source.max()) < before:
+        return f"source leaves 0 to {before - 1}"
+    if fresh is not None and (wrong := _no_list(fresh, torch.bool)):
+        return f"fresh is {wrong}"
+    if fresh is not None and len(fresh) != after:
+        return f"fresh has {len(fresh)} rows of {after}"
+    return ""
+
+
+def _no_list(found: object, dtype: torch.dtype) -> str:
+    """What something is that should be a one-dimensional tensor of a type; empty where it is."""
+    if not isinstance(found, Tensor):
+        return f"of type {type(found).__module__}.{type(found).__name__}, not a tensor"
+    good = found.ndim == 1 and found.dtype == dtype
+    return "" if good else f"{list(found.shape)} of {found.dtype}, not [M] of {dtype}"
+
+
+def _no_values(new: object, count: int, width: torch.Size) -> str:
+    """Why something does not replace rows, of so many, of a width; empty where it does."""
+    if not isinstance(new, Rows) or not isinstance(new.values, Tensor):
+        return f"{type(new).__name__}, not Rows of a tensor"
+    if new.rows is not None:
+        if wrong := _no_list(new.rows, torch.int64):
+            return f"rows are {wrong}"
+        # On a GPU a look would be waited for.
+        if new.rows.is_cpu and ((new.rows < 0) | (new.rows >= count)).any():
+            return f"rows leave 0 to {count - 1}"
+        count = len(new.rows)
+    shape = (count, *width)
+    return "" if _fits(new.values, shape) else f"{list(new.values.shape)}, not {list(shape)}"
+
+
+def _fits(values: Tensor, shape: tuple[int, ...]) -> bool:
+    """Whether values can be written to a tensor of a shape."""
+    pairs = zip(reversed(values.shape), reversed(shape), strict=False)
+    return values.ndim <= len(shape) and all(own in (1, size) for own, size in pairs)
 
 
 def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[Tensor, Tensor]:

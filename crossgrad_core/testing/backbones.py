@@ -12,6 +12,7 @@ from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.numerics.spherical import COEFFICIENTS
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
@@ -84,29 +85,24 @@ def decoding_has_the_shape(make: Make[Backbone]) -> None:
 
 
 def _require_valid(gaussians: Gaussians, primitives: int) -> None:
+    misfit = gaussians.misfit()
+    require(misfit is None, f"decode() gives Gaussians that do not go together: {misfit}")
     number, kind = len(gaussians), gaussians.means.dtype
     require(kind.is_floating_point, f"means are {kind}, not of a floating type")
-    rest, degree = gaussians.sh_rest, gaussians.sh_degree
-    bands = 1 if rest is None else 1 + rest.shape[1]
-    known = bands in {4, 9, 16} or rest is None
-    told = f"sh_degree {degree} does not go with {bands} coefficients (1, 4, 9 or 16)"
-    require(known and degree >= 0 and (degree + 1) ** 2 <= bands, told)
-    shapes: dict[str, tuple[int, ...]] = {"means": (number, 3), "quats": (number, 4)}
-    shapes |= {"scales": (number, 3), "opacities": (number,), "colors": (number, 3)}
-    shapes |= {"sh_dc": (number, 1, 3), "sh_rest": (number, bands - 1, 3)}
-    shapes |= {"origin": (number,), "slot": (number,), "decoded": (primitives,)}
+    bands = 1 if gaussians.sh_rest is None else 1 + gaussians.sh_rest.shape[1]
+    require(bands in COEFFICIENTS, f"there are {bands} coefficients, none of {COEFFICIENTS}")
+    decoded = gaussians.decoded
+    whole = decoded is None or decoded.shape == (primitives,)
+    require(whole, f"decoded is not [{primitives}], the number of primitives")
     kinds = {"origin": torch.int64, "slot": torch.int64, "decoded": torch.bool}
-    for name, shape in shapes.items():
-        tensor: Tensor | None = getattr(gaussians, name)
-        if tensor is not None:
-            found, wanted = (tensor.dtype, tuple(tensor.shape)), (kinds.get(name, kind), shape)
-            require(found == wanted, f"{name} is {found}; expected {wanted}")
-            require(tensor.isfinite().all(), f"{name} is not finite")
+    for name, value in vars(gaussians).items():
+        if isinstance(value, Tensor):
+            wanted = kinds.get(name, kind)
+            require(value.dtype == wanted, f"{name} is {value.dtype}; expected {wanted}")
+            require(value.isfinite().all(), f"{name} is not finite")
     require((gaussians.scales > 0.0).all(), "a scale is not positive")
     inside = (gaussians.opacities >= 0.0).all() and (gaussians.opacities <= 1.0).all()
     require(inside, "an opacity is outside [0, 1]")
-    one = (gaussians.colors is None) != (gaussians.sh_dc is None)
-    require(one, "exactly one of colors and sh_dc must be given")
     origin = gaussians.origin
     if origin is None:
         require(number == primitives, f"{number} Gaussians of {primitives} primitives, no origin")

@@ -13,7 +13,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
+from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices, misfit_of
 from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
@@ -179,28 +179,16 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 
 
 def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
-    """Requires of an edit that it can be applied: indices in range, finite values that fit."""
-    primitives = primitives_of(blocks, parameters)
-    arrays = [name for name in ("source", "fresh") if isinstance(getattr(edit, name), np.ndarray)]
-    require(not arrays, f"edit.{' and edit.'.join(arrays)} is a NumPy array, not a tensor")
-    source, fresh = gather_indices(edit, primitives, torch.device("cpu"))
-    rows = source.shape[0]
-    require(source.dtype == torch.int64, f"edit.source is {source.dtype}, not int64")
-    inside = rows == 0 or (int(source.min()) >= 0 and int(source.max()) < primitives)
-    require(inside, f"edit.source leaves 0 .. {primitives - 1}")
-    require(
-        fresh.dtype == torch.bool and fresh.shape[0] == rows,
-        f"edit.fresh is {fresh.dtype} {list(fresh.shape)}, expected bool [{rows}]",
-    )
-    editable = {name for block in blocks if block.per_primitive for name in block.tensors}
+    """Requires of an edit that it can be applied, and that its values are finite."""
+    misfit = misfit_of(edit, blocks, parameters)
+    require(not misfit, f"the edit does not fit: {misfit}")
+    number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
     for name, overwrite in edit.values.items():
-        require(name in editable, f"edit.values names {name}, which is no tensor of primitives")
-        values, indices = overwrite.values, overwrite.rows
-        wanted = [rows if indices is None else indices.shape[0], *parameters[name].shape[1:]]
-        found = list(values.shape)
+        values, rows = overwrite.values, overwrite.rows
+        # A run spreads what is smaller over the rows: hardly ever meant.
+        wanted = (number if rows is None else len(rows), *parameters[name].shape[1:])
+        found = tuple(values.shape)
         require(found == wanted, f"edit.values of {name} has the shape {found}, expected {wanted}")
-        good = indices is None or ((indices >= 0) & (indices < rows)).all()
-        require(good, f"edit.values overwrites rows of {name} outside 0 .. {rows - 1}")
         require(values.isfinite().all(), f"edit.values of {name} is not finite")
 
 

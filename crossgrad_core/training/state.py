@@ -120,33 +120,36 @@ class TrainState:
         Raises:
             UserError: A name belongs to a slot or to the core, or a state is none.
         """
-        answering = [each.plugin_name for each in hook.get_hookimpls()]
-        where = f"{hook.name}, one of {listed(answering)}"
         if not isinstance(states, Mapping):
-            raise UserError(
-                "a plugin answers with something else for its states",
-                where=where,
-                expected="a mapping of names to PluginState",
-                found=type(states).__name__,
-                todo="repair the plugin (docs/hooks.md)",
-            )
+            raise _no_states(hook, "its states", "a mapping of names to PluginState", states)
         for name, held in states.items():
-            if name in TAKEN - SLOTS.intersection(answering):
-                raise UserError(
-                    f"a plugin answers with a state called {name!r}, which belongs to crossgrad",
-                    where=where,
-                    expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
-                    todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
-                )
             if not isinstance(held, PluginState):
-                raise UserError(
-                    f"a plugin answers with something else for its state {name!r}",
-                    where=where,
-                    expected="a PluginState",
-                    found=type(held).__name__,
-                    todo="repair the plugin (docs/hooks.md)",
-                )
+                raise _no_states(hook, f"its state {name!r}", "a PluginState", held)
+        taken = TAKEN.intersection(states)
+        stolen = taken - SLOTS.intersection(_answering(hook)) if taken else taken
+        if stolen:
+            raise UserError(
+                f"a plugin answers with a state called {min(stolen)!r}, which belongs to crossgrad",
+                where=f"{hook.name}, one of {listed(_answering(hook))}",
+                expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
+                todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
+            )
         self.states.update(states)
+
+
+def _answering(hook: HookCaller) -> list[str]:
+    """Names of the plugins that have a hook."""
+    return [each.plugin_name for each in hook.get_hookimpls()]
+
+
+def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> UserError:
+    return UserError(
+        f"a plugin answers with something else for {what}",
+        where=f"{hook.name}, one of {listed(_answering(hook))}",
+        expected=expected,
+        found=type(found).__name__,
+        todo="repair the plugin (docs/hooks.md)",
+    )
 
 
 class _Current(Mapping[str, Tensor]):

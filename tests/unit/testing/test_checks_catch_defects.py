@@ -963,7 +963,11 @@ def test_every_check_has_a_defect_that_it_catches():
     ("check", "make", "words"),
     [
         (components.hooks_exist, MisspeltArgument, "recrod"),
-        (densifiers.edits_keep_everything_aligned, NumpySource, "edit.source is a NumPy array"),
+        (
+            densifiers.edits_keep_everything_aligned,
+            NumpySource,
+            "source is of type numpy.ndarray, not a tensor",
+        ),
     ],
     ids=name_of,
 )

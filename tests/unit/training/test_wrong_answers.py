@@ -76,25 +76,21 @@ def test_what_a_backbone_decodes_are_gaussians(answer):
     assert error.expected == "Gaussians"
 
 
-def test_a_component_fitted_to_the_scene_comes_with_its_notes(monkeypatch):
-    original = assembling._built
-    wrong = of_slot("exposures", "none", "fitted_to", None)
+@pytest.mark.parametrize(
+    ("base", "slot", "name", "answer"),
+    [
+        (Exposure, "exposures", "none", None),
+        *(
+            (Backbone, "backbones", "vanilla", each)
+            for each in (None, (1, 2), (1, 2, 3), (None, ()))
+        ),
+    ],
+)
+def test_what_is_fitted_to_the_scene_is_of_its_kind(monkeypatch, base, slot, name, answer):
+    original, wrong = assembling._built, of_slot(slot, name, "fitted_to", answer)
 
-    def built(slot, choice):
-        return wrong if slot is Exposure else original(slot, choice)
-
-    monkeypatch.setattr(assembling, "_built", built)
-    with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
-        assemble(RunConfig(steps=10), sample_scene(), "none")
-
-
-@pytest.mark.parametrize("answer", [None, (1, 2), (1, 2, 3), (None, ())])
-def test_a_backbone_fitted_to_the_scene_comes_with_what_was_left_out(monkeypatch, answer):
-    original = assembling._built
-    wrong = of_slot("backbones", "vanilla", "fitted_to", answer)
-
-    def built(slot, choice):
-        return wrong if slot is Backbone else original(slot, choice)
+    def built(kind, choice):
+        return wrong if kind is base else original(kind, choice)
 
     monkeypatch.setattr(assembling, "_built", built)
     with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
