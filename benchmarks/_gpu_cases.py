@@ -14,6 +14,8 @@ VIEWS = (1, 2, 4, 8)
 OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
 #: Gaussians of the made-up clouds, and megapixels of their photos.
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
+#: Lengths of runs with the settings that `crossgrad run` has if nothing is asked.
+USUAL = (1_000, 7_000, 30_000)
 #: Steps of a long run that have a row, beside its last.
 STOPS = (7_000, 15_000)
 
@@ -23,7 +25,7 @@ class Case:
     """One row.
 
     Attributes:
-        part: `sizes`, `steps` or `long`.
+        part: `sizes`, `steps`, `long` or `usual`.
         rasterizer: Its name.
         backbone: Its name.
         views: K.
@@ -46,20 +48,21 @@ class Case:
         return "-".join(map(str, vars(self).values()))
 
     def command(self, scene: Path, out: Path) -> list[str]:
-        """The command that trains a long run."""
+        """The command that trains a run of the parts `long` and `usual`."""
         options = {
             "--device": "cuda",
             "--rasterizer": self.rasterizer,
             "--backbone": self.backbone,
-            "--sampler": "random",
             "--views": self.views,
             "--operator": self.operator,
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            "--schedule": "absolute",
+            "--split": "every",  # As gsplat's trainer has it, where photos lie in one folder.
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
+        if self.part == "long":
+            options |= {"--sampler": "random", "--schedule": "absolute"}
         given = [str(part) for pair in options.items() for part in pair]
         return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
 
@@ -92,6 +95,8 @@ def cases(steps: int, long: int) -> Iterator[Case]:
         yield Case("steps", rasterizer, "vanilla", views, operator, steps)
     for rasterizer, views in product(fast, VIEWS[:2]):
         yield Case("long", rasterizer, "vanilla", views, "sum", long)
+    for rasterizer, length in product(fast, USUAL):
+        yield Case("usual", rasterizer, "vanilla", 1, "sum", length)
 
 
 def is_chosen(case: Case, only: Sequence[str] | None) -> bool:

@@ -18,6 +18,8 @@ from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.dropout import STREAM, dropped
+from crossgrad_core.training.edits import keep
+from crossgrad_core.training.floaters import rows_without_floaters
 from crossgrad_core.training.loop import timed_step
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
@@ -302,3 +304,33 @@ def test_every_backbone_learns_as_on_the_cpu(name, backbone, operator):
     assert apart[:8].max() <= 2e-3
     assert apart.mean() <= 3e-2
     assert losses["cuda"][-10:].mean() < losses["cuda"][:10].mean()
+
+
+@pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
+@pytest.mark.usefixtures("gsplat")
+def test_floaters_are_those_of_the_cpu(backbone):
+    """Primitives beside and behind the cameras; what is left is what the state goes on with."""
+    options = {"backbone": {"name": backbone}}
+    if backbone == "scaffold":
+        options["backbone"]["voxel_size"] = 1e-2
+    found = {}
+    for device, rasterizer in (("cuda", "gsplat"), ("cpu", "torch")):
+        setup, state = started({"name": rasterizer}, device, **options)
+        positions = state.parameters[setup.backbone.positions].detach()
+        centers = torch.stack([view.camera.center for view in setup.train_views])
+        draws = torch.Generator().manual_seed(3)
+        rows = torch.arange(0, len(positions), 2)
+        moved = centers[rows % len(centers)]
+        moved = moved + 0.1 * torch.randn(len(rows), 3, generator=draws, dtype=moved.dtype)
+        positions[rows.to(device)] = moved.to(positions)
+        left = rows_without_floaters(setup, state)
+        assert left is not None
+        assert left.device.type == device
+        keep(setup, state, left)
+        assert len(state.parameters[setup.backbone.positions]) == len(left)
+        timed_step(setup, state)
+        found[device] = left.cpu()
+    assert 0 < len(found["cpu"]) < len(positions)
+    # A box that just reaches a photo counts as seen by gsplat, and may not by our rules.
+    apart = set(found["cuda"].tolist()) ^ set(found["cpu"].tolist())
+    assert len(apart) <= 0.02 * len(positions) + 1, apart
