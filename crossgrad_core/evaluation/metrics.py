@@ -13,6 +13,8 @@ from crossgrad_core.contract.images import eight_bit
 #: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite;
 #: images that differ reach it only if fewer than one value in 150,000 is off, by one 8-bit step.
 PSNR_LIMIT = 100.0
+#: Pixels whose differences stay in the cache until they are summed.
+_AT_ONCE = 2**15
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
@@ -28,10 +30,18 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
     Source: 3DGS evaluation script: 20 log10(1 / sqrt(MSE)).
     """
-    difference = eight_bit(image).to(torch.int64) - eight_bit(target).to(torch.int64)
-    if mask is not None:
-        difference = difference[mask]
-    if difference.numel() == 0:
+    rendered, photo = (
+        each.reshape(-1, 3) if mask is None else each[mask]
+        for each in (eight_bit(image), eight_bit(target))
+    )
+    if rendered.numel() == 0:
         return None
-    mean_square = float((difference * difference).sum()) / difference.numel() / 255**2
+    # All of these are whole numbers that float32 and float64 hold, in whatever order.
+    total = 0.0
+    for ours, theirs in zip(
+        *(torch.split(each, _AT_ONCE) for each in (rendered, photo)), strict=True
+    ):
+        difference = ours.to(torch.float32) - theirs.to(torch.float32)
+        total += float((difference * difference).sum(dtype=torch.float64))
+    mean_square = total / rendered.numel() / 255**2
     return min(-10 * float(np.log10(mean_square)), PSNR_LIMIT) if mean_square > 0 else PSNR_LIMIT

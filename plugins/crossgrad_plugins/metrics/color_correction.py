@@ -18,7 +18,11 @@ DEFINITION = (
 #: as if it did not vary in them: a grey render has two such directions, but for rounding.
 _FLAT = 1e-10
 
+#: Pixels that are worked on at once: what is made of them stays in the cache.
+_AT_ONCE = 2**15
+
 Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
@@ -30,42 +34,56 @@ def color_corrected(compared: Compared) -> Tensor | None:
     if not len(render):
         return None
     matrix, offset = _fit(render, photo)
-    pixels = compared.render.numpy().astype(np.float64) @ matrix + offset
-    return torch.from_numpy(np.rint(np.clip(pixels, 0.0, 255.0)).astype(np.uint8))
+    pixels = compared.render.reshape(-1, 3).numpy()
+    corrected = np.empty_like(pixels)
+    for at in range(0, len(pixels), _AT_ONCE):
+        fitted = pixels[at : at + _AT_ONCE] @ matrix + offset
+        corrected[at : at + _AT_ONCE] = np.rint(np.clip(fitted, 0.0, 255.0))
+    return torch.from_numpy(corrected).reshape(compared.render.shape)
 
 
-def _kept(image: Tensor, mask: Tensor | None) -> Floats:
+def _kept(image: Tensor, mask: Tensor | None) -> Bytes:
     """[N, 3] the pixels that count."""
     kept = image.reshape(-1, 3) if mask is None else image[mask]
-    return kept.numpy().astype(np.float64)
+    return kept.numpy()
 
 
-def _fit(render: Floats, photo: Floats) -> tuple[Floats, Floats]:
+def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
     """Matrix [3, 3] and offset [3]: `render @ matrix + offset` is closest to `photo`, both [N, 3].
 
     Of several such maps the one with the smallest matrix.
     """
-    count = len(render)
-    of_render, of_photo = _sums(render), _sums(photo)
-    within = _spread(render.T @ render, of_render, of_render, count)
-    across = _spread(render.T @ photo, of_render, of_photo, count)
+    sums = _sums(render, photo)
+    within, across = _spread(sums, slice(0, 3)), _spread(sums, slice(3, 6))
     matrix = np.linalg.pinv(within, rcond=_FLAT, hermitian=True) @ across
-    means = (np.array(sums, dtype=np.float64) / count for sums in (of_render, of_photo))
-    mean_render, mean_photo = means
+    mean_render, mean_photo = np.split(sums[6, :6] / len(render), 2)
     return matrix, mean_photo - mean_render @ matrix
 
 
-def _sums(pixels: Floats) -> list[int]:
-    return [int(value) for value in pixels.sum(axis=0)]
+def _sums(render: Bytes, photo: Bytes) -> Floats:
+    """[7, 7] sums of the products of the render's channels, the photo's, and 1.
 
-
-def _spread(products: Floats, first: list[int], second: list[int], count: int) -> Floats:
-    """[3, 3] covariances, from sums of products and sums.
-
-    Sums of products of 8-bit values are exact in float64 in any order; their differences are taken
-    in integers, so that neither rounding nor the number of threads shows.
+    Whole numbers that float64 holds, in whatever order they are added up.
     """
-    exact = [
-        [count * int(products[i, j]) - first[i] * second[j] for j in range(3)] for i in range(3)
-    ]
-    return np.array([[value / count**2 for value in row] for row in exact])
+    total = np.zeros((7, 7))
+    for at in range(0, len(render), _AT_ONCE):
+        part = slice(at, at + _AT_ONCE)
+        values = np.ones((len(render[part]), 7))
+        values[:, :3], values[:, 3:6] = render[part], photo[part]
+        total += values.T @ values
+    return total
+
+
+def _spread(sums: Floats, others: slice) -> Floats:
+    """[3, 3] covariances of the render's channels with others.
+
+    The differences are taken in integers, so that neither rounding nor the number of threads shows.
+    """
+    exact = [[int(value) for value in row] for row in sums]
+    count = exact[6][6]
+    return np.array(
+        [
+            [(count * exact[i][j] - exact[6][i] * exact[6][j]) / count**2 for j in range(6)[others]]
+            for i in range(3)
+        ]
+    )

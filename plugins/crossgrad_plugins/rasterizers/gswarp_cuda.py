@@ -25,7 +25,8 @@ from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-_PACKAGE = "gswarp"
+#: And what it is built on.
+_PACKAGES = ("gswarp", "warp")
 #: Depth up to which gswarp draws nothing, in the units that it is given.
 _NEAR = 0.2
 
@@ -53,7 +54,7 @@ class GswarpRasterizer(Rasterizer):
     @classmethod
     @override
     def speed(cls, device: str) -> float:
-        return 80.0 if device in cls.devices and not package_missing(_PACKAGE) else 0.0
+        return 80.0 if device in cls.devices and not package_missing(*_PACKAGES) else 0.0
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
@@ -61,7 +62,7 @@ class GswarpRasterizer(Rasterizer):
         if selection.device not in self.devices:
             return []
         reasons = []
-        if missing := package_missing(_PACKAGE):
+        if missing := package_missing(*_PACKAGES):
             reasons.append(missing)
         if selection.backbone.own_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]

@@ -53,6 +53,13 @@ def test_a_package_that_is_not_there_is_named_with_its_extra(machine):
         assert f"pip install 'crossgrad[{package}]'" in reason
 
 
+def test_gswarp_without_warp_is_not_there(machine):
+    machine("gswarp")
+    (reason,) = objections(GswarpRasterizer())
+    assert "needs the package warp, which is not installed: pip install 'crossgrad[gs" in reason
+    assert choose_rasterizer("auto", CUDA)[0] == "torch"
+
+
 @pytest.mark.parametrize(
     ("nvcc", "reason"),
     [
@@ -115,7 +122,7 @@ def test_what_a_rasterizer_does_not_give_is_refused_before_training(slot, name, 
 
 
 def test_gswarp_refuses_a_dilation_of_ones_own(machine):
-    machine("gswarp")
+    machine("gswarp", "warp")
 
     class Own(type(build("backbones", "vanilla", {}))):
         own_dilation = True
@@ -124,7 +131,7 @@ def test_gswarp_refuses_a_dilation_of_ones_own(machine):
 
 
 def test_the_fastest_that_is_there_and_can_is_taken(machine):
-    machine("gsplat", "gswarp", nvcc="12.8")
+    machine("gsplat", "gswarp", "warp", nvcc="12.8")
     assert choose_rasterizer("auto", CUDA)[0] == "gsplat"
     assert choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"count"})))[0] == "gsplat"
     chosen, notes = choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"directions"})))
@@ -137,7 +144,7 @@ def test_the_fastest_that_is_there_and_can_is_taken(machine):
 
 
 def test_without_a_compiler_gswarp_is_taken_and_without_both_the_reference(machine):
-    machine("gsplat", "gswarp")
+    machine("gsplat", "gswarp", "warp")
     assert choose_rasterizer("auto", CUDA)[0] == "gswarp"
     machine()
     assert choose_rasterizer("auto", CUDA)[0] == "torch"

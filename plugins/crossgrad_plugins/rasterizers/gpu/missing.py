@@ -11,12 +11,13 @@ from pathlib import Path
 import torch
 
 
-def package_missing(package: str) -> str | None:
-    """Why a rasterizer cannot run without its package; None where it is installed."""
-    if find_spec(package) is not None:
+def package_missing(package: str, *others: str) -> str | None:
+    """Why a rasterizer cannot run without its package and others; None where all are installed."""
+    lacks = next((name for name in (package, *others) if find_spec(name) is None), None)
+    if lacks is None:
         return None
     return (
-        f"rasterizer {package} needs the package {package}, which is not installed: "
+        f"rasterizer {package} needs the package {lacks}, which is not installed: "
         f"pip install 'crossgrad[{package}]', or leave --rasterizer out"
     )
 
