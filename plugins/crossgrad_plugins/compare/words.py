@@ -36,7 +36,7 @@ def headline(comparison: Comparison) -> tuple[Sentence, ...]:
         found = [Sentence(claim(each), support(each)) for each in comparison.ends]
     else:
         found = _of_the_best(comparison)
-    return (*found, *_equal_costs(comparison))
+    return (*found, *_lengths(comparison), *_equal_costs(comparison))
 
 
 def claim(contrast: Contrast) -> str:
@@ -195,6 +195,24 @@ def _why(contrasts: Sequence[Contrast]) -> str:
     if not needed or max(needed) <= pairs:
         return f"differences too close to the margin of {_margin(first)} for {pairs} pairs"
     return f"n \u2265 {max(needed)} pairs needed to tell {_margin(first)}, there are {pairs}"
+
+
+def _lengths(comparison: Comparison) -> list[Sentence]:
+    """That runs of the same scene and seed have other lengths in one arm than in another."""
+    told: dict[str, dict[str, None]] = {}
+    for problem in {problem for by in comparison.main.values() for problem in by}:
+        own = {n: by[problem].length_text for n, by in comparison.main.items() if problem in by}
+        if len(set(own.values())) > 1:
+            for name, length in own.items():
+                told.setdefault(name, {})[length] = None
+    if not told:
+        return []
+    shown = [
+        f"{name} {', '.join(sorted(told[name]))}" for name in comparison.ranking if name in told
+    ]
+    more = len(shown) - _MOST_NAMED
+    shown = [*shown[:_MOST_NAMED], *([f"{more} more"] if more > 0 else [])]
+    return [Sentence("The arms were given different lengths", "; ".join(shown))]
 
 
 def _equal_costs(comparison: Comparison) -> list[Sentence]:

@@ -23,3 +23,25 @@ def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_pat
     assert first.support.startswith("better than views=4 by 1.99 dB (+1.9")
     assert second.claim.startswith("It is worse than views=2 by 0.31 dB (-0.3")
     assert not any("ends best" in each.claim for each in (first, second))
+
+
+def test_arms_of_different_lengths_are_said_to_be(tmp_path):
+    for views, steps in ((1, 300), (2, 900)):
+        for seed in range(3):
+            run = RunFolder("place", seed, 20.0 + views, views_per_step=views, steps=steps)
+            run.write(tmp_path / f"{views}-{seed}")
+    found = compared(read_runs([tmp_path], skip_broken=False), Options())
+    told = {each.claim: each.support for each in headline(found)}
+    assert told["The arms were given different lengths"] == "views=2 900 steps; views=1 300 steps"
+
+
+def test_lengths_that_follow_the_scene_are_not_told(tmp_path):
+    for views in (1, 2):
+        for seed in range(4):
+            steps = 300 * (1 + seed % 2)
+            run = RunFolder(
+                f"place {seed % 2}", seed, 20.0 + views, views_per_step=views, steps=steps
+            )
+            run.write(tmp_path / f"{views}-{seed}")
+    found = compared(read_runs([tmp_path], skip_broken=False), Options())
+    assert not any("lengths" in each.claim for each in headline(found))
