@@ -30,6 +30,7 @@ from crossgrad_core.run.export import (
 )
 from crossgrad_core.run.flight import FRAMES, LADDER, flight
 from crossgrad_core.run.opening import opened, require_checkpoint
+from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.film import drop_frames, film_files, write_film, write_frames
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
@@ -178,7 +179,8 @@ def evaluated_file(
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
     """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
 
-    The folder of a run that is training, and one that may not be written to, is only read.
+    The folder of a run that is training, and one that may not be written to, is only read; so is
+    one of a run that measured what is not installed here.
 
     Raises:
         UserError: It is no run, or it has no checkpoint.
@@ -188,7 +190,9 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points
         result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
-        if writes:
+        # A figure that is not measured here stays in the file.
+        measured_there = read_config(folder).get("metrics") or ()
+        if writes and len(measured_there) <= len(setup.config.metrics):
             name = _own_name(folder, PER_VIEW, state.step)
             other = name.replace(".", "_accepted.")
             write_per_view(folder, result, other if _is_changed(setup) else name)

@@ -17,13 +17,14 @@ from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.assemble import assemble, check_names, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import load_latest
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
-from crossgrad_core.run.persist import from_checkpoint
+from crossgrad_core.run.persist import check_settings, from_checkpoint
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
 from crossgrad_core.run.resumable import CHANGEABLE
+from crossgrad_core.run.stand_ins import as_it_was, without_missing
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
 from crossgrad_core.training.budget import caught_up
@@ -133,7 +134,7 @@ def opened(
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
-    return _from(folder, {"threads": None, **settings}, -1, check)
+    return _from(folder, {"threads": None, **settings}, -1, check, looks=True)
 
 
 def continued(
@@ -171,10 +172,14 @@ def _from(
     settings: Mapping[str, Any],
     verbosity: int,
     check: Callable[[Fingerprint], tuple[str, ...]],
+    *,
+    looks: bool = False,
 ) -> tuple[Setup, TrainState]:
     checkpoint = load_latest(folder)
     # Read after the checkpoint: a run that follows the clock only adds to its configuration.
-    setup, seconds = set_up(_config(folder, settings), verbosity, check)
+    config = _config(folder, settings)
+    setup, seconds = set_up(without_missing(config) if looks else config, verbosity, check)
+    check_settings(as_it_was(setup.config, config), checkpoint)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
     return caught_up(replace(setup, notes=_noted(folder, setup)), state.step), state

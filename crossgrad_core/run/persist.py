@@ -96,7 +96,6 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     Raises:
         UserError: It is not a state of this run: of another backbone, of other photos, or damaged.
     """
-    _check_settings(setup.config, checkpoint)
     _check_tensors(setup, checkpoint)
     try:
         state = _restored(setup, checkpoint)
@@ -109,8 +108,12 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     return state
 
 
-def _check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
-    """Refuses a state that other settings have trained: its figures would be filed under these."""
+def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
+    """Refuses a state that other settings have trained: its figures would be filed under these.
+
+    Raises:
+        UserError: Some that train are not those of the checkpoint.
+    """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
         return  # Of a version that wrote none, or whose settings may have other names.

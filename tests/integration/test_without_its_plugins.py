@@ -1,0 +1,78 @@
+"""A run that parts of another package trained is looked at without them, and not continued."""
+
+import sys
+
+import pytest
+from support.commands import ended
+from support.distributions import write_distribution
+from support.scenes import write_tiny_scene
+
+#: What only trains, and what only measures or listens.
+TRAINS = {
+    "samplers": "epoch",
+    "operators": "pcgrad",
+    "densifiers": "adc",
+    "losses": "l1-ssim",
+    "starts": "filled",
+    "resolutions": "full",
+}
+SOURCE = """
+from crossgrad_core.plugin import Figure, Metric, Observer
+from crossgrad_core.registry.entries import load
+
+class Gains(Metric):
+    figure = Figure("gains", "gains")
+
+    def measure(self, compared):
+        return 1.0
+
+class Listens(Observer):
+    pass
+
+""" + "\n".join(
+    f"class Own{slot.title()}(load({slot!r}, {name!r})):\n    pass\n"
+    for slot, name in TRAINS.items()
+)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """The folder of a run, whose package is gone again."""
+    plugins = {slot: {f"own-{slot}": f"made_up_gone:Own{slot.title()}"} for slot in TRAINS}
+    plugins |= {"metrics": {"gains": "made_up_gone:Gains"}}
+    plugins |= {"observers": {"listens": "made_up_gone:Listens"}}
+    write_distribution(tmp_path / "site", "gone", plugins, {"made_up_gone": SOURCE})
+    scene, out = write_tiny_scene(tmp_path / "tiny", views=9), tmp_path / "run"
+    given = ["--steps", "4", "--views", "2", "--threads", "1", "-q", "--out", out]
+    for option in ("sampler", "operator", "densifier", "loss", "start", "resolution"):
+        slot = "losses" if option == "loss" else f"{option}s"
+        given += [f"--{option}", f"own-{slot}"]
+    with monkeypatch.context() as patched:
+        patched.syspath_prepend(tmp_path / "site")
+        sys.modules.pop("made_up_gone", None)
+        assert ended("run", scene, *given, "--metrics", "gains", "--observe", "listens") == 0
+    return out
+
+
+def test_a_run_is_looked_at_without_what_trained_it(run, capsys):
+    before = (run / "per_view.csv").read_text()
+    assert ended("eval", run) == 0
+    told = capsys.readouterr().err
+    assert "not installed here, and left out: sampler own-samplers, operator own-operators" in told
+    assert "metrics gains, observers listens" in told
+    assert (run / "per_view.csv").read_text() == before
+    assert ended("export", run, "--out", run.parent / "again.ply") == 0
+    assert (run.parent / "again.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
+    assert ended("render", run, "--out", run.parent / "pictures") == 0
+
+
+def test_it_does_not_go_on_without_them(run, capsys):
+    assert ended("run", "--resume", run, "-q") == 2
+    assert "own-" in capsys.readouterr().err
+
+
+def test_settings_that_were_changed_are_still_refused(run, capsys):
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("own-losses", "other-losses"))
+    assert ended("eval", run) == 2
+    assert "config.yaml was changed since this run began" in capsys.readouterr().err
