@@ -19,7 +19,7 @@ from crossgrad_core.registry.entries import Entry, build, entries, load_entry, o
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
-from crossgrad_core.system.files import disk_errors, write_atomically
+from crossgrad_core.system.files import disk_errors, is_leftover, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
 from crossgrad_core.system.progress import Progress
@@ -97,6 +97,7 @@ __all__ = [
     "fingerprint",
     "finish",
     "gathered",
+    "is_leftover",
     "is_live",
     "layered",
     "listed",

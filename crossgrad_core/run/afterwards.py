@@ -31,7 +31,13 @@ from crossgrad_core.run.export import (
 from crossgrad_core.run.flight import FRAMES, LADDER, flight
 from crossgrad_core.run.opening import opened, require_checkpoint
 from crossgrad_core.run.results.config_file import read_config
-from crossgrad_core.run.results.film import drop_frames, film_files, write_film, write_frames
+from crossgrad_core.run.results.film import (
+    ENCODER,
+    drop_frames,
+    film_files,
+    write_film,
+    write_frames,
+)
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import ending, flat_names
@@ -39,6 +45,7 @@ from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.scene_file import ACCEPTED
+from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
@@ -133,7 +140,8 @@ def evaluated_on(
         draw, points = plain_renderer(setup, state), there.points
         result = measured(there.views, draw, setup.metrics, points=points)
         if writes:
-            write_per_view(folder, result, f"per_view_on_{ending(there.name)}.csv")
+            name = name_for(folder, ending(there.name), on)
+            write_per_view(folder, result, f"per_view_on_{name}.csv")
         return result, there
 
 
@@ -228,7 +236,7 @@ def render(
         own = folder_of(folder, state.step) / ("accepted" if _is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
-            views, own = there.views, own / f"on_{ending(there.name)}"
+            views, own = there.views, own / f"on_{_named(folder, out, there.name, on)}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -279,13 +287,23 @@ def fly(
         if out is not None:
             check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
         draw, own = camera_renderer(setup, state), out is None
-        out = out or folder_of(folder, state.step) / f"path_{ending(along.name)}"
+        if out is None:
+            name = (
+                ending(along.name)
+                if path == LADDER
+                else _named(folder, out, along.name, Path(path))
+            )
+            out = folder_of(folder, state.step) / f"path_{name}"
         with torch.no_grad():
             files = write_frames(map(draw, along.cameras), out)
         if own:
             drop_frames(out, len(files))
         made = write_film(files, along.fps)
-        print(f"{len(files)} frames in {out}" + (f", film {made}" if made else ""))  # noqa: T201
+        for film in film_files(out) if own else ():
+            if film != made:  # Of other frames.
+                film.unlink(missing_ok=True)
+        told = f"film {made}" if made else f"no film: too many or too large without {ENCODER}"
+        print(f"{len(files)} frames in {out}, {told}")  # noqa: T201
 
 
 def export(
@@ -367,6 +385,11 @@ def exported(
             path = out or folder / name
             check_new(path)
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
+
+
+def _named(folder: Path, out: Path | None, name: str, source: Path) -> str:
+    """What pictures of a scene or a path are called in the run's folder, if they go there."""
+    return ending(name) if out is not None else name_for(folder, ending(name), source)
 
 
 @contextmanager

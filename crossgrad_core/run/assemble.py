@@ -74,7 +74,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     _LOG.info("reading scene %s", path)
     name = config.reader.name
     if name == AUTO:
-        able = [each for each in entries("readers") if _accepts(each, path)]
+        able = [each for each in entries("readers") if accepts(each, path)]
         if len(able) > 1:
             raise UserError(
                 "the scene can be read in several ways",
@@ -87,7 +87,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
     return build(Reader, name, config.reader.options).read(path, config.reading), name
 
 
-def _accepts(name: str, path: Path) -> bool:
+def accepts(name: str, path: Path) -> bool:
     """Whether a reader takes the folder; one that fails does not keep the others from it."""
     try:
         return build(Reader, name, {}).accepts(path)

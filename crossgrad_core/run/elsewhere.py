@@ -13,7 +13,7 @@ from crossgrad_core.config import AUTO, ComponentChoice
 from crossgrad_core.contract.scene import Camera, Scene, View, centers_of
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.assemble import read_scene
+from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
 #: A pose nearer than this to a training view's is that view: local units (extents), and radians.
@@ -50,7 +50,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     config = setup.config.model_copy(
         update={
             "reading": setup.config.reading.model_copy(update=reading),
-            "reader": ComponentChoice(name=AUTO),
+            "reader": _reader(setup, path),
         }
     )
     other, _ = read_scene(config, path)
@@ -67,6 +67,15 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
             todo="name another capture of the place; leave --on out for the held-out views",
         )
     return Elsewhere(other.name, views, points, len(moved) - len(views))
+
+
+def _reader(setup: Setup, path: Path) -> ComponentChoice:
+    """How the other scene is read: as the run's own where that can be, which others could, too."""
+    own, scene = setup.config.reader, setup.config.scene
+    if scene is not None and path.resolve() == Path(scene).resolve():
+        return own
+    fits = own.name != AUTO and accepts(own.name, path)
+    return ComponentChoice(name=own.name if fits else AUTO)
 
 
 def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:

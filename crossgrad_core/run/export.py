@@ -148,8 +148,8 @@ def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> f
     return fsum(known) / len(known) if known else None
 
 
-def view_named(setup: Setup, name: str) -> View:
-    """The view of that name.
+def view_named(setup: Setup, name: str, where: str = "--camera") -> View:
+    """The view of that name; `where` it was given.
 
     Raises:
         UserError: There is none.
@@ -160,7 +160,7 @@ def view_named(setup: Setup, name: str) -> View:
     names = [view.name for view in setup.scene.views]
     raise UserError(
         f"the scene has no view {name!r}",
-        where="--camera",
+        where=where,
         expected=f"one of {len(names)} names such as {names[0]}",
         todo="per_view.csv lists the held-out views",
     )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import radians, tan
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import torch
@@ -164,7 +164,8 @@ class _Path(BaseModel):
     camera_path: list[_Frame] = Field(min_length=1, max_length=MOST_FRAMES)
     render_width: PositiveInt = Field(le=16_384)
     render_height: PositiveInt = Field(le=16_384)
-    fps: float = Field(FRAMES_PER_SECOND, gt=0, le=1_000)
+    fps: float = Field(FRAMES_PER_SECOND, ge=0.01, le=1_000)
+    camera_type: Literal["perspective"] = "perspective"
 
 
 def _read(path: Path, similarity: Similarity) -> Flight:
@@ -183,6 +184,14 @@ def _read(path: Path, similarity: Similarity) -> Flight:
 
 def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: Path) -> Camera:
     matrix = np.array(frame.camera_to_world).reshape(4, 4)
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise UserError(
+            "a camera of the path has no last row of a pose",
+            where=f"{path}, camera_to_world",
+            expected="16 numbers row by row, the last four 0, 0, 0, 1",
+            found=str(matrix[3].tolist()),
+            todo=_TODO,
+        )
     turned = matrix[:3, :3] * np.array([1.0, -1.0, -1.0])
     lengths = np.linalg.norm(turned, axis=0)
     rotation = turned / np.where(lengths > 0, lengths, 1.0)

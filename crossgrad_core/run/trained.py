@@ -95,19 +95,20 @@ class Run:
             [H, W, 3] in 0..1.
 
         Raises:
-            UserError: There is no view of that name, or the run has no checkpoint.
+            UserError: There is no view of that name, it is no camera, or the run has no checkpoint.
         """
         import torch
 
+        from crossgrad_core.run.asked_cameras import checked_camera
         from crossgrad_core.run.export import camera_renderer, renderer, view_named
         from crossgrad_core.run.process import as_in_a_command
 
         setup, state = self._open()
         with as_in_a_command(), torch.no_grad():
             if isinstance(view, str):
-                image = renderer(setup, state)(view_named(setup, view))
+                image = renderer(setup, state)(view_named(setup, view, "Run.render"))
             else:
-                image = camera_renderer(setup, state)(view)
+                image = camera_renderer(setup, state)(checked_camera(view))
             return np.asarray(image.clamp(0.0, 1.0).cpu().numpy(), dtype=np.float32)
 
     def evaluate(self) -> "EvaluationResult":

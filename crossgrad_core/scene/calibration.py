@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # A pinhole camera where every distortion parameter is 0. Fisheye models are not in the list: with
 # zero parameters they are equidistant, though pycolmap's `is_undistorted` says otherwise.
+#: Models of photos that look into all directions.
+_ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
@@ -68,6 +70,14 @@ class Calibration:
                 found=self.model,
                 todo="export the model with a camera model of COLMAP, such as PINHOLE or OPENCV",
             ) from error
+        if self.model in _ALL_AROUND:
+            raise UserError(
+                f"photos of camera model {self.model} have no pinhole camera",
+                where=where,
+                expected="perspective photos",
+                found=self.model,
+                todo="cut them into perspective views first, as COLMAP's panorama tools do",
+            )
         if not valid:
             raise UserError(
                 f"wrong number of parameters for camera model {self.model}",

@@ -12,7 +12,20 @@ from crossgrad_core.scene.wording import name_some
 from crossgrad_core.system.input_files import is_file
 
 _SUFFIXES = frozenset(
-    {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+    {
+        ".avif",
+        ".bmp",
+        ".gif",
+        ".jp2",
+        ".jpeg",
+        ".jpg",
+        ".pgm",
+        ".png",
+        ".ppm",
+        ".tif",
+        ".tiff",
+        ".webp",
+    }
     | {*SUFFIXES}
 )
 _REDUCED = (2, 4, 8)

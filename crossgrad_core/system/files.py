@@ -18,7 +18,9 @@ _FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 
 
 def size_text(count: int) -> str:
-    """A number of bytes for people, in MiB or GiB."""
+    """A number of bytes for people, in KiB, MiB or GiB."""
+    if count < 2**20:
+        return f"{count / 2**10:,.1f} KiB"
     if count < 2**30:
         return f"{count / 2**20:,.1f} MiB"
     return f"{count / 2**30:,.1f} GiB"

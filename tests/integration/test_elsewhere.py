@@ -144,3 +144,23 @@ def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
         afterwards.evaluate(trained, on=tmp_path / "nothing")
     assert sorted(trained.rglob("*")) == before
     assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
+
+
+def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
+    table = trained / "per_view_on_place.csv"
+    afterwards.evaluated_on(trained, scene)
+    before = table.read_text()
+    (tmp_path / "other").mkdir()
+    fewer = without(scene, tmp_path / "other" / "place", lambda name: name == "street/0001.png")
+    for _ in range(2):
+        afterwards.evaluated_on(trained, fewer)
+        assert table.read_text() == before
+        assert len(per_view(trained / "per_view_on_place-2.csv")) < len(per_view(table))
+    assert not (trained / "per_view_on_place-3.csv").exists()
+
+
+def test_a_scene_that_two_readers_take_is_read_as_the_run_s_own(trained, scene, tmp_path):
+    both = shutil.copytree(scene, tmp_path / "place")
+    (both / "transforms.json").write_text('{"frames": []}')
+    result, _ = afterwards.evaluated_on(trained, both)
+    assert len(result.views) == 11

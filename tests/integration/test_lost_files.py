@@ -10,6 +10,7 @@ import crossgrad_core as cg
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import afterwards, app
 from crossgrad_core.run.flight import LADDER
+from crossgrad_core.run.results import film
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.run.session import Session
 
@@ -164,3 +165,13 @@ def test_what_does_not_train_may_be_changed(run):
     assert "eval_every: 2" in text
     (run / "config.yaml").write_text(text.replace("eval_every: 2", "eval_every: 3"))
     afterwards.evaluate(run)
+
+
+def test_a_film_of_other_frames_does_not_stay(run, monkeypatch, capsys):
+    afterwards.fly(run, path=LADDER, frames=3, out=None)
+    (made,) = run.glob("renders/*/path_ladder/film.*")
+    monkeypatch.setattr(film, "_LARGEST", 100)
+    monkeypatch.setattr(film.shutil, "which", lambda _: None)
+    afterwards.fly(run, path=LADDER, frames=3, out=None)
+    assert not made.exists()
+    assert "no film: too many or too large without ffmpeg" in capsys.readouterr().out

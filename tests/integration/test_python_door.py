@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from threading import Thread
 
 import numpy as np
@@ -236,3 +237,29 @@ def test_importing_is_light():
         "assert callable(cg.run) and callable(cg.open) and callable(cg.resume)\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"fx": 0.0}, {"fx": float("nan")}, {"fy": -80.0}, {"width": 0}, {"width": 50.5},
+        {"cx": float("inf")}, {"world_to_camera": np.eye(4)},
+        {"world_to_camera": 2.0 * torch.eye(4, dtype=torch.float64)},
+        {"world_to_camera": torch.full((4, 4), float("nan"))},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_is_no_camera_is_not_drawn(reference, changed):
+    run = cg.open(reference)
+    camera = run.scene.test_views[0].camera
+    assert run.render(camera).shape == (camera.height, camera.width, 3)
+    with pytest.raises(cg.UserError) as error:
+        run.render(replace(camera, **changed))
+    assert error.value.where == "Run.render"
+
+
+@pytest.mark.parametrize("view", [5, None, "nobody"])
+def test_what_is_no_view_is_not_drawn(reference, view):
+    with pytest.raises(cg.UserError) as error:
+        cg.open(reference).render(view)
+    assert error.value.where == "Run.render"

@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.migration import NOTES, marked, migrated
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
+from crossgrad_core.wording import listed
 
 FILE = "config.yaml"
+#: Settings of every run of every version.
+_ALWAYS: Final = ("scene", "seed")
 
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
@@ -35,7 +38,16 @@ def read_config(folder: Path) -> dict[str, Any]:
             expected=f"a folder with {FILE}",
             todo="name the folder that `crossgrad run` printed",
         )
-    return migrated(_content(folder), path)
+    content = _content(folder)
+    if gone := [name for name in _ALWAYS if name not in content]:
+        raise UserError(
+            f"{FILE} is not whole",
+            where=path,
+            expected="all settings of the run",
+            found=f"no {listed(gone)}",
+            todo="restore the file from a copy; the results beside it are as they were",
+        )
+    return migrated(content, path)
 
 
 def read_notes(folder: Path) -> tuple[str, ...]:

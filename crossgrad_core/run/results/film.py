@@ -18,6 +18,8 @@ ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
 #: Bytes of all frames of an animated picture, which are in memory at once.
 _LARGEST: Final = 1 << 29
+#: Pixels that a side of one may have.
+_LONGEST: Final = 16_383
 
 
 def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
@@ -58,7 +60,7 @@ def film_files(folder: Path) -> tuple[Path, Path]:
 def write_film(frames: list[Path], fps: float) -> Path | None:
     """Writes the frames as film.mp4 beside them where ffmpeg is installed, else as film.webp.
 
-    Frames that are too many for an animated picture remain frames.
+    Frames that are too many or too large for an animated picture remain frames: None.
 
     Args:
         frames: PNG files named by their numbers from 0 on, in one folder.
@@ -96,8 +98,8 @@ def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
     from PIL import Image
 
     with Image.open(frames[0]) as image:
-        size = 3 * image.width * image.height
-    if size * len(frames) > _LARGEST:
+        size, longest = 3 * image.width * image.height, max(image.size)
+    if size * len(frames) > _LARGEST or longest > _LONGEST:
         return None
     images = []
     for frame in frames:  # Pillow wants them all at once.

@@ -52,6 +52,14 @@ def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
 
 
 def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
+    if len(line) != len(header):
+        raise UserError(
+            f"unreadable {FILE}",
+            where=path,
+            expected=f"{len(header)} cells in each line",
+            found=f"{len(line)}: {','.join(line)}",
+            todo=_TODO,
+        )
     try:
         cells = dict(zip(header[2:], line[2:], strict=True))
         values = {name: float(parse_number(cell)) if cell else None for name, cell in cells.items()}

@@ -4,10 +4,11 @@ import os.path
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import Progress, count, table_bytes
+from crossgrad_core.commands import Progress, UserError, count, table_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
@@ -23,7 +24,7 @@ from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_fi
 from crossgrad_plugins.compare.page import page_of
 from crossgrad_plugins.compare.parallel import in_parallel
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.source import check_places, read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 from crossgrad_plugins.compare.terminal import lines_of
 
@@ -56,8 +57,10 @@ def compare(
         UserError: There is nothing to compare, it does not compare, or the folder is in use.
     """
     progress = Progress()
+    _check_numbers(options)
+    check_places(places)
     folder = _default_folder(places) if out is None else out
-    check_free(folder)
+    check_free(folder, OWNED)
     progress.tell("reading runs")
     comparison = compared(read_runs(places, skip_broken=skip_broken), options)
     runs, arms = count(len(comparison.runs), "run"), count(len(comparison.arms), "arm")
@@ -77,6 +80,19 @@ def compare(
     for line in lines_of(comparison, notes):
         print(line)  # noqa: T201 - the result of the command
     print(f"\npage, figures and tables in {folder}: open {folder / PAGE}")  # noqa: T201
+
+
+def _check_numbers(options: Options) -> None:
+    for name in ("margin", "target"):
+        value = getattr(options, name)
+        if value is not None and not isfinite(value):
+            raise UserError(
+                f"the {name} is no number that a figure can have",
+                where=f"--{name}",
+                expected="a finite number",
+                found=str(value),
+                todo="give one, or leave it out",
+            )
 
 
 def drawn_figures(comparison: Comparison) -> list[Drawn]:

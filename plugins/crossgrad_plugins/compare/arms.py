@@ -111,7 +111,8 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
     """
     new = {arm.name: arm.name for arm in arms}
     for text in names:
-        old = next((arm.name for arm in arms if text.startswith(f"{arm.name}:")), None)
+        fitting = (arm.name for arm in arms if text.startswith(f"{arm.name}:"))
+        old = max(fitting, key=len, default=None)
         if old is None or text == f"{old}:":
             raise UserError(
                 "no arm has this name",
@@ -186,5 +187,5 @@ def _of_one(run: Run) -> str:
 def _natural(name: str) -> list[tuple[int, str]]:
     """A key that sorts numbers by their size."""
     return [
-        (int(part), "") if part.isdigit() else (-1, part) for part in _DIGITS.split(name) if part
+        (int(part), "") if part.isdecimal() else (-1, part) for part in _DIGITS.split(name) if part
     ]

@@ -141,7 +141,7 @@ def compared(found: Found, options: Options) -> Comparison:
         cells=cells,
         main=main,
         standing=work.standing,
-        noise=ranking.noise(work.standing),
+        noise=ranking.noise(work.standing, main),
         ends=work.ends(),
         equal=work.equal(),
         amounts=work.amounts,
@@ -260,13 +260,16 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
 
 def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
     """Notes on runs that have no figure at their ends."""
-    return [
-        f"{run.name} has no {quantity.label} at its end (not finite): its pair is left out, and it "
-        "never reaches a quality that it did not reach before"
-        for by in main.values()
-        for run in by.values()
-        if run.final(quantity.name) is None
-    ]
+    notes = []
+    for run in {run.name: run for by in main.values() for run in by.values()}.values():
+        if run.final(quantity.name) is None:
+            held_out = run.number("overall", "views") != 0.0
+            why = "not finite" if held_out else "no view is held out"
+            notes.append(
+                f"{run.name} has no {quantity.label} at its end ({why}): its pair is left out, and "
+                "it never reaches a quality that it did not reach before"
+            )
+    return notes
 
 
 def _not_main(cells: Cells) -> dict[str, str]:

@@ -4,7 +4,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import UserError, check_folder, disk_errors, write_atomically
+from crossgrad_core.commands import (
+    UserError,
+    check_folder,
+    disk_errors,
+    is_leftover,
+    write_atomically,
+)
 
 #: The page; a folder that has it and the mark in it is a comparison.
 PAGE: Final = "index.html"
@@ -14,14 +20,29 @@ FIGURES: Final = "figures"
 _BEGINNING: Final = 2000
 
 
-def check_free(folder: Path) -> None:
+def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
     """Refuses a folder with anything in it that is not an earlier comparison.
+
+    One that was broken off has no page yet, and nothing but files of a comparison.
+
+    Args:
+        folder: The folder.
+        owned: All files that a comparison may have besides its page, as paths below the folder.
 
     Raises:
         UserError: What is in the way, and what to do.
     """
     check_folder(folder)
-    if not folder.is_dir() or is_comparison(folder) or not any(folder.iterdir()):
+    if not folder.is_dir() or is_comparison(folder):
+        return
+    known = {PAGE, *owned} if (folder / FIGURES).is_dir() else set()
+    there = (path for path in folder.rglob("*") if not path.is_dir())
+    others = [
+        path
+        for path in there
+        if path.relative_to(folder).as_posix() not in known and not is_leftover(path)
+    ]
+    if not others and not (folder / PAGE).exists():
         return
     raise UserError(
         "the folder holds something else than a comparison",

@@ -106,6 +106,10 @@ def arm_rows(comparison: Comparison) -> list[ArmRow]:
 
 def _arm_row(comparison: Comparison, name: str) -> ArmRow:
     runs = list(comparison.main[name].values())
+    problems = [by.keys() for by in comparison.main.values() if by]
+    # Scenes that other arms lack would make its costs another thing than theirs.
+    shared = set.intersection(*map(set, problems)) if problems else set()
+    own = [run for at, run in comparison.main[name].items() if at in shared] or runs
     failed = next(len(arm.failed) for arm in comparison.arms if arm.name == name)
     against, verdict = _against(comparison, name)
     return ArmRow(
@@ -116,10 +120,10 @@ def _arm_row(comparison: Comparison, name: str) -> ArmRow:
         standing=tuple(_standing(comparison, name, scene) for scene in comparison.scenes),
         against=against,
         verdict=verdict,
-        spent=tuple(_mean([run.spent(cost) for run in runs], cost) for cost in comparison.costs),
-        primitives=_mean([run.number("primitives") for run in runs]),
-        peak=_mean([run.peak_primitives for run in runs]),
-        memory=_mean([run.number("peak_memory_mib") for run in runs]),
+        spent=tuple(_mean([run.spent(cost) for run in own], cost) for cost in comparison.costs),
+        primitives=_mean([run.number("primitives") for run in own]),
+        peak=_mean([run.peak_primitives for run in own]),
+        memory=_mean([run.number("peak_memory_mib") for run in own]),
     )
 
 

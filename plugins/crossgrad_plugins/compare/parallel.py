@@ -1,9 +1,11 @@
 """Figures that are drawn at the same time."""
 
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from typing import TypeVar
 
@@ -24,5 +26,7 @@ def in_parallel(drawings: Sequence[Callable[[], _Drawn]]) -> list[_Drawn]:
     workers = min(len(available_cores()), len(drawings)) if sys.platform == "linux" else 1
     if workers == 1 or threading.active_count() > 1:
         return [draw() for draw in drawings]
-    with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
+    # Ctrl-C reaches every process of a terminal: this one alone says that it was interrupted.
+    quiet = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(workers, mp_context=get_context("fork"), initializer=quiet) as pool:
         return [future.result() for future in [pool.submit(draw) for draw in drawings]]

@@ -68,15 +68,25 @@ def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -
     return tuple(sorted(score, key=lambda arm: (np.isnan(score[arm]), sign * score[arm])))
 
 
-def noise(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, tuple[float, int]]:
+def noise(
+    standing: Mapping[str, Mapping[str, Standing]], runs: Mapping[str, Runs]
+) -> dict[str, tuple[float, int]]:
     """Scene -> standard deviation of a run over its seeds, pooled over arms, and its freedom.
 
-    Scenes with one seed per arm are left out: there is no telling.
+    Scenes with one seed per arm are left out: there is no telling. Runs that stand for two arms
+    count once.
+
+    Args:
+        standing: What `standings` finds.
+        runs: The runs of each arm.
     """
     sums: dict[str, tuple[float, int]] = {}
-    for by in standing.values():
+    counted: set[frozenset[str]] = set()
+    for arm, by in standing.items():
         for scene, each in by.items():
-            if each.seeds > 1:
+            own = frozenset(run.name for (at, _), run in runs[arm].items() if at == scene)
+            if each.seeds > 1 and own not in counted:
+                counted.add(own)
                 total, freedom = sums.get(scene, (0.0, 0))
                 more = each.seeds - 1
                 sums[scene] = total + more * each.spread**2, freedom + more

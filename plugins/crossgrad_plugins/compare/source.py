@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from crossgrad_core.commands import RunConfig, UserError, find_runs, read_results, read_rows
 from crossgrad_plugins.compare.run import Run
@@ -64,6 +64,15 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> Found:
     folders = list(dict.fromkeys(folder for place in places for folder in _folders(place)))
     names = _short_names(folders)
     labels = {parent: _labels(parent) for parent in {folder.parent for folder in folders}}
+    for folder in dict.fromkeys(each for place in places for each in _headless(place)):
+        if not skip_broken:
+            raise UserError(
+                "results of a run without its config.yaml",
+                where=folder,
+                todo="restore the file, or move the folder away; --skip-broken leaves this run out "
+                "and compares the others",
+            )
+        found.left_out[str(folder)] = "has no config.yaml"
     for folder in folders:
         try:
             results = read_results(folder)
@@ -76,17 +85,40 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> Found:
     return found
 
 
+def check_places(places: Sequence[Path]) -> None:
+    """Refuses what is no folder, before anything is said of where results go.
+
+    Raises:
+        UserError: One is a file, or is not there.
+    """
+    for place in places:
+        if not place.is_dir():
+            raise _no_run(place)
+
+
 def _folders(place: Path) -> Iterator[Path]:
     found = find_runs(place) if place.is_dir() else ()
     if not found:
-        raise UserError(
-            "no run to compare",
-            where=place,
-            expected="the folder of a run, or one with runs below it",
-            found="no config.yaml" if place.is_dir() else "no such folder",
-            todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
-        )
+        raise _no_run(place)
     yield from (folder.resolve() for folder in found)
+
+
+def _no_run(place: Path) -> UserError:
+    there = "a file" if place.is_file() else "no such folder"
+    return UserError(
+        "no run to compare",
+        where=place,
+        expected="the folder of a run, or one with runs below it",
+        found="no config.yaml" if place.is_dir() else there,
+        todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
+    )
+
+
+def _headless(place: Path) -> Iterator[Path]:
+    """Folders with results of a run at or below a place whose config.yaml is gone."""
+    for path in sorted(place.rglob("summary.json")):
+        if not (path.parent / "config.yaml").exists():
+            yield path.parent.resolve()
 
 
 def _broken(error: UserError) -> UserError:
@@ -107,13 +139,40 @@ def _sort_in(found: Found, name: str, results: "RunResults", label: str | None) 
     run = Run(name, results, results.summary, _config(results), label)
     if run.status == "failed":
         found.failed.append(run)
-        found.left_out[name] = f"failed: {run.summary.get('error')}"
+        found.left_out[name] = f"failed: {' '.join(str(run.summary.get('error')).split())}"
     elif run.status != "finished":
         found.left_out[name] = "was stopped before its end"
     elif not results.rows:
         found.left_out[name] = "was never evaluated: metrics.csv has no row"
     else:
+        _check_whole(results)
         found.runs.append(run)
+
+
+def _check_whole(results: "RunResults") -> None:
+    """Refuses a finished run of which a table is cut off or gone: readings would be of elsewhere.
+
+    Raises:
+        UserError: metrics.csv ends before the run did, or held-out views have no figures.
+    """
+    summary = results.summary or {}
+    last, steps = results.rows[-1].get("step"), summary.get("step")
+    if last != steps:
+        raise UserError(
+            "metrics.csv does not go to the end of the run",
+            where=results.folder / "metrics.csv",
+            expected=f"a last row of step {steps}, which summary.json is of",
+            found=f"step {last:.0f}" if last is not None else "no step",
+            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+        )
+    if (summary.get("overall") or {}).get("views") and not results.views:
+        raise UserError(
+            "the figures of the held-out views are gone",
+            where=results.folder / "per_view.csv",
+            expected="a row of each",
+            found="no such file, or an empty one",
+            todo=f"crossgrad eval {results.folder} writes them again",
+        )
 
 
 def _check_summary(results: "RunResults") -> None:
@@ -123,9 +182,16 @@ def _check_summary(results: "RunResults") -> None:
         raise UserError(
             "unreadable summary.json",
             where=results.folder / "summary.json",
-            found=str(error),
+            found=_in_words(error),
             todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
         ) from error
+
+
+def _in_words(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return " ".join(str(error).split())
+    problems = error.errors(include_url=False, include_context=False)
+    return "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in problems)
 
 
 def _config(results: "RunResults") -> dict[str, object]:
@@ -142,7 +208,7 @@ def _config(results: "RunResults") -> dict[str, object]:
         raise UserError(
             "unreadable configuration of a run",
             where=results.folder / "config.yaml",
-            found=str(error),
+            found=_in_words(error),
             todo="restore the file, or read the run with the version that wrote it",
         ) from error
 

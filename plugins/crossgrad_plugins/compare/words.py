@@ -53,6 +53,8 @@ def claim(contrast: Contrast) -> str:
     if contrast.verdict is Verdict.EQUIVALENT:
         both = f"{contrast.first} and {contrast.second}"
         return f"{both} are equivalent within {_margin(contrast)}{_except(contrast)}"
+    if found.center == 0.0:
+        return f"Inconclusive: no difference between {contrast.first} and {contrast.second}"
     return f"Inconclusive: {better} is {size} ahead of {worse}, which may be noise"
 
 
@@ -129,10 +131,7 @@ def noise_sentence(comparison: Comparison) -> str:
 
 def _alone(comparison: Comparison) -> Sentence:
     if len(comparison.arms) > 1:
-        return Sentence(
-            "The arms share no scene with the same seed: nothing is paired",
-            "run them on the same scenes with the same seeds",
-        )
+        return _unpaired(comparison)
     quantity = comparison.quantity
     by = comparison.standing[comparison.arms[0].name]
     finals = ", ".join(
@@ -141,6 +140,26 @@ def _alone(comparison: Comparison) -> Sentence:
         for scene, each in by.items()
     )
     return Sentence("One arm: there is nothing to compare it with", finals)
+
+
+def _unpaired(comparison: Comparison) -> Sentence:
+    """Why several arms have no pair."""
+    failed = [arm.name for arm in comparison.arms if arm.failed and not arm.runs]
+    if failed:
+        return Sentence(
+            f"Nothing is paired: every run of {', '.join(failed)} failed", "see what is left out"
+        )
+    problems = [set(by) for by in comparison.main.values() if by]
+    if len(problems) > 1 and set.intersection(*problems):
+        return Sentence(
+            f"Nothing is paired: no scene and seed has {comparison.quantity.label} at the ends of "
+            "two arms",
+            "see the notes",
+        )
+    return Sentence(
+        "The arms share no scene with the same seed: nothing is paired",
+        "run them on the same scenes with the same seeds",
+    )
 
 
 def _of_the_best(comparison: Comparison) -> list[Sentence]:

@@ -144,9 +144,13 @@ def views_per_step(evidence: Evidence) -> Decision:
     probe, figures = evidence.probe, {}
     # docs/results/two-views.md and docs/results/paper.md.
     shown = "at equal seconds two views ended 0.22 and 0.07 dB below one over our scenes"
-    if probe is not None and not probe.problem and not isnan(probe.noise_scale):
+    if probe is not None and probe.problem:
+        shown += f"; the probe tells nothing: {probe.problem}"
+    elif probe is not None and not isnan(probe.noise_scale):
         figures = {"noise_scale": probe.noise_scale}
-        shown += f"; gradient noise scale {probe.noise_scale:.0f} views"
+        known = isfinite(probe.noise_scale)
+        scale = f"{probe.noise_scale:.0f} views" if known else "beyond all views: no common part"
+        shown += f"; gradient noise scale {scale}"
     saved = "further renders of a step"
     return plain.found(shown, decided=True, saved=saved, figures=figures)
 

@@ -122,6 +122,11 @@ def _names(root: Path) -> Iterator[str]:
         yield from ((here / file).as_posix() for file in sorted(files) if file[0] != ".")
 
 
+#: What a TIFF may hold that no photo has; by Pillow's names.
+_MODES_OF_TIFF: Final = ("I", "1")
+_VALUES: Final = {"F": "floating point", "I": "32 bits", "1": "1 bit"}
+
+
 def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
     """Names of the photos, and of those that cannot be used by what they are called."""
     usable, left_out = [], []
@@ -175,6 +180,15 @@ def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
     """
     path = root / name
     with opened(path, "the photo cannot be decoded") as image:
+        if image.mode == "F" or (image.format == "TIFF" and image.mode in _MODES_OF_TIFF):
+            # COLMAP would write them again in a form that nobody reads.
+            raise UserError(
+                "its values are none of a photo",
+                where=path,
+                expected="8 or 16 bits",
+                found=f"{image.format}, {_VALUES[image.mode]}",
+                todo="save it as JPEG or PNG",
+            )
         camera, position = camera_of(image), position_of(image)
         orientation = orientation_of(image)
         brightness, sharpness, transparent = _look(image, header)

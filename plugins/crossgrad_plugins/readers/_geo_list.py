@@ -4,6 +4,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -35,7 +36,8 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
 
     Args:
         path: The file.
-        names: The photos of the scene; the list may leave out their folders.
+        names: The photos of the scene; the list may leave out their folders, and have another
+            suffix or case.
 
     Raises:
         UserError: The file cannot be read, a line lacks numbers, or the system is not known.
@@ -43,8 +45,11 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
     first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
     rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
     known, to_degrees = _by_file(names), _system(" ".join(first), path)
-    found = ((known[name], to_degrees(row)) for name, row in rows.items() if name in known)
-    return measured(found, path.name)
+    loose = _by_file(names, _folded)
+    photos = {name: known.get(name) or loose.get(_folded(name)) for name in rows}
+    found = ((photo, to_degrees(rows[name])) for name, photo in photos.items() if photo)
+    strangers = tuple(name for name, photo in photos.items() if not photo)
+    return replace(measured(found, path.name), strangers=strangers)
 
 
 def _text(path: Path) -> str:
@@ -73,11 +78,19 @@ def _wrong(path: Path, expected: str, found: str) -> UserError:
     )
 
 
-def _by_file(names: Collection[str]) -> dict[str, str]:
-    """Photos by their names and, where only one has it, by that of the file alone."""
-    times = Counter(PurePosixPath(name).name for name in names)
-    alone = {PurePosixPath(n).name: n for n in names if times[PurePosixPath(n).name] == 1}
-    return {**alone, **{name: name for name in names}}
+def _folded(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix("")).casefold()
+
+
+def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[str, str]:
+    """Photos by what is said of their names and, where only one has it, of the file's alone."""
+    files = {name: said(PurePosixPath(name).name) for name in names}
+    whole = {name: said(name) for name in names}
+    found: dict[str, str] = {}
+    for called in (files, whole):
+        times = Counter(called.values())
+        found |= {text: name for name, text in called.items() if times[text] == 1}
+    return found
 
 
 def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:

@@ -19,11 +19,13 @@ class Measured:
         source: What tells it.
         places: Name of a photo -> its place.
         flat: Number of photos of which all but the altitude is known, beside those.
+        strangers: Names that are those of no photo.
     """
 
     source: str
     places: Mapping[str, Place] = field(default_factory=dict)
     flat: int = 0
+    strangers: tuple[str, ...] = ()
 
 
 def of_headers(files: Mapping[str, Path], source: str) -> Measured:

@@ -59,6 +59,9 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
         if not shown:
             if measured.flat:
                 notes.append(f"{measured.source}: {count(measured.flat, 'photo')} without altitude")
+            elif measured.strangers:
+                names, first = count(len(measured.strangers), "name"), measured.strangers[0]
+                notes.append(f"{measured.source}: {names}, such as {first}, and none of a photo")
             elif named is not None:
                 notes.append(f"{measured.source}: no photo of the scene is there, or has a place")
             continue

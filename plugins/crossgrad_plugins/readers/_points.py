@@ -18,6 +18,8 @@ from crossgrad_plugins.readers._inside import Inside
 #: Names under which tools put points beside their poses, the first one that is there is taken.
 USUAL: Final = ("sparse_pc.ply", "points3D.ply", "points3d.ply", "point_cloud.ply", "points.ply")
 _GREY: Final = 127
+#: Colours that reach this have 16 bits.
+_LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 #: Points and photos that are tried, and the share of points that some photo has to show.
 _TRIED, _FEWEST = 1000, 0.01
@@ -143,7 +145,7 @@ def _placed(points: Points, frame: Frame3D) -> Points:
 
 
 def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[np.uint8]:
-    """[P, 3] from whole numbers to 255, or from fractions to 1."""
+    """[P, 3] from whole numbers to 255 or to 65,535, or from fractions to 1."""
     names = next((names for names in _COLORS if all(name in columns for name in names)), None)
     if names is None:
         return np.full((count, 3), _GREY, dtype=np.uint8)
@@ -152,6 +154,8 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
         return stored
     with np.errstate(invalid="ignore"):
         values = np.nan_to_num(stored.astype(np.float64))
-    # Text files hold no types: numbers above 1 are of the whole kind.
-    top = 1.0 if np.abs(values).max(initial=0.0) <= 1.0 else 255.0
+    # Text files hold no types: numbers above 1 are of the whole kind, and far above 255 of the
+    # longer one, as scanners write.
+    largest = np.abs(values).max(initial=0.0)
+    top = 1.0 if largest <= 1.0 else 255.0 if largest < _LONG else 65_535.0
     return np.rint(values.clip(0.0, top) * (255.0 / top)).astype(np.uint8)

@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, TypeAlias
 
-from crossgrad_core.commands import UserError, listed
+from crossgrad_core.commands import UserError, layered, listed
 from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, choices, scene_name
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.standing import Standing, figure
@@ -44,6 +44,11 @@ def best_grid(
     arms: list[dict[str, Any]] = []
     for arm in grid.arms:
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
+        if len(own) == 1 and len(grid.arms) > 1:
+            # Nothing varies in it: an arm that the others are held against.
+            settings = layered([arm.settings, own[0].parameters])
+            arms.append({"name": arm.name, "settings": settings, "by_scene": arm.by_scene})
+            continue
         best = {}
         for scene in map(scene_name, grid.scenes):
             chosen, without = _best(own, scene, ends, grid)
@@ -65,7 +70,9 @@ def best_grid(
 def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """The arm as it is, and with its best parameters; its own settings by scene win, as before."""
     own = {"settings": arm.settings}
-    by_scene = {scene: {**values, **arm.by_scene.get(scene, {})} for scene, values in best.items()}
+    by_scene = {
+        scene: layered([values, arm.by_scene.get(scene, {})]) for scene, values in best.items()
+    }
     yield {"name": arm.name, **own, "by_scene": arm.by_scene}
     yield {"name": f"{arm.name}, best", **own, "by_scene": by_scene}
 
@@ -116,11 +123,18 @@ def _check_ended(
     found: Sequence[tuple[Choice, Mapping[int, float | None]]], scene: str, grid: Grid
 ) -> None:
     ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in found)
-    if len(found) < 2 or ended < len(found):  # noqa: PLR2004 - one is no choice
+    if len(found) == 1:
+        raise UserError(
+            "nothing varies in the grid's only arm: there is nothing to choose",
+            where=f"arm {found[0][0].arm.name}",
+            expected="parameters with several values",
+            todo="run the grid as it is",
+        )
+    if ended < len(found):
         raise UserError(
             "the best parameters are not known yet",
             where=f"{scene}, arm {found[0][0].arm.name}",
-            expected="parameters that vary, and a finished run of each of their values and seeds",
+            expected="a finished run of each value and seed",
             found=f"{ended} of {len(found)} values finished",
             todo="finish the sweep first: the same command without --best",
         )

@@ -263,8 +263,18 @@ def _of_the_settings(grid: Grid) -> Iterator[Problem]:
             if name in settings:
                 yield Problem(f"{place}.{name}", f"is not for a grid to set: list it in {axis}")
     yield from _of_the_names(grid)
+    yield from _of_the_configurations(grid)
+
+
+def _of_the_configurations(grid: Grid) -> Iterator[Problem]:
     if (runs := _number_of_runs(grid)) > MOST_RUNS:
         yield Problem("the grid", f"has {runs:.3g} runs, more than {MOST_RUNS:,}")
+        return
+    if _twice(arm.name for arm in grid.arms):
+        return
+    for label in _twice(choice.label for choice in choices(grid)):
+        hint = "tables tell configurations apart by their names"
+        yield Problem("arms", f"two configurations are called {label!r}", hint)
 
 
 def _of_the_names(grid: Grid) -> Iterator[Problem]:

@@ -90,6 +90,8 @@ def read_records(folder: Path) -> list[Record]:
 def _lines(path: Path) -> Iterator[Record]:
     for line in path.read_bytes().splitlines():
         try:
-            yield Record(**json.loads(line))
+            record = Record(**json.loads(line))
+            _ = record.when
         except (TypeError, ValueError):
             continue
+        yield record

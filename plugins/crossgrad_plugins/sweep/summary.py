@@ -60,12 +60,16 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay below it."""
+    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay below it.
+
+    A run of both is what the new grid calls it.
+    """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
+    known = {run for run, *_ in rows}
     rows += [
         (run, scene, label, seed)
         for run, scene, label, seed in _read_plan(layout, writes=True)
-        if (run, scene, label, seed) not in rows and layout.run(run).is_dir()
+        if run not in known and layout.run(run).is_dir()
     ]
     write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])
 

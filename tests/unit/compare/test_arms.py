@@ -233,3 +233,15 @@ def test_settings_are_flat_texts():
         "reading.max_size": "400",
         "background": "black",
     }
+
+
+def test_names_may_have_other_digits_and_colons(tmp_path):
+    plan = ["run,scene,configuration,seed"]
+    for number, name in enumerate(("rate 10\u2074", "two", "two: x")):
+        RunFolder(views_per_step=1 + number).write(tmp_path / "runs" / f"r{number}")
+        plan.append(f"r{number},city,{name},0")
+    (tmp_path / "runs.csv").write_text("\n".join(plan) + "\n")
+    arms = arms_of(read_runs([tmp_path], skip_broken=False).runs)
+    assert [arm.name for arm in arms] == ["rate 10\u2074", "two", "two: x"]
+    names = [arm.name for arm in renamed(arms, ["two: x:new"])]
+    assert names == ["rate 10\u2074", "two", "new"]

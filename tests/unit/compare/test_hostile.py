@@ -33,9 +33,13 @@ def _folder(tmp_path):
     [
         ("metrics.csv", "step,psnr\n1,high\n"),
         ("metrics.csv", "step,psnr\n1\n"),
+        ("metrics.csv", "step,psnr\n300,20.0\n"),
         ("summary.json", '{"status": "fin'),
         ("summary.json", "[]"),
         ("per_view.csv", "nothing\n"),
+        ("per_view.csv", "name,regime,psnr\na/1.jpg,far\n"),
+        ("config.yaml", ""),
+        ("config.yaml", "crossgrad: '0.2'\nscene: /scenes/city\nsteps: 600\n"),
         ("config.yaml", "seed: [1\n"),
         ("config.yaml", "seed: one\n"),
         ("config.yaml", "crossgrad: 9.9\n"),
@@ -150,3 +154,70 @@ def test_an_old_run_beside_a_new_one(tmp_path):
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     assert "ssim_skimage is not compared: new did not measure it" in found.notes
     assert len(found.arms) == 2
+
+
+def test_figures_of_views_that_are_gone_are_told(folder):
+    (folder / "1-1" / "per_view.csv").unlink()
+    with pytest.raises(UserError) as error:
+        read_runs([folder], skip_broken=False)
+    assert "the figures of the held-out views are gone" in error.value.what
+    assert "crossgrad eval" in error.value.todo
+    assert list(read_runs([folder], skip_broken=True).left_out) == ["1-1"]
+
+
+def test_results_without_their_configuration_are_not_passed_over(folder):
+    (folder / "1-1" / "config.yaml").unlink()
+    with pytest.raises(UserError, match="without its"):
+        read_runs([folder], skip_broken=False)
+    found = read_runs([folder], skip_broken=True)
+    assert len(found.runs) == 5
+    assert list(found.left_out.values()) == ["has no config.yaml"]
+
+
+def test_a_file_is_refused_as_what_it_is(folder):
+    grid = folder / "grid.yaml"
+    grid.write_text("base: {}")
+    with pytest.raises(UserError) as error:
+        app.compare([grid], Options(), None, skip_broken=False)
+    assert (error.value.what, error.value.found) == ("no run to compare", "a file")
+
+
+@pytest.mark.parametrize("name", ["margin", "target"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_no_figure_is_at_infinity(folder, name, value):
+    with pytest.raises(UserError) as error:
+        app.compare([folder], Options(**{name: value}), folder / "out", skip_broken=False)
+    assert error.value.where == f"--{name}"
+
+
+def test_a_comparison_that_was_broken_off_is_replaced(folder):
+    out = folder / "out"
+    app.compare([folder], Options(), out, skip_broken=False)
+    (out / "index.html").unlink()
+    (out / ".index.html.123.tmp").touch()
+    app.compare([folder], Options(), out, skip_broken=False)
+    (out / "index.html").unlink()
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="something else"):
+        app.compare([folder], Options(), out, skip_broken=False)
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_why_nothing_is_paired_is_said(tmp_path):
+    for seed in range(2):
+        RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
+        RunFolder(seed=seed, views_per_step=2, status="failed").write(tmp_path / f"bad-{seed}")
+    assert "Nothing is paired: every run of views=2 failed" in headlines(tmp_path)
+
+
+def test_arms_without_a_figure_at_their_ends_are_not_said_to_share_no_scene(tmp_path):
+    for seed in range(2):
+        RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
+        RunFolder(seed=seed, views_per_step=2, final=float("nan")).write(tmp_path / f"bad-{seed}")
+    assert "no scene and seed has PSNR at the ends of two arms" in headlines(tmp_path)
+
+
+def test_a_tie_has_no_leader(tmp_path):
+    for views in (1, 2):
+        RunFolder(views_per_step=views).write(tmp_path / f"{views}")
+    assert "Inconclusive: no difference between views=1 and views=2" in headlines(tmp_path)

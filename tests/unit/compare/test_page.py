@@ -11,6 +11,7 @@ from support.run_folders import RunFolder
 from crossgrad_core.cli.main import main
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.page import arm_rows
 from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 
@@ -169,3 +170,15 @@ def test_only_a_comparison_is_replaced_and_the_same_runs_give_the_same_bytes(wri
     (other / "index.html").write_text("<html>somebody's</html>")
     assert run(*runs, "--out", str(other)) == 2
     assert (other / "index.html").read_text() == "<html>somebody's</html>"
+
+
+def test_costs_are_those_of_the_scenes_that_all_arms_have(tmp_path):
+    for scene, primitives in (("city", 1000), ("beach", 9000)):
+        for views in (1, 2) if scene == "city" else (1,):
+            run = RunFolder(scene, views_per_step=views, primitives=primitives)
+            run.write(tmp_path / f"{scene}-{views}")
+    found = compared(read_runs([tmp_path], skip_broken=False), Options())
+    assert {row.name: (row.primitives, row.runs) for row in arm_rows(found)} == {
+        "views=1": ("1,000", 2),
+        "views=2": ("1,000", 1),
+    }

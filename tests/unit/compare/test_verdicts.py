@@ -6,7 +6,10 @@ from math import inf, isnan, nan, sqrt
 import numpy as np
 import pytest
 from scipy.stats import trim_mean, ttest_1samp
+from support.run_folders import RunFolder
 
+from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
 from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate
 from crossgrad_plugins.compare.statistics.holm import holm
@@ -180,3 +183,19 @@ def test_scenes_that_contradict_a_verdict_are_told(levels, verdict, contradictin
 
 def test_one_scene_contradicts_nothing():
     assert estimate([0.1, 0.2, 0.3], ["a"] * 3, 0.1).by_scene == ()
+
+
+def test_runs_that_stand_for_two_arms_are_counted_once_in_the_noise(tmp_path):
+    plan = ["run,scene,configuration,seed"]
+    for number, final in enumerate((20.0, 20.4, 21.0, 22.0)):
+        seed, views = number % 2, 1 + number // 2
+        run = RunFolder(seed=seed, final=final, views_per_step=views)
+        run.write(tmp_path / "runs" / f"r{number}")
+        labels = ("one", "also one") if views == 1 else ("two",)
+        plan += [f"r{number},city,{label},{seed}" for label in labels]
+    (tmp_path / "runs.csv").write_text("\n".join(plan) + "\n")
+    found = compared(read_runs([tmp_path], skip_broken=False), Options())
+    assert len(found.arms) == 3
+    spread, freedom = found.noise["city"]
+    assert freedom == 2
+    assert spread == pytest.approx(sqrt((0.4**2 / 2 + 1.0**2 / 2) / 2))

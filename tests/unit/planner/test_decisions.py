@@ -4,6 +4,7 @@ import csv
 import json
 import os
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -353,6 +354,13 @@ def test_a_probe_that_fails_decides_nothing():
         found = part(evidence)
         assert found.basis == "default"
         assert probe.problem in found.evidence
+    assert probe.problem in groups.views_per_step(evidence).evidence
+
+
+def test_a_noise_scale_without_an_end_is_not_told():
+    probe = Probe(rho=0.5, rho_low=0.1, rho_high=0.9, noise_scale=inf, conflict=0.5)
+    found = groups.views_per_step(evidence_of("city_unimodal", probe))
+    assert found.evidence.endswith("gradient noise scale beyond all views: no common part")
 
 
 def orbit(count=40):

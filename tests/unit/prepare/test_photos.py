@@ -351,3 +351,18 @@ def test_names_with_spaces_and_signs_are_photos_and_hidden_files_are_not(tmp_pat
     used, left_out = found(tmp_path)
     assert sorted(used) == ["a b é.JPG", "über uns/1,2.png"]
     assert not left_out
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"), [("F", "floating point"), ("I", "32 bits"), ("1", "1 bit")]
+)
+def test_values_that_colmap_would_write_for_nobody_are_left_out(mode, words, tmp_path):
+    for name in ("good.jpg", "better.jpg"):
+        save(tmp_path / name)
+    levels = np.linspace(0, 1, 90 * 70).reshape(70, 90)
+    scaled = {"F": levels.astype(np.float32), "I": (levels * 2**30).astype(np.int32)}
+    image = Image.fromarray(scaled[mode]) if mode in scaled else Image.fromarray(levels > 0.5)
+    image.save(tmp_path / "odd.tif")
+    used, left_out = found(tmp_path)
+    assert set(used) == {"good.jpg", "better.jpg"}
+    assert words in left_out["odd.tif"]

@@ -497,7 +497,7 @@ class TestModels:
         path = make()
         record = struct.pack("<QIiQQ2d", 1, 1, 17, 48, 32, 48.0, 32.0)
         (model(path) / "cameras.bin").write_bytes(record)
-        refuses(path, "EQUIRECTANGULAR cannot be undistorted")
+        refuses(path, "EQUIRECTANGULAR have no pinhole camera", "0000.png")
 
     @pytest.mark.parametrize(
         ("params", "words"),

@@ -474,3 +474,15 @@ def test_a_chunk_of_metashape_on_earth_tells(plain, tmp_path, frame):
     chunk = read(path, "metashape", frame="chunk") if frame == "local" else scene
     own = chunk.similarity.to_input(np.stack([v.camera.center.numpy() for v in chunk.views]))
     np.testing.assert_allclose(here, own, atol=1e-6)
+
+
+def test_a_list_of_other_suffixes_and_case_is_of_these_photos(scene):
+    text = geo_list(scene, "EPSG:4326", in_degrees).replace(".jpg", ".JPG")
+    (scene / "geo.txt").write_text(text)
+    assert "geo.txt, 10 of 10" in read(scene).georeference.note
+
+
+def test_a_list_of_other_photos_is_told(scene):
+    (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
+    found = read(scene)
+    assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note

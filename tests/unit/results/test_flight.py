@@ -16,6 +16,8 @@ from crossgrad_core.testing.posed import posed_scene, posed_view
 
 FRAMES = 9
 IDENTITY = np.eye(4).ravel().tolist()
+#: Column by column, as other programs write matrices.
+TURNED = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]
 FAR_AWAY = [*IDENTITY[:3], 1e20, *IDENTITY[4:]]
 
 
@@ -117,8 +119,11 @@ def test_a_camera_path_is_read_in_input_coordinates(tmp_path):
         ({"camera_path": []}, "camera_path"),
         ({"render_width": 0}, "render_width"),
         ({"fps": "fast"}, "fps"),
+        ({"fps": 1e-9}, "fps"),
+        ({"camera_type": "equirectangular"}, "camera_type"),
+        ({"camera_path": [{"camera_to_world": TURNED, "fov": 50}]}, "row by row"),
         ({"camera_path": [{"camera_to_world": [1.0] * 15, "fov": 50}]}, "camera_to_world"),
-        ({"camera_path": [{"camera_to_world": [0.0] * 16, "fov": 50}]}, "no rotation"),
+        ({"camera_path": [{"camera_to_world": [0.0] * 15 + [1], "fov": 50}]}, "no rotation"),
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16, "fov": 50}]}, "camera_to_world"),
         ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 180}]}, "fov"),
         ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 1e-9}]}, "fov"),
@@ -152,6 +157,10 @@ def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypa
         assert (found.n_frames, found.size) == (3, (8, 6))
     monkeypatch.setattr(film, "_LARGEST", 100)
     assert film.write_film(frames, 10.0) is None
+    wide = film.write_frames([torch.zeros(1, 16_384, 3)], tmp_path / "wide")
+    monkeypatch.undo()
+    monkeypatch.setattr(film.shutil, "which", lambda _: None)
+    assert film.write_film(wide, 10.0) is None
 
 
 def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monkeypatch):

@@ -79,7 +79,7 @@ def test_a_run_by_figure_and_regime(folder: Path, result):
         ("", "an empty file"),
         ("name,psnr\n", "name,psnr"),
         ("name,regime,psnr,psnr\n", "name,regime,psnr,psnr"),
-        ("name,regime,psnr\na,b\n", "shorter"),
+        ("name,regime,psnr\na,b\n", "2: a,b"),
         ("name,regime,psnr\na,b,high\n", "not a number"),
     ],
 )

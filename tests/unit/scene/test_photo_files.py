@@ -1,5 +1,6 @@
 """Names of photos that leave no room for what is looked for beside them."""
 
+import pytest
 from PIL import Image
 
 from crossgrad_core.scene.photo_files import PhotoFolder, find_mask
@@ -24,3 +25,9 @@ def test_a_mask_is_called_as_other_programs_call_it_the_first_that_is_there(tmp_
         (tmp_path / name).touch()
         assert find_mask(tmp_path, "a/1.jpg") == tmp_path / name
     assert find_mask(tmp_path, "a/2.jpg") is None
+
+
+@pytest.mark.parametrize("suffix", [".avif", ".gif", ".webp", ".JPG"])
+def test_a_photo_may_have_another_suffix_than_its_pose_says(tmp_path, suffix):
+    (tmp_path / f"one{suffix}").touch()
+    assert PhotoFolder(tmp_path).find("one.png", ()) == tmp_path / f"one{suffix}"

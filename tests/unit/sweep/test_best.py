@@ -138,3 +138,31 @@ def test_it_is_refused_before_all_is_finished(swept, tmp_path):
     ]
     with pytest.raises(UserError, match="0 of 3 values finished"):
         best_grid(grid, cells, left, tmp_path)
+
+
+def test_settings_by_scene_are_laid_over_the_best_ones(tmp_path):
+    path = tmp_path / "grid.yaml"
+    path.write_text(
+        "scenes: [town]\narms:\n"
+        "  - {name: a, parameters: {operator.c: {values: [0.2, 0.4]}, "
+        "operator.name: {value: cagrad}}, by_scene: {town: {operator: sum}}}\n"
+        "  - {name: plain}\n"
+    )
+    grid = read_grid(path)
+    cells = [Job(str(i), each.label, "town", 0, {}) for i, each in enumerate(choices(grid))]
+    standings = [Standing(j, "finished", summary={"overall": {"psnr": 20.0}}) for j in cells]
+    content, _ = best_grid(grid, cells, standings, tmp_path)
+    arms = {arm["name"]: arm for arm in content["arms"]}
+    # An arm in which nothing varies stays as it is.
+    assert list(arms) == ["a", "a, best", "plain"]
+    assert arms["a, best"]["by_scene"] == {"town": {"operator": {"name": "sum"}}}
+
+
+def test_a_grid_in_which_nothing_varies_has_no_best(tmp_path):
+    path = tmp_path / "grid.yaml"
+    path.write_text("scenes: [town]\narms: [{name: a}]\n")
+    grid = read_grid(path)
+    job = Job("0", choices(grid)[0].label, "town", 0, {})
+    standing = Standing(job, "finished", summary={"overall": {"psnr": 20.0}})
+    with pytest.raises(UserError, match="nothing varies"):
+        best_grid(grid, [job], [standing], tmp_path)

@@ -170,3 +170,17 @@ def test_a_few_lines_that_stand_for_too_many_runs_are_refused(tmp_path):
     for text in (grid(80), seeds + grid(4)):
         with pytest.raises(UserError, match="more than 100,000"):
             read_grid(written(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "parameters: {views: {values: [1, 1]}}",
+        "arms: [{name: 'a, views=2'}, {name: a, parameters: {views: {values: [2, 3]}}}]",
+    ],
+)
+def test_two_configurations_of_one_name_are_refused(tmp_path, text):
+    path = tmp_path / "grid.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match="two configurations are called"):
+        read_grid(path)

@@ -23,7 +23,12 @@ def test_lines_of_all_workers_come_in_the_order_of_time(tmp_path):
     assert [each.time for each in found] == sorted(each.time for each in found)
 
 
-@pytest.mark.parametrize("torn", [b'{"event": "beg', b"{}\n", b"[1]\n", b'\xff\xfe\n{"a": 1}'])
+FOREIGN = b'{"event": "ended", "run": "a", "worker": 3, "time": 5, "host": "x"}\n'
+
+
+@pytest.mark.parametrize(
+    "torn", [b'{"event": "beg', b"{}\n", b"[1]\n", b'\xff\xfe\n{"a": 1}', FOREIGN]
+)
 def test_a_torn_or_foreign_line_costs_no_other(tmp_path, torn):
     add(tmp_path)
     with (tmp_path / "1.jsonl").open("ab") as file:

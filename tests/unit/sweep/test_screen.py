@@ -150,12 +150,14 @@ def test_rows_of_earlier_grids_are_told_from_those_of_the_newest(tmp_path):
     was = [Job("id0", "a", "city", 1, {}), Job("id1", "b", "city", 1, {})]
     write_plan(layout, was)
     assert earlier_rows(layout) == frozenset()
-    # Another configuration is a now, and what it was is called c.
-    now = [Job("id2", "a", "city", 1, {}), Job("id0", "c", "city", 1, {})]
+    # Another configuration is a now; that of b is called c, and no longer b.
+    now = [Job("id2", "a", "city", 1, {}), Job("id1", "c", "city", 1, {})]
     write_plan(layout, now)
     assert earlier_rows(layout) == {("id0", "a")}
+    assert ",b," not in layout.plan.read_text()
     write_plan(layout, was)
     assert earlier_rows(layout) == frozenset()
+    assert ",c," not in layout.plan.read_text()
 
 
 def test_a_record_of_a_clock_that_is_behind_is_seen(sweep, monkeypatch):

@@ -1,0 +1,45 @@
+"""Names in a run's folder for what came from elsewhere: other scenes, and camera paths.
+
+Two folders may have one name, and their results must not take each other's place.
+"""
+
+from json import dumps
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.text_files import read_json
+
+#: Which name stands for which place.
+FILE: Final = "sources.json"
+
+
+def name_for(folder: Path, name: str, source: Path) -> str:
+    """The name, or that name with a number where it stands for another place already.
+
+    Args:
+        folder: The run's folder, which remembers it.
+        name: What the place is called.
+        source: The place.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    known, place = _known(folder), str(source.resolve())
+    taken, number = name, 1
+    while known.get(taken, place) != place:
+        number += 1
+        taken = f"{name}-{number}"
+    if taken not in known:
+        content = dumps({**known, taken: place}, indent=1, ensure_ascii=False)
+        write_atomically(folder / FILE, f"{content}\n".encode())
+    return taken
+
+
+def _known(folder: Path) -> dict[str, str]:
+    try:
+        found = read_json(folder / FILE)
+    except (FileNotFoundError, ValueError):
+        return {}
+    pairs = found.items() if isinstance(found, dict) else ()
+    return {str(name): place for name, place in pairs if isinstance(place, str)}

@@ -1,0 +1,21 @@
+"""Colours of points, in the ranges that programs write them in."""
+
+import numpy as np
+import pytest
+
+from crossgrad_plugins.readers._points import _colors
+
+
+@pytest.mark.parametrize(
+    ("stored", "expected"),
+    [
+        (np.array([0.0, 0.5, 1.0]), (0, 128, 255)),
+        (np.array([0.0, 128.0, 255.0]), (0, 128, 255)),
+        (np.array([65535, 32768, 256], dtype=np.uint16), (255, 128, 1)),
+        (np.array([7, 128, 256], dtype=np.int32), (7, 128, 255)),
+        (np.array([1, 2, 3], dtype=np.uint8), (1, 2, 3)),
+    ],
+)
+def test_the_range_follows_the_largest_value(stored, expected):
+    columns = dict(zip(("red", "green", "blue"), stored[:, None], strict=True))
+    assert tuple(_colors(columns, 1)[0]) == expected
