@@ -395,7 +395,7 @@ def _with_interval(row: Mapping[str, str], column: str) -> str:
 
 def _noise(results: Results) -> Iterator[str]:
     yield from ("## Noise", "", "Standard deviation of a run over seeds, pooled over all arms.", "")
-    found = noise(standings(results.runs, PSNR))
+    found = noise(standings(results.runs, PSNR), results.runs)
     if not found:
         yield "not run"
         return

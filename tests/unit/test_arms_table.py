@@ -1,5 +1,7 @@
 """`benchmarks/arms.py`: a row for each scene and arm, with what it cost and the code that ran."""
 
+import shutil
+
 import pytest
 from support.run_folders import RunFolder
 from support.scripts import printed_by
@@ -112,7 +114,7 @@ def test_two_configurations_of_one_arm_are_refused(tmp_path, printed, capsys):
     write_sweep(tmp_path / "two", "m0,city,B,0", "m1,city,B,1")
     for folder, names in (("one", "m"), ("two", "a")):
         for seed in (0, 1):
-            (tmp_path / folder / "runs" / f"{names}{seed}" / "config.yaml").unlink()
+            shutil.rmtree(tmp_path / folder / "runs" / f"{names}{seed}")
     with pytest.raises(SystemExit) as ended:
         printed(tmp_path)
     assert ended.value.code == 2

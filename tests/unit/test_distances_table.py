@@ -138,7 +138,9 @@ def test_figures_of_another_state_of_a_run_are_not_taken(
         (run / "point_cloud.ply").write_bytes(b"other")
     else:
         summary = json.loads((run / "summary.json").read_text())
-        (run / "summary.json").write_text(json.dumps({**summary, "step": 400}))
+        (run / "summary.json").write_text(json.dumps({**summary, "step": 700}))
+        table = (run / "metrics.csv").read_text()
+        (run / "metrics.csv").write_text(table.replace("\n600,", "\n700,"))
     evaluated.psnr = 30.0
     assert psnr_of(printed, *options) == ["30.00"] * 2 and len(evaluated.on) == 2
     # Another command wrote the table: what stands beside it is not of this one.

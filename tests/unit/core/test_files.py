@@ -61,7 +61,8 @@ def test_other_system_errors_pass(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("count", "text"), [(0, "0.0 MiB"), (3 * 2**19, "1.5 MiB"), (2**30, "1.0 GiB")]
+    ("count", "text"),
+    [(0, "0.0 KiB"), (3 * 2**9, "1.5 KiB"), (3 * 2**19, "1.5 MiB"), (2**30, "1.0 GiB")],
 )
 def test_sizes_are_readable(count: int, text: str):
     assert size_text(count) == text
