@@ -250,8 +250,7 @@ class RunConfig(BaseModel):
     floaters: Annotated[Literal["keep", "remove"] | None, Flag("keep|remove", TRAINING)] = Field(
         None,
         description="What is done at the end with primitives around cameras that no training photo "
-        "shows, and on the way with Gaussians in which a camera stands. Default: remove; keep with "
-        "--preset inria, and where density control is none.",
+        "shows. Default: remove; keep with --preset inria, and where density control is none.",
     )
     dropout: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
         None,

@@ -386,18 +386,6 @@ class BrightensAtRandom(Vanilla):
         return replace(gaussians, sh_dc=gaussians.sh_dc + chance)
 
 
-class EllipsoidsNowhere(Vanilla):
-    ellipsoids: ClassVar[tuple[str, ...]] = ("sizes", "quats")
-
-
-class EllipsoidsTheOtherWayRound(Vanilla):
-    ellipsoids: ClassVar[tuple[str, ...]] = ("quats", "scales")
-
-
-class EllipsoidsOfOne(Vanilla):
-    ellipsoids: ClassVar[tuple[str, ...]] = ("scales",)
-
-
 class PositionsNowhere(Vanilla):
     positions: ClassVar[str] = "centres"
 
@@ -864,9 +852,6 @@ DEFECTS = [
     (backbones.positions_are_those_of_primitives, PositionsNowhere),
     (backbones.positions_are_those_of_primitives, PositionsOfFourColumns),
     (backbones.positions_are_those_of_primitives, PositionsOfAll),
-    (backbones.ellipsoids_are_those_of_primitives, EllipsoidsNowhere),
-    (backbones.ellipsoids_are_those_of_primitives, EllipsoidsTheOtherWayRound),
-    (backbones.ellipsoids_are_those_of_primitives, EllipsoidsOfOne),
     (backbones.gradients_reach_every_block, FrozenQuats),
     (backbones.checkpoints_give_the_same_gaussians, CountsOnItself),
     (backbones.checkpoints_give_the_same_gaussians, Trembles),
