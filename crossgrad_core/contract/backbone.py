@@ -35,9 +35,6 @@ class Backbone(Component):
             per-primitive tensors together, and without a call of `prepare`. At the end of a run
             rows are removed likewise, after `decode` was asked what some of them alone give
             (floaters). Where it is empty, only edits move or remove rows.
-        ellipsoids: Where primitives are Gaussians at `positions`: tensors [N, 3] of the logarithms
-            of their standard deviations, local units, and [N, 4] of their quaternions, wxyz of any
-            length. The first is made smaller where a camera stands in one (giants). Else empty.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -47,7 +44,6 @@ class Backbone(Component):
     own_dilation: ClassVar[bool] = False
     passed_on: ClassVar[Mapping[str, str]] = {}
     positions: ClassVar[str] = ""
-    ellipsoids: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     @override

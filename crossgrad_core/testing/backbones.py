@@ -121,20 +121,6 @@ def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
     require(backbone.positions in {"", *fitting}, known)
 
 
-def ellipsoids_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`ellipsoids` is empty or names two tensors, [N, 3] and [N, 4], beside `positions`."""
-    backbone = make()
-    names = backbone.ellipsoids
-    if not names:
-        return
-    parameters = created(backbone)
-    held = {name for block in backbone.blocks() if block.per_primitive for name in block.tensors}
-    known = f"ellipsoids is {names!r}; tensors of primitives: {listed(sorted(held))}"
-    require(len(names) == 2 and held >= {*names} and bool(backbone.positions), known)  # noqa: PLR2004
-    shapes = [tuple(parameters[name].shape[1:]) for name in names]
-    require(shapes == [(3,), (4,)], f"ellipsoids have rows of {shapes}, not (3,) and (4,)")
-
-
 def gradients_reach_every_block(make: Make[Backbone]) -> None:
     """What is decoded over all views depends on every block that is trained."""
     backbone = make()
@@ -268,7 +254,6 @@ BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     created_from_the_scene,
     decoding_has_the_shape,
     positions_are_those_of_primitives,
-    ellipsoids_are_those_of_primitives,
     gradients_reach_every_block,
     checkpoints_give_the_same_gaussians,
     edits_keep_rows_together,

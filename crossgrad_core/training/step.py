@@ -27,7 +27,6 @@ from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.density_views import observed_views
 from crossgrad_core.training.edits import apply_edit, put_in_order
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.giants import keep_off_cameras
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
@@ -165,8 +164,6 @@ def _finish(
             _optimize(setup, state, rendered, left, scale)
     if setup.acts_after_step:
         edited |= _after_step(setup, state, edited=edited)
-    if keep_off_cameras(setup, state):
-        restart(state)
     if edited:
         put_in_order(setup, state)
     return edit.counts
