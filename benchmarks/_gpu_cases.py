@@ -45,7 +45,8 @@ class Case:
     @property
     def name(self) -> str:
         """The folder of its runs."""
-        return "-".join(map(str, vars(self).values()))
+        split = ("every",) if self.part in {"long", "usual"} else ()
+        return "-".join(map(str, (*vars(self).values(), *split)))
 
     def command(self, scene: Path, out: Path) -> list[str]:
         """The command that trains a run of the parts `long` and `usual`."""

@@ -12,7 +12,7 @@ steps as published, in processes of their own; rows are what it had after 7,000,
 steps. `usual` trains it with the settings that `crossgrad run` has by itself, for several lengths.
 With the folder of gsplat's examples, gsplat's own trainer takes as many steps as `long` on the same
 scene. It holds out each 8th photo, our runs each 8th of each folder. Runs, gpu.csv, the curves of
-the long runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the same
+runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the same
 command goes on. Without a GPU it ends with exit code 2.
 """
 

@@ -1,7 +1,7 @@
 """Evaluation, renders and exports of a run that was trained."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from crossgrad_core.contract.georeference import INPUT, check_coordinates
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
-from crossgrad_core.evaluation.result import EvaluationResult
+from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
 from crossgrad_core.registry.entries import build, find
 from crossgrad_core.run.elsewhere import Elsewhere, elsewhere
 from crossgrad_core.run.export import (
@@ -30,7 +30,6 @@ from crossgrad_core.run.export import (
 )
 from crossgrad_core.run.flight import FRAMES, LADDER, flight
 from crossgrad_core.run.opening import opened, require_checkpoint
-from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.film import (
     ENCODER,
     drop_frames,
@@ -43,7 +42,7 @@ from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import ending, flat_names
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
-from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.per_view import read_per_view, write_per_view
 from crossgrad_core.run.results.scene_file import ACCEPTED
 from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.summary import summarised_step
@@ -53,6 +52,7 @@ from crossgrad_core.run.session import CLOUD, totals
 from crossgrad_core.system.writability import check_file, check_folder, check_new
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
 #: Files of Gaussians by the names that programs give them: none holds what another one's says.
@@ -198,13 +198,28 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points
         result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
-        # A figure that is not measured here stays in the file.
-        measured_there = read_config(folder).get("metrics") or ()
-        if writes and len(measured_there) <= len(setup.config.metrics):
+        if writes and not _loses_figures(folder, result):
             name = _own_name(folder, PER_VIEW, state.step)
             other = name.replace(".", "_accepted.")
             write_per_view(folder, result, other if _is_changed(setup) else name)
         return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
+
+
+def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
+    """Whether per_view.csv has figures that could not be measured now; then says that it stays."""
+    try:
+        before = read_per_view(folder)
+    except UserError:  # A damaged one is written anew.
+        return False
+    lost = _known(before) - _known(result.views)
+    if lost:
+        _LOG.warning("%s stays as it is: %s not measured here", PER_VIEW, listed(sorted(lost)))
+    return bool(lost)
+
+
+def _known(views: Sequence[ViewMetrics]) -> set[str]:
+    """The figures that some view has."""
+    return {name for view in views for name, value in view.values.items() if value is not None}
 
 
 def render(

@@ -1,6 +1,7 @@
 """Cameras that a program makes up: what is none is refused before it is drawn."""
 
 from math import isfinite
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor
@@ -19,11 +20,11 @@ def checked_camera(camera: object) -> Camera:
         raise _refused("a view's name or a camera", f"{type(camera).__name__}")
     sides = {"width": camera.width, "height": camera.height}
     for name, side in sides.items():
-        if not isinstance(side, int) or isinstance(side, bool) or side < 1:
+        if not isinstance(side, Integral) or isinstance(side, bool) or side < 1:
             raise _refused(f"a {name} of 1 pixel or more", repr(side))
     for name in ("fx", "fy", "cx", "cy"):
         value = getattr(camera, name)
-        known = isinstance(value, int | float) and isfinite(value)
+        known = isinstance(value, Real) and isfinite(value)
         if not known or (name.startswith("f") and value <= 0):
             above = " above 0" if name.startswith("f") else ""
             raise _refused(f"a finite {name}{above}, in pixels", repr(value))

@@ -8,7 +8,8 @@ from typing import Final
 
 from crossgrad_core import defaults
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.registry.entries import entries
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.slots import LISTS
 from crossgrad_core.wording import listed, plural
 
@@ -20,7 +21,8 @@ _PLAIN: Final = {
     "operator": defaults.OPERATOR,
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
-    "start": defaults.BARE_START,
+    # It asks for no points, of which the scene may have none.
+    "start": defaults.START_ALONE,
     "resolution": defaults.RESOLUTION,
 }
 
@@ -34,8 +36,7 @@ def without_missing(config: RunConfig) -> RunConfig:
     lacking = []
     for slot, plain in _PLAIN.items():
         chosen = config.operators if slot == "operator" else (getattr(config, slot),)
-        known = entries(plural(slot))
-        if gone := [each.name for each in chosen if each is not None and each.name not in known]:
+        if gone := [each.name for each in chosen if each is not None and _is_gone(slot, each)]:
             lacking.append(f"{slot} {listed(gone)}")
             update[slot] = ComponentChoice(name=plain)
     for slot in LISTS:
@@ -46,6 +47,19 @@ def without_missing(config: RunConfig) -> RunConfig:
     if lacking:
         _LOG.warning("not installed here, and left out: %s", listed(lacking))
     return config.model_copy(update=update)
+
+
+def _is_gone(slot: str, choice: ComponentChoice) -> bool:
+    """Whether a part, or one that its options name, is not installed."""
+    if choice.name not in entries(plural(slot)):
+        return True
+    if slot != "operator":
+        return False
+    try:
+        build(plural(slot), choice.name, choice.options)
+    except UserError:
+        return True
+    return False
 
 
 def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:

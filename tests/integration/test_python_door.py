@@ -253,6 +253,9 @@ def test_what_is_no_camera_is_not_drawn(reference, changed):
     run = cg.open(reference)
     camera = run.scene.test_views[0].camera
     assert run.render(camera).shape == (camera.height, camera.width, 3)
+    sides = {"width": np.int64(camera.width), "height": np.int64(camera.height)}
+    same = replace(camera, **sides, fx=np.float64(camera.fx))
+    np.testing.assert_array_equal(run.render(same), run.render(camera))
     with pytest.raises(cg.UserError) as error:
         run.render(replace(camera, **changed))
     assert error.value.where == "Run.render"

@@ -7,6 +7,9 @@ from support.commands import ended
 from support.distributions import write_distribution
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.config import RunConfig
+from crossgrad_core.run.stand_ins import without_missing
+
 #: What only trains, and what only measures or listens.
 TRAINS = {
     "samplers": "epoch",
@@ -76,3 +79,24 @@ def test_settings_that_were_changed_are_still_refused(run, capsys):
     (run / "config.yaml").write_text(text.replace("own-losses", "other-losses"))
     assert ended("eval", run) == 2
     assert "config.yaml was changed since this run began" in capsys.readouterr().err
+
+
+def test_a_figure_that_cannot_be_measured_now_stays(run, capsys):
+    lines = (run / "per_view.csv").read_text().splitlines()
+    at = lines[0].split(",").index("lpips")
+    cells = [line.split(",") for line in lines[1:]]
+    text = (
+        "\n".join([lines[0], *(",".join([*c[:at], "0.1234", *c[at + 1 :]]) for c in cells)]) + "\n"
+    )
+    (run / "per_view.csv").write_text(text)
+    assert ended("eval", run) == 0
+    assert (run / "per_view.csv").read_text() == text
+    assert "per_view.csv stays as it is: gains, lpips not measured here" in capsys.readouterr().err
+
+
+def test_an_operator_that_names_one_that_is_gone_is_stood_in():
+    operator = {"name": "dispatch", "rules": {"near-far": "own-operators"}}
+    config = RunConfig.model_validate({"operator": operator})
+    assert [each.name for each in without_missing(config).operators] == ["sum"]
+    known = RunConfig.model_validate({"operator": {"name": "cagrad"}})
+    assert without_missing(known) == known

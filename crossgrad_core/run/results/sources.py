@@ -12,6 +12,8 @@ from crossgrad_core.system.text_files import read_json
 
 #: Which name stands for which place.
 FILE: Final = "sources.json"
+#: The path that comes from no file.
+RESERVED: Final = ("ladder",)
 
 
 def name_for(folder: Path, name: str, source: Path) -> str:
@@ -27,7 +29,7 @@ def name_for(folder: Path, name: str, source: Path) -> str:
     """
     known, place = _known(folder), str(source.resolve())
     taken, number = name, 1
-    while known.get(taken, place) != place:
+    while taken in RESERVED or known.get(taken, place) != place:
         number += 1
         taken = f"{name}-{number}"
     if taken not in known:

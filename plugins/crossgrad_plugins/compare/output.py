@@ -36,13 +36,13 @@ def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
     if not folder.is_dir() or is_comparison(folder):
         return
     known = {PAGE, *owned} if (folder / FIGURES).is_dir() else set()
-    there = (path for path in folder.rglob("*") if not path.is_dir())
-    others = [
+    there = (*folder.glob("*"), *(folder / FIGURES).glob("*"))
+    others = (
         path
         for path in there
-        if path.relative_to(folder).as_posix() not in known and not is_leftover(path)
-    ]
-    if not others and not (folder / PAGE).exists():
+        if path.relative_to(folder).as_posix() not in {*known, FIGURES} and not is_leftover(path)
+    )
+    if next(others, None) is None and not (folder / PAGE).exists():
         return
     raise UserError(
         "the folder holds something else than a comparison",

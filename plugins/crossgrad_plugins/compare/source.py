@@ -117,7 +117,8 @@ def _no_run(place: Path) -> UserError:
 def _headless(place: Path) -> Iterator[Path]:
     """Folders with results of a run at or below a place whose config.yaml is gone."""
     for path in sorted(place.rglob("summary.json")):
-        if not (path.parent / "config.yaml").exists():
+        folder = path.parent
+        if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
             yield path.parent.resolve()
 
 

@@ -45,10 +45,16 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
     first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
     rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
     known, to_degrees = _by_file(names), _system(" ".join(first), path)
-    loose = _by_file(names, _folded)
-    photos = {name: known.get(name) or loose.get(_folded(name)) for name in rows}
-    found = ((photo, to_degrees(rows[name])) for name, photo in photos.items() if photo)
-    strangers = tuple(name for name, photo in photos.items() if not photo)
+    photos = {name: known[name] for name in rows if name in known}
+    loose, others = _by_file(names, _folded), [name for name in rows if name not in known]
+    times = Counter(map(_folded, others))
+    for name in others:
+        # Of two that could be meant none is, and the photo's own row comes first.
+        photo = loose.get(_folded(name)) if times[_folded(name)] == 1 else None
+        if photo is not None and photo not in photos.values():
+            photos[name] = photo
+    found = ((photo, to_degrees(rows[name])) for name, photo in photos.items())
+    strangers = tuple(name for name in rows if name not in photos)
     return replace(measured(found, path.name), strangers=strangers)
 
 
@@ -79,7 +85,8 @@ def _wrong(path: Path, expected: str, found: str) -> UserError:
 
 
 def _folded(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix("")).casefold()
+    folder, _, file = name.rpartition("/")
+    return f"{folder}/{file.rpartition('.')[0] or file}".casefold()
 
 
 def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[str, str]:
@@ -88,8 +95,8 @@ def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[s
     whole = {name: said(name) for name in names}
     found: dict[str, str] = {}
     for called in (files, whole):
-        times = Counter(called.values())
-        found |= {text: name for name, text in called.items() if times[text] == 1}
+        often = Counter(called.values())
+        found |= {text: name for name, text in called.items() if often[text] == 1}
     return found
 
 

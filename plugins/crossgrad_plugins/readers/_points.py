@@ -18,7 +18,8 @@ from crossgrad_plugins.readers._inside import Inside
 #: Names under which tools put points beside their poses, the first one that is there is taken.
 USUAL: Final = ("sparse_pc.ply", "points3D.ply", "points3d.ply", "point_cloud.ply", "points.ply")
 _GREY: Final = 127
-#: Colours that reach this have 16 bits.
+#: Colours have 16 bits where this percentile of them reaches so much.
+_MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 #: Points and photos that are tried, and the share of points that some photo has to show.
@@ -156,6 +157,7 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
         values = np.nan_to_num(stored.astype(np.float64))
     # Text files hold no types: numbers above 1 are of the whole kind, and far above 255 of the
     # longer one, as scanners write.
-    largest = np.abs(values).max(initial=0.0)
-    top = 1.0 if largest <= 1.0 else 255.0 if largest < _LONG else 65_535.0
+    sizes = np.abs(values[np.isfinite(stored)])
+    long = len(sizes) > 0 and np.percentile(sizes, _MOST) >= _LONG
+    top = 1.0 if sizes.max(initial=0.0) <= 1.0 else 65_535.0 if long else 255.0
     return np.rint(values.clip(0.0, top) * (255.0 / top)).astype(np.uint8)

@@ -6,11 +6,13 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, TypeAlias
 
-from crossgrad_core.commands import UserError, layered, listed
+from crossgrad_core.commands import UserError, listed
 from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, choices, scene_name
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.standing import Standing, figure
 
+#: Settings of which a run has one.
+LENGTHS = frozenset({"steps", "max_views", "seconds"})
 #: Seeds that the new grid has.
 SEEDS = 3
 #: Configuration and scene -> seed -> the metric, None where the run failed or has none; a run that
@@ -38,15 +40,24 @@ def best_grid(
     Raises:
         UserError: Of some arm and scene a run is left to do, all values failed, or nothing varies.
     """
+    if len(choices(grid)) == len(grid.arms):
+        raise UserError(
+            "nothing varies in any arm of the grid: there is nothing to choose",
+            where=grid.name or "the grid",
+            expected="an arm whose parameters have several values",
+            todo="run the grid as it is",
+        )
     ends = _ends(grid, cells, standings)
     first = max(grid.seeds) + 1
     notes: list[str] = []
     arms: list[dict[str, Any]] = []
     for arm in grid.arms:
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
-        if len(own) == 1 and len(grid.arms) > 1:
+        if len(own) == 1:
             # Nothing varies in it: an arm that the others are held against.
-            settings = layered([arm.settings, own[0].parameters])
+            for scene in map(scene_name, grid.scenes):
+                _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
+            settings = {**arm.settings, **own[0].parameters}
             arms.append({"name": arm.name, "settings": settings, "by_scene": arm.by_scene})
             continue
         best = {}
@@ -71,10 +82,27 @@ def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, A
     """The arm as it is, and with its best parameters; its own settings by scene win, as before."""
     own = {"settings": arm.settings}
     by_scene = {
-        scene: layered([values, arm.by_scene.get(scene, {})]) for scene, values in best.items()
+        scene: _below(values, arm.by_scene.get(scene, {})) for scene, values in best.items()
     }
     yield {"name": arm.name, **own, "by_scene": arm.by_scene}
     yield {"name": f"{arm.name}, best", **own, "by_scene": by_scene}
+
+
+def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Values below settings that win over them, in one layer.
+
+    What another component is chosen for takes the options of the first with it, and a run has one
+    length.
+    """
+    lengths = LENGTHS if LENGTHS & own.keys() else frozenset()
+    components = {name.removesuffix(".name") for name in own if name.endswith(".name")}
+    components |= {name for name in own if "." not in name}
+    kept = {
+        name: value
+        for name, value in values.items()
+        if name not in lengths and name.partition(".")[0] not in components
+    }
+    return {**kept, **own}
 
 
 def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> Ends:
@@ -123,13 +151,6 @@ def _check_ended(
     found: Sequence[tuple[Choice, Mapping[int, float | None]]], scene: str, grid: Grid
 ) -> None:
     ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in found)
-    if len(found) == 1:
-        raise UserError(
-            "nothing varies in the grid's only arm: there is nothing to choose",
-            where=f"arm {found[0][0].arm.name}",
-            expected="parameters with several values",
-            todo="run the grid as it is",
-        )
     if ended < len(found):
         raise UserError(
             "the best parameters are not known yet",

@@ -486,3 +486,12 @@ def test_a_list_of_other_photos_is_told(scene):
     (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
     found = read(scene)
     assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note
+
+
+def test_the_row_of_a_photo_comes_before_one_that_only_looks_like_it(scene):
+    text = geo_list(scene, "EPSG:4326", in_degrees)
+    (scene / "geo.txt").write_text(text + "0001.TIF 11 51 200\n/ 11 51 200\n. 11 51 200\n")
+    assert_in_place(read(scene), 1e-5)
+    # Of two rows that look like a photo none is meant.
+    (scene / "geo.txt").write_text(text.replace("0001.jpg", "0001.TIF") + "0001.PNG 11 51 200\n")
+    assert "geo.txt, 9 of 10" in read(scene).georeference.note

@@ -140,29 +140,62 @@ def test_it_is_refused_before_all_is_finished(swept, tmp_path):
         best_grid(grid, cells, left, tmp_path)
 
 
-def test_settings_by_scene_are_laid_over_the_best_ones(tmp_path):
-    path = tmp_path / "grid.yaml"
-    path.write_text(
-        "scenes: [town]\narms:\n"
-        "  - {name: a, parameters: {operator.c: {values: [0.2, 0.4]}, "
-        "operator.name: {value: cagrad}}, by_scene: {town: {operator: sum}}}\n"
-        "  - {name: plain}\n"
-    )
+CHOICES = """
+- {name: a, settings: {operator: cagrad}, parameters: {operator.c: {values: [0.2, 0.4]}}}
+---
+- {name: a, parameters: {backbone.lr_opacities: {values: [0.02, 0.04]}}}
+---
+- {name: a, parameters: {operator: {values: [sum, cagrad]}}, by_scene: {town: {operator: sum}}}
+---
+- name: a
+  parameters: {operator.c: {values: [0.2, 0.4]}, operator.name: {value: cagrad}}
+  by_scene: {town: {operator: sum}}
+---
+- {name: a, parameters: {steps: {values: [10, 20]}}, by_scene: {town: {max_views: 12}}}
+---
+- {name: a, parameters: {steps: {values: [10, 20]}}, by_scene: {town: {operator.c: 0.9}}}
+"""
+
+
+@pytest.mark.parametrize("arms", CHOICES.split("---"))
+@pytest.mark.parametrize("base", ["{backbone: mip}", "{operator: {name: cagrad, c: 0.7}}"])
+def test_the_best_arm_is_the_configuration_that_was_best(tmp_path, base, arms):
+    path, again = tmp_path / "grid.yaml", tmp_path / "best.yaml"
+    plain = "- {name: plain, settings: {views: 2}, parameters: {operator.c: {value: 0.3}}}"
+    path.write_text(f"base: {base}\nscenes: [town]\narms:\n{arms.strip()}\n{plain}\n")
     grid = read_grid(path)
     cells = [Job(str(i), each.label, "town", 0, {}) for i, each in enumerate(choices(grid))]
-    standings = [Standing(j, "finished", summary={"overall": {"psnr": 20.0}}) for j in cells]
+    standings = [
+        Standing(job, "finished", summary={"overall": {"psnr": 20.0 + int(job.id)}})
+        for job in cells
+    ]
     content, _ = best_grid(grid, cells, standings, tmp_path)
-    arms = {arm["name"]: arm for arm in content["arms"]}
-    # An arm in which nothing varies stays as it is.
-    assert list(arms) == ["a", "a, best", "plain"]
-    assert arms["a, best"]["by_scene"] == {"town": {"operator": {"name": "sum"}}}
+    write_mapping(again, content)
+    found = {each.arm.name: each for each in choices(read_grid(again))}
+    assert list(found) == ["a", "a, best", "plain"]
+    new, (_, best, alone) = read_grid(again), choices(grid)
+    for name, choice in (("a, best", best), ("plain", alone)):
+        scene = grid.scenes[0]
+        assert found[name].settings(new.base, scene) == choice.settings(grid.base, scene), name
 
 
 def test_a_grid_in_which_nothing_varies_has_no_best(tmp_path):
     path = tmp_path / "grid.yaml"
-    path.write_text("scenes: [town]\narms: [{name: a}]\n")
+    path.write_text("scenes: [town]\narms: [{name: a}, {name: b}]\n")
     grid = read_grid(path)
-    job = Job("0", choices(grid)[0].label, "town", 0, {})
-    standing = Standing(job, "finished", summary={"overall": {"psnr": 20.0}})
+    jobs = [Job(each.label, each.label, "town", 0, {}) for each in choices(grid)]
+    standings = [Standing(j, "finished", summary={"overall": {"psnr": 20.0}}) for j in jobs]
     with pytest.raises(UserError, match="nothing varies"):
-        best_grid(grid, [job], [standing], tmp_path)
+        best_grid(grid, jobs, standings, tmp_path)
+
+
+def test_an_arm_in_which_nothing_varies_has_to_be_finished_too(swept, tmp_path):
+    path = tmp_path / "grid.yaml"
+    path.write_text(GRID + "  - {name: plain, parameters: {rate_factor: {value: 1}}}\n")
+    grid, cells, standings = read_grid(path), *swept[1:]
+    jobs = [
+        Job(f"p{n}", "plain, rate_factor=1", n, s, {}) for n in ("town", "beach") for s in (4, 2)
+    ]
+    left = [Standing(job, "left") for job in jobs]
+    with pytest.raises(UserError, match="not known yet"):
+        best_grid(grid, [*cells, *jobs], [*standings, *left], tmp_path)
