@@ -198,10 +198,11 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points
         result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
-        if writes and not _loses_figures(folder, result):
+        if writes:
             name = _own_name(folder, PER_VIEW, state.step)
-            other = name.replace(".", "_accepted.")
-            write_per_view(folder, result, other if _is_changed(setup) else name)
+            name = name.replace(".", "_accepted.") if _is_changed(setup) else name
+            if name != PER_VIEW or not _loses_figures(folder, result):
+                write_per_view(folder, result, name)
         return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
 
 
