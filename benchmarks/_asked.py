@@ -9,13 +9,13 @@ from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.settings import ABSENT, Settings, settings_of
 from crossgrad_plugins.compare.source import without_length
+from crossgrad_plugins.sweep.best import LENGTHS
 from crossgrad_plugins.sweep.grid import Choice, Grid
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.summary import earlier_rows
 
 #: What a run decides at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
-_LENGTHS: Final = frozenset({"steps", "max_views", "seconds"})
 #: Paths, which a grid may name from its own folder.
 _PATHS: Final = ("exposure_from", "reading.init")
 
@@ -52,7 +52,7 @@ class Asked:
         settings = choice.settings(grid.base, scene, assignments)
         config = configured(settings)
         named = settings_of(config.model_dump(mode="json", exclude_unset=True))
-        return cls(config, named, bool(_LENGTHS & settings.keys()))
+        return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
         """Whether a run has all that is named; what a run decides or does not know fits."""

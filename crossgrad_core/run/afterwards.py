@@ -188,7 +188,7 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
 
     The folder of a run that is training, and one that may not be written to, is only read; so is
-    one of a run that measured what is not installed here.
+    one whose per_view.csv has figures that cannot be measured here.
 
     Raises:
         UserError: It is no run, or it has no checkpoint.
@@ -252,7 +252,9 @@ def render(
         own = folder_of(folder, state.step) / ("accepted" if _is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
-            views, own = there.views, own / f"on_{_named(folder, out, there.name, on)}"
+            views = there.views
+            if out is None:
+                own /= f"on_{name_for(folder, ending(there.name), on)}"
         if not views:
             raise UserError(
                 "there are no views to render",
@@ -304,11 +306,8 @@ def fly(
             check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
         draw, own = camera_renderer(setup, state), out is None
         if out is None:
-            name = (
-                ending(along.name)
-                if path == LADDER
-                else _named(folder, out, along.name, Path(path))
-            )
+            name = ending(along.name)
+            name = name if path == LADDER else name_for(folder, name, Path(path))
             out = folder_of(folder, state.step) / f"path_{name}"
         with torch.no_grad():
             files = write_frames(map(draw, along.cameras), out)
@@ -401,11 +400,6 @@ def exported(
             path = out or folder / name
             check_new(path)
         return path, export_scene(setup, state, path, camera, exporter, coordinates)
-
-
-def _named(folder: Path, out: Path | None, name: str, source: Path) -> str:
-    """What pictures of a scene or a path are called in the run's folder, if they go there."""
-    return ending(name) if out is not None else name_for(folder, ending(name), source)
 
 
 @contextmanager

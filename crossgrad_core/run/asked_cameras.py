@@ -23,10 +23,10 @@ def checked_camera(camera: object) -> Camera:
         if not isinstance(side, Integral) or isinstance(side, bool) or side < 1:
             raise _refused(f"a {name} of 1 pixel or more", repr(side))
     for name in ("fx", "fy", "cx", "cy"):
-        value = getattr(camera, name)
+        value, focal = getattr(camera, name), name in {"fx", "fy"}
         known = isinstance(value, Real) and isfinite(value)
-        if not known or (name.startswith("f") and value <= 0):
-            above = " above 0" if name.startswith("f") else ""
+        if not known or (focal and value <= 0):
+            above = " above 0" if focal else ""
             raise _refused(f"a finite {name}{above}, in pixels", repr(value))
     if not _is_pose(camera.world_to_camera):
         raise _refused(

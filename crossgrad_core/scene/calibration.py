@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 # A pinhole camera where every distortion parameter is 0. Fisheye models are not in the list: with
 # zero parameters they are equidistant, though pycolmap's `is_undistorted` says otherwise.
-#: Models of photos that look into all directions.
-_ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
 _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+# Photos that look into all directions.
+_ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 # Beyond these nothing can be computed with a camera in single precision.
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6

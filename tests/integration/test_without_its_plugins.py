@@ -8,6 +8,7 @@ from support.distributions import write_distribution
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.registry.entries import load
 from crossgrad_core.run.stand_ins import without_missing
 
 #: What only trains, and what only measures or listens.
@@ -98,5 +99,8 @@ def test_an_operator_that_names_one_that_is_gone_is_stood_in():
     operator = {"name": "dispatch", "rules": {"near-far": "own-operators"}}
     config = RunConfig.model_validate({"operator": operator})
     assert [each.name for each in without_missing(config).operators] == ["sum"]
+    start = RunConfig.model_validate({"start": {"name": "own-starts"}})
+    # It has to do without points, which the scene may lack.
+    assert load("starts", without_missing(start).start.name).alone
     known = RunConfig.model_validate({"operator": {"name": "cagrad"}})
     assert without_missing(known) == known

@@ -119,7 +119,7 @@ def _headless(place: Path) -> Iterator[Path]:
     for path in sorted(place.rglob("summary.json")):
         folder = path.parent
         if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
-            yield path.parent.resolve()
+            yield folder.resolve()
 
 
 def _broken(error: UserError) -> UserError:

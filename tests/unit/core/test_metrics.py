@@ -96,10 +96,8 @@ def test_ssim_skimage_is_what_scikit_image_says():
     assert ssim_skimage(IMAGE, TARGET) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("height", [128, 129, 133, 138, 139, 256, 261, 300])
-def test_ssim_skimage_in_strips_has_the_bits_of_the_whole(height):
-    random = torch.Generator().manual_seed(height)
-    image, target = torch.randint(0, 256, (2, height, 40, 3), generator=random, dtype=torch.uint8)
+def whole(image, target):
+    """[H, W, 3] scikit-image's map of SSIM, of images in one piece."""
     _, full = structural_similarity(
         image.numpy() / 255,
         target.numpy() / 255,
@@ -110,22 +108,21 @@ def test_ssim_skimage_in_strips_has_the_bits_of_the_whole(height):
         channel_axis=-1,
         full=True,
     )
+    return full
+
+
+@pytest.mark.parametrize("height", [128, 129, 133, 138, 139, 256, 261, 300])
+def test_ssim_skimage_in_strips_has_the_bits_of_the_whole(height):
+    random = torch.Generator().manual_seed(height)
+    image, target = torch.randint(0, 256, (2, height, 40, 3), generator=random, dtype=torch.uint8)
+    full = whole(image, target)
     inside = np.zeros((height, 40), dtype=bool)
     inside[5:-5, 5:-5] = True
     assert ssim_skimage(image, target) == full[inside].mean()
 
 
 def test_both_ssims_agree_away_from_the_border():
-    _, full = structural_similarity(
-        IMAGE.numpy() / 255,
-        TARGET.numpy() / 255,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=-1,
-        full=True,
-    )
+    full = whole(IMAGE, TARGET)
     ours = ssim_map(IMAGE.double() / 255, TARGET.double() / 255).numpy()
     np.testing.assert_allclose(ours[5:-5, 5:-5], full[5:-5, 5:-5], atol=1e-9)
 
