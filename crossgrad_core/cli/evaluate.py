@@ -35,7 +35,8 @@ def evaluate(
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()
-    from crossgrad_core.run import afterwards
+    from crossgrad_core.run.afterwards import figures
+    from crossgrad_core.run.afterwards.how import How
 
-    how = afterwards.How(device, threads, accept_scene)
-    afterwards.evaluate(run, how, ply, on)
+    how = How(device, threads, accept_scene)
+    figures.evaluate(run, how, ply, on)

@@ -46,9 +46,10 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()
-    from crossgrad_core.run import afterwards
+    from crossgrad_core.run.afterwards import files
+    from crossgrad_core.run.afterwards.how import How
 
-    how = afterwards.How(device, threads, accept_scene)
-    afterwards.export(
+    how = How(device, threads, accept_scene)
+    files.export(
         run, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )

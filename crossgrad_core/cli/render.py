@@ -62,13 +62,14 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             todo="leave out --frames, or draw a ladder",
         )
     announce()
-    from crossgrad_core.run import afterwards
+    from crossgrad_core.run.afterwards import pictures
+    from crossgrad_core.run.afterwards.how import How
 
-    how = afterwards.How(device, threads, accept_scene)
+    how = How(device, threads, accept_scene)
     if path is not None:
-        afterwards.fly(run, path, frames=frames, out=out, how=how)
+        pictures.fly(run, path, frames=frames, out=out, how=how)
         return
-    afterwards.render(run, split=split or "test", out=out, how=how, on=on)
+    pictures.render(run, split=split or "test", out=out, how=how, on=on)
 
 
 def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:

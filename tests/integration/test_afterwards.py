@@ -11,7 +11,9 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app, opening
+from crossgrad_core.run import app, opening
+from crossgrad_core.run.afterwards import figures, files, pictures
+from crossgrad_core.run.afterwards.how import How
 from crossgrad_core.run.results.lock import locked
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
@@ -55,7 +57,7 @@ def new_files(folder: Path, before: dict[str, bytes]) -> set[str]:
 
 
 def export(folder, **options):
-    afterwards.export(folder, **{"file_format": "ply", "out": None, **options})
+    files.export(folder, **{"file_format": "ply", "out": None, **options})
 
 
 def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys):
@@ -99,7 +101,7 @@ def test_results_of_another_step_than_the_summary_get_names_of_their_own(finishe
     path.write_text(json.dumps({**json.loads(path.read_text()), "step": 2}))
     before = content(finished)
     export(finished)
-    afterwards.evaluate(finished)
+    figures.evaluate(finished)
     expected = {"point_cloud_step-000003.ply", "per_view_step-000003.csv"}
     assert new_files(finished, before) == expected
     assert content(finished)["per_view_step-000003.csv"] == before["per_view.csv"]
@@ -108,18 +110,18 @@ def test_results_of_another_step_than_the_summary_get_names_of_their_own(finishe
 def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys):
     with locked(finished, "training"):
         before = content(finished)
-        afterwards.evaluate(finished)
+        figures.evaluate(finished)
         assert "overall" in capsys.readouterr().out
         assert "another process writes" in caplog.text and "none is written there" in caplog.text
         for write in (
             lambda: export(finished),
             lambda: export(finished, camera="street/0002.png"),
-            lambda: afterwards.render(finished, split="test", out=None),
+            lambda: pictures.render(finished, split="test", out=None),
         ):
             with pytest.raises(UserError, match=r"training since(.|\n)*another place with --out"):
                 write()
         export(finished, out=tmp_path / "mine.ply")
-        afterwards.render(finished, split="test", out=tmp_path / "renders")
+        pictures.render(finished, split="test", out=tmp_path / "renders")
         assert content(finished) == before
     assert (tmp_path / "mine.ply").read_bytes() == before["point_cloud.ply"]
     assert len(list((tmp_path / "renders").iterdir())) == 2
@@ -127,8 +129,8 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
 
 def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp_path):
     for name, draw in (
-        ("street__0001", lambda out: afterwards.render(finished, split="all", out=out)),
-        ("00001", lambda out: afterwards.fly(finished, "ladder", frames=2, out=out)),
+        ("street__0001", lambda out: pictures.render(finished, split="all", out=out)),
+        ("00001", lambda out: pictures.fly(finished, "ladder", frames=2, out=out)),
     ):
         folder = tmp_path / name
         folder.mkdir()
@@ -137,18 +139,18 @@ def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp
             draw(folder)
         assert content(folder) == {f"{name}.png": b"a photo of mine"}
     for _ in range(2):  # The run's own are drawn anew.
-        afterwards.render(finished, split="test", out=None)
+        pictures.render(finished, split="test", out=None)
 
 
 def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
-    for look in (afterwards.evaluate, export):
+    for look in (figures.evaluate, export):
         with pytest.raises(UserError, match="not the folder of a run"):
             look(tmp_path)
     assert content(tmp_path) == {}
 
 
 def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsys):
-    afterwards.evaluate(finished)
+    figures.evaluate(finished)
     said = capsys.readouterr().out
     assert "3 steps" in said and "memory" not in said
 
@@ -156,8 +158,8 @@ def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsy
 def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(finished, monkeypatch):
     asked = []
     monkeypatch.setattr(opening, "configure_threads", asked.append)
-    afterwards.evaluate(finished)
-    afterwards.evaluate(finished, afterwards.How(threads=2))
+    figures.evaluate(finished)
+    figures.evaluate(finished, How(threads=2))
     assert app.run({}, resume=finished, verbosity=-1) == 0
     assert asked == [None, 2, 1]
 
@@ -169,13 +171,13 @@ def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path,
     path.write_text(yaml.safe_dump(stored))
     looks = (
         lambda how: export(finished, out=tmp_path / "a.ply", how=how),
-        lambda how: afterwards.evaluate(finished, how),
-        lambda how: afterwards.render(finished, split="test", out=tmp_path / "renders", how=how),
+        lambda how: figures.evaluate(finished, how),
+        lambda how: pictures.render(finished, split="test", out=tmp_path / "renders", how=how),
     )
     for look in looks:
         with pytest.raises(UserError, match=r"config.yaml, device: cuda(.|\n)*--device cpu"):
-            look(afterwards.How())
-        look(afterwards.How(device="cpu", threads=1))
+            look(How())
+        look(How(device="cpu", threads=1))
     assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
 

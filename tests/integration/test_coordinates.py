@@ -12,7 +12,9 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app
+from crossgrad_core.run import app
+from crossgrad_core.run.afterwards import figures, files
+from crossgrad_core.run.afterwards.how import AS_IT_IS
 from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.run.export import export_scene
 from crossgrad_core.training.start import first_state
@@ -164,23 +166,23 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
     assert {"point_cloud_utm.ply", "point_cloud_utm.georef.json"} <= new
     assert {name: (trained / name).read_bytes() for name in before} == before
     with pytest.raises(UserError, match="the file exists"):
-        afterwards.exported(trained, file_format=None, out=None, coordinates="utm")
+        files.exported(trained, file_format=None, out=None, coordinates="utm")
     with pytest.raises(UserError, match=r"no such coordinates(?s:.*)epsg:32633"):
-        afterwards.exported(trained, file_format=None, out=None, coordinates="gauss")
+        files.exported(trained, file_format=None, out=None, coordinates="gauss")
 
 
 def test_what_stands_beside_a_named_file_is_not_replaced(trained, tmp_path):
     (tmp_path / "a.georef.json").write_text("mine")
     with pytest.raises(UserError, match="the file exists"):
-        afterwards.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
+        files.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
     assert (tmp_path / "a.georef.json").read_text() == "mine"
 
 
 def test_a_file_in_other_coordinates_is_not_taken_for_one_in_those_of_the_scene(trained, tmp_path):
     path = tmp_path / "a.ply"
-    afterwards.exported(trained, file_format=None, out=path, coordinates="enu")
+    files.exported(trained, file_format=None, out=path, coordinates="enu")
     with pytest.raises(UserError, match=r"in other coordinates(?s:.*)--coordinates input"):
-        afterwards.evaluated_file(trained, path)
+        figures.evaluated_file(trained, path)
 
 
 def test_options_of_the_reader_are_kept(scene, tmp_path):
@@ -189,6 +191,6 @@ def test_options_of_the_reader_are_kept(scene, tmp_path):
     options = {"name": "colmap", "gps": str(scene / "images"), "model": "sparse/0"}
     given = {"scene": str(scene), "out": str(out), "steps": 1, "threads": 1, "reader": options}
     assert app.run(given, verbosity=-1) == 0
-    setup, _ = afterwards.AS_IT_IS.open(out)
+    setup, _ = AS_IT_IS.open(out)
     assert setup.config.reader.options == {"gps": str(scene / "images"), "model": "sparse/0"}
     assert str(scene / "images") in setup.scene.georeference.source

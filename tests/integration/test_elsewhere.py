@@ -9,7 +9,8 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app
+from crossgrad_core.run import app
+from crossgrad_core.run.afterwards import figures, pictures
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 PLACE = {"scale": 7.0, "offset": (40.0, -20.0, 3.0)}
@@ -54,7 +55,7 @@ def per_view(path):
 def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures(
     trained, scene, capsys
 ):
-    result, there = afterwards.evaluated_on(trained, scene)
+    result, there = figures.evaluated_on(trained, scene)
     assert there.trained == 7 and len(result.views) == 11
     assert set(result.regimes) == {"street", "aerial"}
     rows, own = per_view(trained / "per_view_on_place.csv"), per_view(trained / "per_view.csv")
@@ -62,52 +63,50 @@ def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures
     for name, row in own.items():
         # Their cameras took two local frames to get here: a rounded pixel may differ.
         assert float(rows[name]["psnr"]) == pytest.approx(float(row["psnr"]), abs=0.02)
-    afterwards.evaluate(trained, on=scene)
+    figures.evaluate(trained, on=scene)
     printed = capsys.readouterr().out
     assert "street" in printed and "left out: 7 of its views" in printed
 
 
 def test_a_file_is_drawn_there_as_the_model_is(trained, scene, capsys):
-    model, _ = afterwards.evaluated_on(trained, scene)
+    model, _ = figures.evaluated_on(trained, scene)
     before = sorted(trained.rglob("*"))
-    file, gaussians, there = afterwards.evaluated_file(
-        trained, trained / "point_cloud.ply", on=scene
-    )
+    file, gaussians, there = figures.evaluated_file(trained, trained / "point_cloud.ply", on=scene)
     assert gaussians > 0 and there is not None and there.trained == 7
     for mine, other in zip(file.views, model.views, strict=True):
         assert mine.name == other.name
         # The model is vanilla on black: the file holds all of it, rounded to float32.
         assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
-    afterwards.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
+    figures.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
     printed = capsys.readouterr().out
     assert "drawn on black" in printed and "left out: 7 of its views" in printed
     assert sorted(trained.rglob("*")) == before
 
 
 def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
-    afterwards.render(trained, split="test", out=None, on=scene)
+    pictures.render(trained, split="test", out=None, on=scene)
     (folder,) = (trained / "renders").glob("*/on_place")
     assert len(list(folder.glob("*.png"))) == 11
-    afterwards.render(trained, split="test", out=tmp_path / "own", on=scene)
+    pictures.render(trained, split="test", out=tmp_path / "own", on=scene)
     assert len(list((tmp_path / "own").iterdir())) == 11
 
 
 def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
     folder = tmp_path / "ladder"
-    afterwards.fly(trained, "ladder", frames=3, out=folder)
+    pictures.fly(trained, "ladder", frames=3, out=folder)
     assert len(list(folder.glob("*.png"))) == 3
     (film,) = folder.glob("film.*")
     assert f"3 frames in {folder}, film {film}" in capsys.readouterr().out
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(UserError, match="the file exists"):
-        afterwards.fly(trained, "ladder", frames=2, out=folder)
+        pictures.fly(trained, "ladder", frames=2, out=folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     # In the run's own folder a film takes the place of the one before.
     for frames in (3, 2):
-        afterwards.fly(trained, "ladder", frames=frames, out=None)
+        pictures.fly(trained, "ladder", frames=frames, out=None)
     assert len(list((trained / "renders").glob("*/path_ladder/film.*"))) == 1
     with pytest.raises(UserError, match="frames of a ladder"):
-        afterwards.fly(trained, "path.json", frames=2, out=None)
+        pictures.fly(trained, "path.json", frames=2, out=None)
 
 
 @pytest.mark.parametrize(
@@ -135,25 +134,25 @@ def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
     # Without a second photo there are no points left: none are needed.
     only = without(scene, tmp_path / "only", lambda name: name != "aerial/0001.png")
     with pytest.raises(UserError, match="trained on all views"):
-        afterwards.evaluate(trained, on=only)
+        figures.evaluate(trained, on=only)
     away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
     with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
-        afterwards.evaluate(trained, on=far_away)
+        figures.evaluate(trained, on=far_away)
     with pytest.raises(UserError):
-        afterwards.evaluate(trained, on=tmp_path / "nothing")
+        figures.evaluate(trained, on=tmp_path / "nothing")
     assert sorted(trained.rglob("*")) == before
     assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
 
 
 def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
     table = trained / "per_view_on_place.csv"
-    afterwards.evaluated_on(trained, scene)
+    figures.evaluated_on(trained, scene)
     before = table.read_text()
     (tmp_path / "other").mkdir()
     fewer = without(scene, tmp_path / "other" / "place", lambda name: name == "street/0001.png")
     for _ in range(2):
-        afterwards.evaluated_on(trained, fewer)
+        figures.evaluated_on(trained, fewer)
         assert table.read_text() == before
         assert len(per_view(trained / "per_view_on_place-2.csv")) < len(per_view(table))
     assert not (trained / "per_view_on_place-3.csv").exists()
@@ -162,5 +161,5 @@ def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
 def test_a_scene_that_two_readers_take_is_read_as_the_run_s_own(trained, scene, tmp_path):
     both = shutil.copytree(scene, tmp_path / "place")
     (both / "transforms.json").write_text('{"frames": []}')
-    result, _ = afterwards.evaluated_on(trained, both)
+    result, _ = figures.evaluated_on(trained, both)
     assert len(result.views) == 11

@@ -8,7 +8,8 @@ from support.scenes import write_tiny_scene
 
 import crossgrad_core as cg
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import afterwards, app
+from crossgrad_core.run import app
+from crossgrad_core.run.afterwards import figures, files, pictures
 from crossgrad_core.run.flight import LADDER
 from crossgrad_core.run.results import film
 from crossgrad_core.run.results.summary import read_summary
@@ -46,8 +47,8 @@ def test_results_without_checkpoints_are_not_begun_again(run, status):
     before = contents(run)
     for act in (
         lambda: app.run({}, resume=run, verbosity=-1),
-        lambda: afterwards.evaluate(run),
-        lambda: afterwards.export(run, file_format="ply", out=None),
+        lambda: figures.evaluate(run),
+        lambda: files.export(run, file_format="ply", out=None),
     ):
         with pytest.raises(UserError, match="the checkpoints of the run are gone") as refused:
             act()
@@ -104,7 +105,7 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
 
 def test_of_a_shorter_film_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
-        afterwards.fly(run, path=LADDER, frames=frames, out=None)
+        pictures.fly(run, path=LADDER, frames=frames, out=None)
         assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
 
 
@@ -153,7 +154,7 @@ def test_a_changed_configuration_is_refused(run, old, new, named):
     assert text.count(old) == 1
     (run / "config.yaml").write_text(text.replace(old, new))
     before = contents(run)
-    for act in (lambda: app.run({}, resume=run, verbosity=-1), lambda: afterwards.evaluate(run)):
+    for act in (lambda: app.run({}, resume=run, verbosity=-1), lambda: figures.evaluate(run)):
         with pytest.raises(UserError, match=r"config.yaml was changed since") as refused:
             act()
         assert refused.value.where == f"settings {named}; step 6"
@@ -164,14 +165,14 @@ def test_what_does_not_train_may_be_changed(run):
     text = (run / "config.yaml").read_text()
     assert "eval_every: 2" in text
     (run / "config.yaml").write_text(text.replace("eval_every: 2", "eval_every: 3"))
-    afterwards.evaluate(run)
+    figures.evaluate(run)
 
 
 def test_a_film_of_other_frames_does_not_stay(run, monkeypatch, capsys):
-    afterwards.fly(run, path=LADDER, frames=3, out=None)
+    pictures.fly(run, path=LADDER, frames=3, out=None)
     (made,) = run.glob("renders/*/path_ladder/film.*")
     monkeypatch.setattr(film, "_LARGEST", 100)
     monkeypatch.setattr(film.shutil, "which", lambda _: None)
-    afterwards.fly(run, path=LADDER, frames=3, out=None)
+    pictures.fly(run, path=LADDER, frames=3, out=None)
     assert not made.exists()
     assert "no film: too many or too large without ffmpeg" in capsys.readouterr().out

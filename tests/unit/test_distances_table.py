@@ -9,7 +9,7 @@ from support.run_folders import RunFolder
 from support.scenes import write_tiny_scene
 from support.scripts import printed_by
 
-from crossgrad_core.run import afterwards
+from crossgrad_core.run.afterwards import figures
 
 NAMES = [f"{folder}/{number:04}.png" for folder in ("street", "aerial") for number in range(4)]
 
@@ -93,10 +93,8 @@ def evaluated(monkeypatch):
         figure = SimpleNamespace(name="psnr")
         return SimpleNamespace(views=views, figures=[figure]), None
 
-    monkeypatch.setattr(afterwards, "evaluated_on", evaluate)
-    monkeypatch.setattr(
-        afterwards, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how)
-    )
+    monkeypatch.setattr(figures, "evaluated_on", evaluate)
+    monkeypatch.setattr(figures, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how))
     return told
 
 

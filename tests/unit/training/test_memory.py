@@ -129,7 +129,7 @@ def test_where_the_system_does_not_say_nothing_is_shown(monkeypatch):
 
 def test_no_module_of_ours_needs_one_that_only_some_systems_have():
     absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
-    ours = "import crossgrad_core.run.app, crossgrad_core.run.afterwards\n"
+    ours = "import crossgrad_core.run.app, crossgrad_core.run.afterwards.figures\n"
     ours += "import crossgrad_plugins.diagnostics.app"
     subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
 

@@ -1,0 +1,1 @@
+"""Figures, pictures and files of a run that was trained."""
