@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import llvmlite
 import numba
@@ -32,13 +32,20 @@ _LOG = logging.getLogger(__name__)
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
-#: Called before a kernel is compiled that was not on disk.
-_LISTENERS: list[Callable[[], None]] = []
+class Listener(Protocol):
+    """Is called before a kernel is compiled."""
+
+    def __call__(self, *, kept: bool) -> None:
+        """`kept` says whether it will be on disk then."""
+        ...
+
+
+_LISTENERS: list[Listener] = []
 
 
 @contextmanager
-def told_of_missing(listener: Callable[[], None]) -> Iterator[None]:
-    """Calls the listener before each kernel that is not on disk and will be kept there."""
+def told_of_missing(listener: Listener) -> Iterator[None]:
+    """Calls the listener before each kernel that is not on disk, and is compiled."""
     _LISTENERS.append(listener)
     try:
         yield
@@ -73,6 +80,12 @@ def _name(function: Callable[..., Any]) -> str:
     return function.__qualname__.strip("_")
 
 
+def _tell_compiling(name: str, *, kept: bool) -> None:
+    _LOG.info(_COMPILING, name)
+    for listener in _LISTENERS:
+        listener(kept=kept)
+
+
 class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
     """Keeps nothing."""
 
@@ -82,7 +95,7 @@ class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
     @override
     def load_overload(self, sig: object, target_context: object) -> None:
         """Finds nothing."""
-        _LOG.info(_COMPILING, self._name)
+        _tell_compiling(self._name, kept=False)
 
     @override
     def save_overload(self, sig: object, cres: object) -> None:
@@ -106,9 +119,7 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
         with suppress(Exception):
             found = super().load_overload(sig, target_context)
         if found is None:
-            _LOG.info(_COMPILING, _name(self._py_func))
-            for listener in _LISTENERS:
-                listener()
+            _tell_compiling(_name(self._py_func), kept=True)
         return cast("object | None", found)
 
     @override

@@ -7,6 +7,7 @@ from math import ceil
 from typing import Protocol
 
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.numerics.kernel_cache import told_of_missing
 from crossgrad_core.training.clock import ClockKind
 from crossgrad_core.training.expected_cost import (
     Crowd,
@@ -75,13 +76,24 @@ def most_steps(setup: Setup) -> int:
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
-    """Steps that were taken on from a state, and the training seconds of a view in them."""
+    """Steps that were taken on from a state, and the training seconds of a view in them.
+
+    Where a kernel had to be compiled, what was measured before and with it is left out.
+    """
     timed_step(setup, state)
-    kind, start, first, taken = setup.config.clock, state.clock.copy(), state.step, 0.0
-    while state.step - first < PROBE_STEPS or taken < PROBE_SHARE * seconds:
-        timed_step(setup, state)
-        taken = state.clock.trained(kind) - start.trained(kind)
-    pace = setup.schedule.pace
+    kind, pace, compiled = setup.config.clock, setup.schedule.pace, False
+
+    def begin_again(**_: bool) -> None:
+        nonlocal compiled
+        compiled = True
+
+    start, first, taken = state.clock.copy(), state.step, 0.0
+    with told_of_missing(begin_again):
+        while state.step - first < PROBE_STEPS or taken < PROBE_SHARE * seconds:
+            timed_step(setup, state)
+            if compiled:
+                start, first, compiled = state.clock.copy(), state.step, False
+            taken = state.clock.trained(kind) - start.trained(kind)
     return state.step - first, taken / (pace.views(state.step) - pace.views(first))
 
 

@@ -26,27 +26,33 @@ from crossgrad_core.training.setup import Setup
 
 @contextmanager
 def compiling_beside(setup: Setup) -> Iterator[None]:
-    """Starts the other process with the first kernel that is missing, and ends it at last.
+    """Starts the other process with the first kernel that is missing, and waits for it at last.
 
-    Not where this one has one core, or one thread, to itself, and not for a GPU.
+    Not where this one has one core, or one thread, to itself, and not for a GPU. Then all kernels
+    of steps by rows are in memory here, too: whether a view draws few rows or many, which have
+    kernels of their own, is found out on the clock.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
 
-    def start() -> None:
-        if processes or alone or setup.device.type != "cpu":
+    def start(*, kept: bool) -> None:
+        if processes or alone or not kept or setup.device.type != "cpu":
             return
         command = [sys.executable, "-m", __name__, setup.config.loss.model_dump_json()]
         silent = subprocess.DEVNULL
         processes.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
 
-    with told_of_missing(start):
-        try:
+    try:
+        with told_of_missing(start):
             yield
-        finally:
-            for process in processes:
-                process.terminate()
-                process.wait()
+        for process in processes:
+            process.wait()
+        if setup.by_rows:
+            compile_rows()
+    finally:
+        for process in processes:
+            process.terminate()
+            process.wait()
 
 
 def compile_all(loss: ComponentChoice) -> None:
@@ -55,9 +61,14 @@ def compile_all(loss: ComponentChoice) -> None:
     render = torch.full((64, 64, 3), 0.5, requires_grad=True)
     measured = build(Loss, loss.name, loss.options).loss(render, photo, None, None)
     measured.backward()  # type: ignore[no-untyped-call]
-    values, state = torch.zeros((8, 3)), AdamState()
-    adam_step({"all": values}, {"all": torch.ones_like(values)}, state, {"all": 1e-3})
-    late = Late()
+    values = torch.zeros((8, 3))
+    adam_step({"all": values}, {"all": torch.ones_like(values)}, AdamState(), {"all": 1e-3})
+    compile_rows()
+
+
+def compile_rows() -> None:
+    """Compiles what steps by rows need, likewise."""
+    values, state, late = torch.zeros((8, 3)), AdamState(), Late()
     # One row of many, another one, which is late by then, and so many that all are taken.
     for rows in ([1], [4], [1, 4, 6]):
         grad = by_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)

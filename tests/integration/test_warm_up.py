@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics import kernel_cache
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_core.training import compile_ahead
+from crossgrad_core.training import budget, compile_ahead
 
 #: Trains as the command does, and prints which kernels were compiled or loaded after the warm-up.
 SCRIPT = """
@@ -93,32 +94,99 @@ def test_what_is_compiled_beside_is_what_a_run_uses():
     assert new == []
 
 
-@pytest.mark.parametrize(("settings", "processes"), [({}, 1), ({"threads": 1}, 0)])
-def test_the_other_process_starts_with_the_first_missing_kernel(monkeypatch, settings, processes):
-    started = []
+class _Process:
+    """Takes the command and the end of it."""
 
-    class Process:
-        """Takes the command and the end of it."""
+    started: ClassVar[list[str]] = []
 
-        def __init__(self, command, **options):
-            started.append(command)
+    def __init__(self, command, **options):
+        self.started.append(command[-1])
 
-        def terminate(self):
-            started.append("terminated")
+    def terminate(self):
+        self.started.append("terminated")
 
-        def wait(self):
-            started.append("waited for")
+    def wait(self):
+        self.started.append("waited for")
 
-    monkeypatch.setattr(compile_ahead.subprocess, "Popen", Process)
+
+@pytest.fixture
+def started(monkeypatch):
+    """What becomes of the other process, on a machine of two cores."""
+    monkeypatch.setattr(compile_ahead.subprocess, "Popen", _Process)
     monkeypatch.setattr(compile_ahead, "available_cores", lambda: 2)
-    setup = SimpleNamespace(config=RunConfig(**settings), device=torch.device("cpu"))
-    with compile_ahead.compiling_beside(setup):
+    monkeypatch.setattr(_Process, "started", [])
+    return _Process.started
+
+
+def _setup(**settings):
+    return SimpleNamespace(config=RunConfig(**settings), device=torch.device("cpu"), by_rows={})
+
+
+def _miss(*, kept=True):
+    for listener in kernel_cache._LISTENERS:
+        listener(kept=kept)
+
+
+def test_the_other_process_starts_with_the_first_missing_kernel(started):
+    with compile_ahead.compiling_beside(_setup()):
         assert started == []
-        for _ in range(2):
-            for listener in kernel_cache._LISTENERS:
-                listener()
-    assert len(started) == 3 * processes
+        _miss()
+        _miss()
+        assert [json.loads(each) for each in started] == [{"name": "l1-ssim"}]
+    # It is not ended before it is ready.
+    assert started[1:] == ["waited for", "terminated", "waited for"]
     assert kernel_cache._LISTENERS == []
-    if processes:
-        assert started[1:] == ["terminated", "waited for"]
-        assert json.loads(started[0][-1]) == {"name": "l1-ssim"}
+
+
+def test_the_other_process_ends_with_a_run_that_is_refused(started):
+    def refuse():
+        with compile_ahead.compiling_beside(_setup()):
+            _miss()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        refuse()
+    assert started[1:] == ["terminated", "waited for"]
+
+
+@pytest.mark.parametrize(("settings", "kept"), [({"threads": 1}, True), ({}, False)])
+def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, settings, kept):
+    with compile_ahead.compiling_beside(_setup(**settings)):
+        _miss(kept=kept)
+    assert started == []
+
+
+def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeypatch):
+    # Whether a view draws few rows is found out on the clock.
+    asked = []
+    monkeypatch.setattr(compile_ahead, "compile_rows", lambda: asked.append("rows"))
+    for by_rows in ({}, {"sh_rest": "f_rest"}):
+        setup = _setup(threads=1)
+        setup.by_rows = by_rows
+        with compile_ahead.compiling_beside(setup):
+            assert asked == []
+    assert asked == ["rows"]
+
+
+def test_a_probe_begins_again_behind_a_kernel_that_had_to_be_compiled(monkeypatch):
+    clock = SimpleNamespace(seconds=0.0)
+    clock.trained = lambda kind: clock.seconds
+    clock.copy = lambda: SimpleNamespace(trained=lambda kind, at=clock.seconds: at)
+    state = SimpleNamespace(step=0, clock=clock)
+    setup = SimpleNamespace(
+        config=SimpleNamespace(clock="wall"),
+        schedule=SimpleNamespace(pace=SimpleNamespace(views=lambda step: step)),
+    )
+
+    def step(setup, state):
+        state.step += 1
+        clock.seconds += 0.1
+        if state.step in (3, 9):
+            clock.seconds += 5.0
+            _miss(kept=False)
+
+    monkeypatch.setattr(budget, "timed_step", step)
+    steps, each = budget._probed(setup, state, seconds=10.0)
+    assert steps == budget.PROBE_STEPS
+    assert state.step == 9 + budget.PROBE_STEPS
+    assert each == pytest.approx(0.1)

@@ -62,10 +62,16 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
     return Standing(job, "interrupted" if begun(folder) else "waiting")
 
 
+def figures(standing: Standing) -> dict[str, float]:
+    """The finite figures of all held-out views of a finished run, by name."""
+    overall = (standing.summary or {}).get("overall") or {}
+    numbers = ((n, v) for n, v in overall.items() if isinstance(v, int | float))
+    return {name: float(value) for name, value in numbers if isfinite(value)}
+
+
 def figure(standing: Standing, name: str) -> float | None:
     """A figure of all held-out views of a finished run; None where it is none or not finite."""
-    value = ((standing.summary or {}).get("overall") or {}).get(name)
-    return float(value) if isinstance(value, int | float) and isfinite(value) else None
+    return figures(standing).get(name)
 
 
 def begun(folder: Path) -> bool:

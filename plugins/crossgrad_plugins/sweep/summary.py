@@ -7,7 +7,7 @@ from crossgrad_core.commands import UserError, listed, read_rows, write_table
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.standing import Standing, figure
+from crossgrad_plugins.sweep.standing import Standing, figure, figures
 
 _COLUMNS = ("run", "scene", "configuration", "seed")
 
@@ -24,9 +24,11 @@ def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
     """Mean and, over seeds, standard deviation of a figure: configurations x scenes.
 
-    The best mean of each scene has an asterisk.
+    The best mean of each scene has an asterisk. Where no finished run has the figure, a line says
+    which ones they have.
     """
-    values = {each.job.id: figure(each, metric.name) for each in standings}
+    known = tuple(standings)
+    values = {each.job.id: figure(each, metric.name) for each in known}
     found: dict[tuple[str, str], list[float]] = {}
     for job in cells:
         if (value := values[job.id]) is not None:
@@ -42,6 +44,9 @@ def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+    if not found and any(each.summary for each in known):
+        there = listed(sorted({name for each in known for name in figures(each)})) or "no figures"
+        yield f"no finished run has {metric.name}; they have {there} (metric: of the grid)"
 
 
 def _best(found: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:

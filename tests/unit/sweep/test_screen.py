@@ -120,6 +120,15 @@ def test_the_table_has_means_over_seeds_and_marks_the_best():
     assert list(table(jobs, found, Metric(goal="minimize")))[1].endswith("*")
 
 
+def test_a_metric_that_no_run_has_is_told_with_those_they_have():
+    jobs, overall = JOBS[:2], {"psnr": 20.0, "lpips": None, "ssim": 0.5}
+    found = [Standing(job, "finished", summary={"overall": overall}) for job in jobs]
+    told = list(table(jobs, found, Metric(name="psnr_street")))[-1]
+    assert told.startswith("no finished run has psnr_street; they have psnr, ssim")
+    waiting = [Standing(job, "waiting") for job in jobs]
+    assert "no finished run" not in "".join(table(jobs, waiting, Metric(name="psnr_street")))
+
+
 def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
     layout = Layout(tmp_path)
     layout.make()
