@@ -63,7 +63,7 @@ from crossgrad_core.contract.objections import objections_to_views, set_for_noth
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.pace import ViewPlan
-from crossgrad_core.contract.poses import footprint_of, radial_distances
+from crossgrad_core.contract.poses import footprint_of, radial_distances, without_rounding
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.resolution import Resolution, octave
@@ -221,4 +221,5 @@ __all__ = [
     "shows_bar",
     "size_text",
     "unit_range",
+    "without_rounding",
 ]

@@ -11,12 +11,30 @@ from crossgrad_core.contract.scene import Camera, Scene, View, centers_of
 _FEWEST_SEEN = 3
 #: Points tested against the image of a view that observed too few.
 _MOST_TESTED = 50_000
+#: Of a length between cameras; what is behind them is rounding.
+_BITS = 40
 
 
 def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] distance of each camera from the mean training camera centre, local units."""
+    """[V] distance of each camera from the mean training camera centre, local units.
+
+    Without what is rounding: a camera that stands there has 0, and equal distances are equal.
+    """
     middle = scene.centers.mean(axis=0)
-    return np.asarray(np.linalg.norm(centers_of(views) - middle, axis=1))
+    return without_rounding(scene, np.linalg.norm(centers_of(views) - middle, axis=1))
+
+
+def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths [V] between camera centres, rounded to 2^-40 (1e-12) of the largest coordinate.
+
+    What the mean of the training cameras is taken from differs by its rounding alone in layouts
+    that are regular, and a cut at the median, a rank or a logarithm would depend on it.
+    """
+    largest = float(np.abs(scene.centers).max(initial=0.0))
+    if not 0.0 < largest < np.inf:
+        return lengths
+    step = 2.0 ** (np.ceil(np.log2(largest)) - _BITS)
+    return np.asarray(np.round(lengths / step) * step)
 
 
 def footprint_of(scene: Scene, view: View) -> float:

@@ -77,7 +77,8 @@ class RevisingDensification(CloneSplit):
     @override
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         edit, state = super().densify(context, state)
-        if self.opacity_decrease == 0 or edit.is_empty:
+        schedule, step = context.schedule, context.step
+        if self.opacity_decrease == 0 or not (schedule.collects(step) and schedule.densifies(step)):
             return edit, state
         blocks = tuple(b for b in context.backbone.blocks() if "opacities" in b.tensors)
         logits = apply_to_parameters(edit, blocks, context.parameters)["opacities"].detach()

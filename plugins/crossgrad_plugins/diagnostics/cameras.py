@@ -13,6 +13,7 @@ from crossgrad_core.plugin import (
     footprint_of,
     radial_distances,
 )
+from crossgrad_plugins.diagnostics.distances import relative_variance
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement
@@ -42,11 +43,14 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
 def camera_rows(scene: Scene) -> list[Row]:
     """Bimodality of heights and log-distances, and the variance of the distances."""
     axis, source = upward(scene)
-    samples = {f"height ({source})": altitudes(scene, scene.train_views, axis)}
+    # Name -> values, and Var(r) / mean(r)^2 of a distance; heights have an arbitrary origin.
+    heights = altitudes(scene, scene.train_views, axis)
+    samples = {f"height ({source})": (heights, float("nan"))}
     for name, values in distances_of(scene).items():
-        samples[f"log {name} distance"] = np.log(values[values > 0.0])
+        logs = np.log(values[values > 0.0])
+        samples[f"log {name} distance"] = logs, relative_variance(values)
     rows: list[Row] = []
-    for name, values in samples.items():
+    for name, (values, variance) in samples.items():
         coefficient = bimodality(values)
         rows.append(
             {
@@ -54,19 +58,11 @@ def camera_rows(scene: Scene) -> list[Row]:
                 "views": coefficient.size,
                 "bimodality_sample": coefficient.sample,
                 "bimodality_population": coefficient.population,
-                "relative_variance": _relative_variance(name, values),
+                "relative_variance": variance,
                 "note": coefficient.reason,
             }
         )
     return rows
-
-
-def _relative_variance(name: str, values: NDArray[np.float64]) -> float:
-    """Var(r) / mean(r)^2 of a distance; NaN for heights, whose origin is arbitrary."""
-    if not name.startswith("log") or len(values) == 0:
-        return float("nan")
-    distances = np.exp(values)
-    return float(distances.var() / distances.mean() ** 2)
 
 
 def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:

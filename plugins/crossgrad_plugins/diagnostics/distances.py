@@ -6,6 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+#: Correlations that differ by less are equal.
+_ROUNDING = 1e-9
+#: Decimals of a difference of logarithms that are no rounding.
+_DIGITS = 11
+
 
 @dataclass(frozen=True, eq=False)
 class DistanceConflict:
@@ -47,7 +52,7 @@ def conflict_by_distance(
         bins: Q.
         permutations: How many.
     """
-    variance = float(distances.var() / distances.mean() ** 2) if distances.any() else float("nan")
+    variance = relative_variance(distances)
     positive = np.flatnonzero(distances > 0.0)
     logs, products = np.log(distances[positive]), gramian[np.ix_(positive, positive)]
     first, second = np.triu_indices(len(positive), 1)
@@ -57,7 +62,7 @@ def conflict_by_distance(
         return DistanceConflict(variance, np.full(bins + 1, np.nan), nothing, np.nan, np.nan)
     ranks = _pair_ranks(logs)
     first, second = first[counted], second[counted]
-    apart = np.abs(logs[first] - logs[second])
+    apart = _apart(logs, first, second)
     negative = products[first, second] < 0.0
     edges = np.quantile(apart, np.linspace(0.0, 1.0, bins + 1))
     # The first order is the cameras' own.
@@ -67,10 +72,16 @@ def conflict_by_distance(
     ]
     order = np.stack(orders)
     correlations = _correlations(ranks[order[:, first], order[:, second]], negative)
-    above = int((correlations[1:] >= correlations[0]).sum())
+    # Equal ones are sums in another order.
+    above = int((correlations[1:] >= correlations[0] - _ROUNDING).sum())
     p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
     rates = _rates(apart, negative, edges)
     return DistanceConflict(variance, edges, rates, float(correlations[0]), p_value)
+
+
+def relative_variance(distances: NDArray[np.float64]) -> float:
+    """Var(r) / mean(r)^2 of distances [V]; NaN where all are 0, or there are none."""
+    return float(distances.var() / distances.mean() ** 2) if distances.any() else float("nan")
 
 
 def _rates(
@@ -87,8 +98,15 @@ def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, V] rank of |log r_i - log r_j| among all pairs."""
     first, second = np.triu_indices(len(logs), 1)
     ranks = np.zeros((len(logs), len(logs)))
-    ranks[first, second] = rankdata(np.abs(logs[first] - logs[second]))
+    ranks[first, second] = rankdata(_apart(logs, first, second))
     return ranks + ranks.T
+
+
+def _apart(
+    logs: NDArray[np.float64], first: NDArray[np.int64], second: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """|log r_i - log r_j| of pairs; equal ones are equal, whatever their logarithms round to."""
+    return np.asarray(np.abs(logs[first] - logs[second]).round(_DIGITS))
 
 
 def _correlations(ranks: NDArray[np.float64], negative: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -114,12 +114,13 @@ def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
     """
     similarity = (1.0 + cosines) / 2.0
-    root = 1.0 / np.sqrt(similarity.sum(axis=1))
-    # The second smallest eigenvalue of I - S is the second largest of S.
-    scaled = root[:, None] * similarity * root[None, :]
-    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0)
-    # A further eigenvalue, -1 at the least, stands below the smallest.
-    gaps = np.diff(values, prepend=-2.0)
-    if len(values) == 1 or gaps[-2] <= _SMALLEST_GAP:
+    root = np.sqrt(similarity.sum(axis=1))
+    # The second smallest eigenvalue of I - S is the second largest of S, whose largest, 1, is known
+    # with its vector. Two groups that share nothing have 1 twice: without it the other one is left.
+    scaled = similarity / root[:, None] / root[None, :]
+    first = root / np.linalg.norm(root)
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
+    # The known one is -1 now: of the others none is less.
+    if len(values) == 1 or values[-1] - values[-2] <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
-    return (vectors[:, -2] > 0.0).astype(np.int64)
+    return (vectors[:, -1] > 0.0).astype(np.int64)

@@ -34,8 +34,9 @@ class Footprint(Grouping):
     """near: views that draw a local unit over at least the median number of pixels; far: the rest.
 
     The measure of a view is the median of f/z over the SfM points that it observed, or over those
-    in its image where it observed none; where there are none either, that of the nearest training
-    camera that has one. It uses the focal length and needs no layout of cameras around a centre.
+    in its image where it observed fewer than three; where there are none either, that of the
+    nearest training camera that has one. It uses the focal length and needs no layout of cameras
+    around a centre.
 
     Source: the paper, projected footprint; Otsu's cut and what stands in are ours.
     """

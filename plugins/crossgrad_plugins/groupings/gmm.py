@@ -21,7 +21,8 @@ from crossgrad_plugins.groupings.radial import Radial
 from crossgrad_plugins.groupings.split import FAR, NEAR, log_distances, require_training_views
 
 _VARIANCE_FLOOR = 1e-6
-_DISTANCE_FLOOR = 1e-9
+#: A mixture begins with two cameras.
+_FEWEST = 2
 _ITERATIONS = 500
 _TOLERANCE = 1e-10
 
@@ -30,7 +31,8 @@ class GaussianMixture(Grouping):
     """The two components of a mixture fitted to log r; near has the smaller mean.
 
     Falls back to the median (grouping `radial`), with a note, where the fit is degenerate: a
-    component weighs less than one camera, gets no camera, or a figure is not finite.
+    component weighs less than one camera, gets no camera, or a figure is not finite. A camera that
+    stands at the mean of all has no logarithm: it is near, and left out of the fit.
 
     Source: expectation maximisation (Dempster et al. 1977) in one dimension.
     """
@@ -43,15 +45,15 @@ class GaussianMixture(Grouping):
     ) -> Rule:
         require_training_views(scene, "gmm")
         distances = radial_distances(scene, scene.train_views)
-        floor = _DISTANCE_FLOOR * float(np.median(distances))
-        mixture = _fit(distances, floor, self.restarts, rng)
-        if mixture is None or len(set(mixture.labels(distances, floor))) == 1:
+        away = distances[distances > 0.0]
+        mixture = _fit(np.log(away), self.restarts, rng)
+        if mixture is None or len(set(mixture.labels(away))) == 1:
             median = Radial().fit(scene, rng)
             fallback = "grouping gmm: the mixture is degenerate, the median split is used instead"
             return Rule(median.labels, (fallback, *median.notes))
         near, far = np.exp(mixture.means)
         note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
-        return Rule(lambda views: mixture.labels(radial_distances(scene, views), floor), (note,))
+        return Rule(lambda views: mixture.labels(radial_distances(scene, views)), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:
@@ -67,21 +69,16 @@ class _Mixture:
     variances: NDArray[np.float64]
     likelihood: float
 
-    def labels(self, distances: NDArray[np.float64], floor: float) -> tuple[str, ...]:
+    def labels(self, distances: NDArray[np.float64]) -> tuple[str, ...]:
         """The more probable component of each distance [V]."""
-        joint = _log_joint(np.log(np.maximum(distances, floor)), self)
-        return tuple(NEAR if near >= far else FAR for near, far in joint)
+        nowhere = distances == 0.0
+        near, far = _log_joint(np.log(np.where(nowhere, 1.0, distances)), self).T
+        return tuple(NEAR if is_near else FAR for is_near in (near >= far) | nowhere)
 
 
-def _fit(
-    distances: NDArray[np.float64], floor: float, restarts: int, rng: np.random.Generator
-) -> _Mixture | None:
+def _fit(logs: NDArray[np.float64], restarts: int, rng: np.random.Generator) -> _Mixture | None:
     """The most likely of several fits; None where none is usable."""
-    if floor <= 0.0:
-        return None
-    logs = np.log(np.maximum(distances, floor))
-    spread = float(logs.var())
-    if spread == 0.0:
+    if len(logs) < _FEWEST or (spread := float(logs.var())) == 0.0:
         return None
     fits = [_expectation_maximisation(logs, spread, rng) for _ in range(restarts)]
     usable = [fit for fit in fits if _usable(fit, len(logs))]

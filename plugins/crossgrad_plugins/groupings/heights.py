@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Scene, UserError, View, centers_of
+from crossgrad_core.plugin import Scene, UserError, View, centers_of, without_rounding
 
 #: An axis, or where to take it from.
 Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]
@@ -16,11 +16,14 @@ _SHORTEST_MEAN = 0.1
 
 
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V] height of each camera along the unit axis `up` [3] over the mean training camera."""
+    """[V] height of each camera along the unit axis `up` [3] over the mean training camera.
+
+    Equal heights are equal, as `radial_distances` has distances.
+    """
     middle = scene.centers.mean(axis=0)
     # Not a matrix product: its rounding depends on the number of rows, and a median cut falls
     # exactly on one of them.
-    return np.asarray(((centers_of(views) - middle) * up).sum(axis=1))
+    return without_rounding(scene, ((centers_of(views) - middle) * up).sum(axis=1))
 
 
 def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:

@@ -13,9 +13,6 @@ from crossgrad_plugins.groupings.thresholds import otsu_threshold
 Cut: TypeAlias = Literal["median", "otsu"]
 CUT: Final = "where near ends: the median, or Otsu's cut of the logarithms"
 
-#: Distances below this share of the median one are rounding.
-_NOWHERE = 1e-9
-
 NEAR, MIDDLE, FAR = "near", "middle", "far"
 
 
@@ -55,9 +52,8 @@ def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:
 def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
     """Logarithms of the distances from the mean training camera; none for one that stands there."""
     distances = radial_distances(scene, views)
-    there = _NOWHERE * float(np.median(radial_distances(scene, scene.train_views)))
     logs = np.full(len(distances), -np.inf)
-    np.log(distances, out=logs, where=distances > there)
+    np.log(distances, out=logs, where=distances > 0.0)
     return Quantity("the log distance from the mean camera", logs)
 
 

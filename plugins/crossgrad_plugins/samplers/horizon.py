@@ -18,6 +18,9 @@ from crossgrad_core.plugin import (
 from crossgrad_plugins.samplers.draws import Deck, draw
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 
+#: Decimals of a number of steps that are no rounding.
+_DIGITS = 6
+
 
 class Horizon(Sampler):
     """Views by turns: a far ones, then b near ones, and so on; each group in epochs of its own.
@@ -53,7 +56,8 @@ class Horizon(Sampler):
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
         near, far = groups_of(context, "horizon", 2).items()
-        coarse = context.step <= self.coarse_share * context.schedule.total
+        # 0.29 of 100 steps are 29, though not in binary numbers.
+        coarse = context.step <= round(self.coarse_share * context.schedule.total, _DIGITS)
         far_turns, near_turns = self.coarse if coarse else self.fine
         turns = [far] * far_turns + [near] * near_turns
         start = _turn(state, coarse)

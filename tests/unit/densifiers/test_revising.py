@@ -280,3 +280,12 @@ def test_decoding_photos_for_an_edit_counts_as_loading():
     before = state.clock.load
     timed_step(setup, state)  # Its edit measures every training view.
     assert state.clock.load - before >= (1 + VIEWS) * Slow.SECONDS
+
+
+def test_an_edit_that_grows_nothing_and_prunes_nothing_lowers_opacities_all_the_same():
+    ctx = context()
+    before = ctx.parameters["opacities"].detach()
+    kept = RevisingDensification(error_threshold=1e9, prune_opacity=0.0)
+    edit, _ = kept.densify(ctx, EMPTY_STATE)
+    assert edit.source is None
+    assert torch.equal(edit.values["opacities"].values, lowered_logits(before, 0.001))

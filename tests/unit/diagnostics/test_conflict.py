@@ -151,3 +151,27 @@ def test_constant_conflict_has_no_correlation(gramian):
     distances = np.arange(1.0, 6.0)
     found = conflict_by_distance(gramian, distances, np.random.default_rng(0))
     assert np.isnan([found.correlation, found.p_value]).all()
+
+
+@pytest.mark.parametrize("views", [4, 6, 8])
+def test_a_relabelling_that_is_as_good_counts_however_its_sum_rounds(views):
+    # One pair conflicts, the nearest camera with the farthest one: no other is as far apart.
+    pairs, values = views * (views - 1) / 2, []
+    for seed in range(20):
+        distances = np.exp(np.random.default_rng(seed).normal(size=views))
+        near, far = distances.argmin(), distances.argmax()
+        gramian = np.full((views, views), 0.5) + np.eye(views)
+        gramian[near, far] = gramian[far, near] = -0.3
+        rng = np.random.default_rng(seed)
+        values.append(conflict_by_distance(gramian, distances, rng).p_value)
+    # 20 draws of 499 relabellings each: three standard errors of their mean.
+    share = 1.0 / pairs
+    assert np.mean(values) == pytest.approx(share, abs=3 * np.sqrt(share / 499 / 20) + 1 / 500)
+
+
+def test_pairs_that_are_equally_far_apart_have_one_rank():
+    # Two rings whose radii differ by rounding, in conflict between them.
+    radii = np.repeat([1.0, 3.0], 8) * (1 + 1e-15 * np.random.default_rng(0).normal(size=16))
+    sides = np.repeat([1.0, -1.0], 8)
+    found = conflict_by_distance(np.outer(sides, sides), radii, np.random.default_rng(0))
+    assert found.correlation == pytest.approx(1.0, abs=1e-12)

@@ -49,6 +49,16 @@ def test_a_long_chain_of_photos_is_solved_to_its_ends():
     assert np.abs(fit.gains - planted).max() < 1e-3
 
 
+@pytest.mark.parametrize(("count", "shared"), [(400, 1), (800, 5)])
+def test_a_strip_of_hundreds_of_photos_is_solved_to_rounding(count, shared):
+    planted = np.random.default_rng(1).normal(0, 1, count)
+    photos = np.repeat(np.arange(count), 2 * shared)
+    points = shared * photos + np.tile(np.arange(2 * shared), count)
+    stops = planted[photos] + np.random.default_rng(2).normal(-2, 1, points.max() + 1)[points]
+    fit = fitted(Observations(photos, points, stops, np.arange(points.max() + 1)), count)
+    assert np.abs(fit.gains - (planted - planted.mean())).max() < 1e-9
+
+
 def test_parts_that_share_no_point_have_a_mean_of_zero_each():
     one = observed(np.array([1.0, 3.0]), 20, 20, noise=0.0)
     other = observed(np.array([-5.0, -5.5]), 20, 20, noise=0.0)

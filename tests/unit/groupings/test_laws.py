@@ -212,8 +212,8 @@ def test_gmm_survives_degenerate_distances(distances):
 
 
 def test_gmm_falls_back_to_the_median_and_says_so():
-    # The median is zero: no logarithm of these distances makes sense.
-    scene = on_a_line(0.0, 0.0, 0.0, 1.0, 2.0)
+    # All that have a logarithm have one.
+    scene = on_a_line(0.0, 0.0, 0.0, 1.0, 1.0)
     rule = GaussianMixture().fit(scene, np.random.default_rng(0))
     radial = Radial().fit(scene, np.random.default_rng(0))
     assert rule.labels(scene.views) == radial.labels(scene.views)
@@ -224,3 +224,41 @@ def test_gmm_is_not_said_to_be_degenerate_where_it_is_not():
     scene = hybrid()
     rule = GaussianMixture().fit(scene, np.random.default_rng(0))
     assert not any("degenerate" in note for note in rule.notes)
+
+
+def ring(radius, count, center, turn=0.0):
+    """Cameras on a circle whose coordinates are no round numbers."""
+    angles = turn + 2 * np.pi * np.arange(count) / count
+    flat = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+    return radius * flat + np.array(center)
+
+
+def scene_at(*centers):
+    rows = np.concatenate([np.atleast_2d(each) for each in centers])
+    return posed_scene([posed_view(row, f"{i:02}.png") for i, row in enumerate(rows)])
+
+
+@pytest.mark.parametrize(("name", "options"), [("radial", {"cut": "otsu"}), ("gmm", {})])
+def test_a_camera_in_the_middle_of_two_rings_is_near_and_moves_no_cut(name, options):
+    middle = (0.3, 0.7, 0.4)
+    scene = scene_at(ring(1.0, 8, middle, 0.2), ring(3.0, 8, middle, 0.5), middle)
+    rule = build("groupings", name, options).fit(scene, np.random.default_rng(0))
+    assert rule.labels(scene.train_views) == ("near",) * 8 + ("far",) * 8 + ("near",)
+
+
+@pytest.mark.parametrize("name", ["radial", "percentile", "anchors", "terciles"])
+def test_cameras_on_one_ring_are_no_two_groups(name):
+    scene = scene_at(ring(1.0, 12, (0.3, 0.7, 0.4), 0.2))
+    with pytest.raises(UserError, match="leaves a group without training views"):
+        build("groupings", name, {}).fit(scene, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("cut", ["median", "otsu", "gap"])
+def test_cameras_at_one_height_over_a_tilted_ground_are_no_two_groups(cut):
+    up = np.array([0.1, -0.3, 0.9]) / np.linalg.norm([0.1, -0.3, 0.9])
+    across = np.cross(up, [1.0, 0.0, 0.0])
+    plane = np.stack([across, np.cross(up, across)])
+    rows = np.random.default_rng(1).normal(size=(20, 2)) @ plane + 0.4
+    grouping = build("groupings", "altitude", {"cut": cut, "up": tuple(up)})
+    with pytest.raises(UserError, match="leaves a group without training views"):
+        grouping.fit(scene_at(rows), np.random.default_rng(0))

@@ -181,3 +181,16 @@ def test_a_missing_file_is_a_user_error(tmp_path):
     scene = names("a.png", "b.png")
     with pytest.raises(UserError, match="cannot be read"):
         Lists(file=tmp_path / "no.csv").fit(scene, RNG)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cut_parts_groups_that_share_nothing(size, seed):
+    # The largest eigenvalue stands there twice: any vector of its plane comes out of a solver.
+    sides = np.repeat([1.0, -1.0], size)
+    order = np.random.default_rng(seed).permutation(2 * size)
+    cosines = np.outer(sides, sides)[np.ix_(order, order)]
+    found = spectral_cut(cosines)
+    assert len(set(found[sides[order] > 0])) == 1
+    assert len(set(found[sides[order] < 0])) == 1
+    assert len(set(found)) == 2
