@@ -213,6 +213,15 @@ class RunConfig(BaseModel):
         description="decay of Adam's second moment; where it is given, rates are those of runs "
         "that show photos often",
     )
+    position_steps: Annotated[Literal["extent", "size"] | None, Flag("extent|size", TRAINING)] = (
+        Field(
+            None,
+            description="How far positions step: by a share of the scene's extent, as published, "
+            "or along the axes of each Gaussian, by a share of their lengths. Default: size in "
+            "runs of fewer than 30,000 steps; extent in longer ones, with --preset inria, and of "
+            "anchors.",
+        )
+    )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",
         description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "

@@ -36,6 +36,7 @@ class Vanilla(Backbone):
     plain: ClassVar[bool] = True
     passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc", "sh_rest": "f_rest"}
     positions: ClassVar[str] = "means"
+    axes: ClassVar[tuple[str, str] | tuple[()]] = ("scales", "quats")
 
     initial_opacity: float = Field(0.1, gt=0.0, lt=1.0, description="of a Gaussian of a point")
     sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")

@@ -35,6 +35,9 @@ class Backbone(Component):
             per-primitive tensors together, and without a call of `prepare`. At the end of a run
             rows are removed likewise, after `decode` was asked what some of them alone give
             (floaters). Where it is empty, only edits move or remove rows.
+        axes: Tensors [N, 3] of the logarithms of standard deviations and [N, 4] of rotations (wxyz,
+            of any length) of Gaussians that primitives are, each about its position, which may then
+            step along these axes. Empty where primitives are none.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -44,6 +47,7 @@ class Backbone(Component):
     own_dilation: ClassVar[bool] = False
     passed_on: ClassVar[Mapping[str, str]] = {}
     positions: ClassVar[str] = ""
+    axes: ClassVar[tuple[str, str] | tuple[()]] = ()
 
     @classmethod
     @override

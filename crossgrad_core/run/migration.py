@@ -59,6 +59,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest.setdefault("events", "steps")
         rest.setdefault("rate_factor", 1.0)
         rest.setdefault("beta2", 0.999)
+        rest.setdefault("position_steps", "extent")
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)

@@ -118,12 +118,13 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
         return  # Of a version that wrote none, or whose settings may have other names.
     ours = settings_of(config)
-    changed = sorted(key for key in ours.keys() | stored.keys() if ours.get(key) != stored.get(key))
+    # What it does not know is of a later state of this version, and was read as it was then.
+    changed = sorted(key for key in stored if ours.get(key) != stored[key])
     if changed:
         raise UserError(
             "config.yaml was changed since this run began",
             where=f"settings {listed(changed)}; step {checkpoint.step}",
-            expected=listed(f"{key}: {stored.get(key)}" for key in changed),
+            expected=listed(f"{key}: {stored[key]}" for key in changed),
             found=listed(f"{key}: {ours.get(key)}" for key in changed),
             todo="put them back, or start a new run with the changed file (--config)",
         )

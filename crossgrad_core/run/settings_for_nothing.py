@@ -17,6 +17,7 @@ from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.training.floaters import cameras_that_tell
+from crossgrad_core.training.rates import axes_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
@@ -58,6 +59,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_groups(config, setup),
         *_of_exposure(config, setup),
         *_of_the_split(config),
+        *_of_positions(config, setup),
         *_of_the_start(config),
         *_of_the_end(config, setup),
     ]
@@ -210,6 +212,12 @@ def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             yield "floaters", f"backbone {setup.selection.names['backbone']} names no positions"
         if not cameras_that_tell(setup.scene):
             yield "floaters", "no photo observes enough points to say what around it is empty"
+
+
+def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.position_steps == "size" and axes_of(setup) is None:
+        name = setup.selection.names["backbone"]
+        yield "position_steps", f"primitives of backbone {name} are no Gaussians with axes"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

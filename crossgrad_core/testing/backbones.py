@@ -121,6 +121,16 @@ def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
     require(backbone.positions in {"", *fitting}, known)
 
 
+def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
+    """`axes` is empty or names tensors [N, 3] and [N, 4] of primitives that have positions."""
+    backbone = make()
+    parameters = created(backbone)
+    held = {name for block in backbone.blocks() if block.per_primitive for name in block.tensors}
+    shapes = [tuple(parameters[n].shape[1:]) if n in held else None for n in backbone.axes]
+    fit = not backbone.axes or (shapes == [(3,), (4,)] and backbone.positions != "")
+    require(fit, f"axes is {backbone.axes!r}, positions {backbone.positions!r}; shapes {shapes}")
+
+
 def gradients_reach_every_block(make: Make[Backbone]) -> None:
     """What is decoded over all views depends on every block that is trained."""
     backbone = make()
@@ -254,6 +264,7 @@ BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     created_from_the_scene,
     decoding_has_the_shape,
     positions_are_those_of_primitives,
+    axes_are_those_of_primitives,
     gradients_reach_every_block,
     checkpoints_give_the_same_gaussians,
     edits_keep_rows_together,

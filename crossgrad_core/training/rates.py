@@ -130,6 +130,19 @@ def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
     )
 
 
+def axes_of(setup: Setup) -> tuple[str, str, str] | None:
+    """Tensors of positions, scales and rotations, where positions step along axes; else None.
+
+    Runs as long as the published ones have the published steps.
+    """
+    config, backbone = setup.config, setup.backbone
+    short = config.preset != "inria" and _planned(config, setup.schedule) < REFERENCE
+    by_size = short if config.position_steps is None else config.position_steps == "size"
+    if not (by_size and backbone.positions and backbone.axes):
+        return None
+    return backbone.positions, *backbone.axes
+
+
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
     """Name of each trained tensor -> its learning rate in a step."""
     every = setup.schedule.sh_every

@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import torch
 
+from crossgrad_core.contract.adam_state import AdamRule
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -24,13 +26,14 @@ from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
+from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.density_views import observed_views
 from crossgrad_core.training.edits import apply_edit, put_in_order
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
-from crossgrad_core.training.rates import means_rate_at, rates_at, rule_at
+from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.room import room_of
 from crossgrad_core.training.setup import Setup
@@ -182,12 +185,31 @@ def _optimize(
     by_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
     whole = {name: dense(g) for name, g in found.items() if name not in by_rows}
     state.settle(name for name, g in whole.items() if g is not None)
-    adam_step(state.tensors, whole, state.moments, rates, rule, scale.to_sum)
+    _take_adam_step(setup, state, whole, rates, rule, scale)
     for name, gradient in by_rows.items():
         param, to_sum = state.tensors[name], scale.to_sum[name]
         step = one_more(name, param, state.moments, rates[name], rule, to_sum)
         state.late.step(name, param, gradient, state.moments, step)
     state.laps.lap("optimizer")
+
+
+def _take_adam_step(
+    setup: Setup,
+    state: TrainState,
+    gradients: TensorGradients,
+    rates: Mapping[str, float],
+    rule: AdamRule,
+    scale: Scale,
+) -> None:
+    """Adam's step of whole tensors; that of positions by the axes of their Gaussians, where due."""
+    tensors, found = state.tensors, axes_of(setup)
+    if found is None or gradients.get(found[0]) is None:
+        adam_step(tensors, gradients, state.moments, rates, rule, scale.to_sum)
+        return
+    name, *axes = found
+    steps = torch.zeros_like(tensors[name])
+    adam_step({**tensors, name: steps}, gradients, state.moments, rates, rule, scale.to_sum)
+    step_along_axes(tensors[name], steps, *(tensors[each] for each in axes))
 
 
 def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit, bool]:

@@ -65,7 +65,7 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
     then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0, "beta2": 0.999}
-    then |= {"floaters": "keep"}
+    then |= {"floaters": "keep", "position_steps": "extent"}
     expected = {"seconds": 5.0, "seed": 1, **then}
     assert merged(path, options, assignments) == expected
     kept = merged(path, {"seed": 2}, [])

@@ -41,6 +41,7 @@ USUAL: Mapping[str, Any] = {
     "views": 2,
     "beta2": 0.999,
     "floaters": "keep",
+    "position_steps": "extent",
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.
