@@ -29,7 +29,15 @@ from crossgrad_core.system.terminal import is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder, check_new
-from crossgrad_core.wording import count, did_you_mean, listed, plural, sentences, singular
+from crossgrad_core.wording import (
+    count,
+    did_you_mean,
+    listed,
+    plural,
+    sentences,
+    singular,
+    with_article,
+)
 
 if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
@@ -132,6 +140,7 @@ __all__ = [
     "view_gradients",
     "view_plan_of",
     "way_on",
+    "with_article",
     "with_steps",
     "write_atomically",
     "write_mapping",

@@ -18,6 +18,11 @@ def singular(slot: str) -> str:
     return slot.removesuffix("es" if slot.endswith("sses") else "s")
 
 
+def with_article(noun: str) -> str:
+    """`a sampler`, `an operator`; as it is written, not as it sounds."""
+    return f"an {noun}" if noun[0] in "aeio" else f"a {noun}"
+
+
 def plural(word: str) -> str:
     """The slot of one member's word, the inverse of `singular`."""
     return f"{word}es" if word.endswith("ss") else f"{word}s"

@@ -42,6 +42,9 @@ class WithPlugins(TyperGroup):
         """Runs a command; an interrupt ends it with the status that shells expect."""
         try:
             return super().invoke(ctx)
+        except typer.BadParameter as error:
+            error.message = _plain(error.message)
+            raise
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from None
@@ -49,6 +52,12 @@ class WithPlugins(TyperGroup):
     def _add_plugins(self) -> None:
         for name, entry in registry.entries(COMMANDS).items():
             self.commands.setdefault(name, PluginCommand(entry))
+
+
+def _plain(message: str) -> str:
+    """What is wrong with a value, without the words of the library that found it."""
+    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
+    return message.partition(", unable to parse")[0]
 
 
 class PluginCommand(TyperCommand):

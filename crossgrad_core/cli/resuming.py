@@ -27,7 +27,8 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
         raise UserError(
             "a resumed run keeps its settings and its scene",
             where=listed(typed),
-            expected="--device, --threads, --stop-after and --accept-scene, and nothing else",
+            expected="--device, --threads, --stop-after, --accept-scene, --check, -q and -v, and "
+            "nothing else",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )

@@ -150,7 +150,7 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
         wanted,
         resume=given["resume"],
         dry_run=given["dry_run"],
-        verbosity=int(given["verbose"]) - int(given["quiet"]),
+        verbosity=-1 if given["quiet"] else int(given["verbose"]),
         accept_scene=given["accept_scene"],
         check=given["check"],
     )

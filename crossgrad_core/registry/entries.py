@@ -18,7 +18,14 @@ from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.wording import did_you_mean, in_one_line, listed, sentences, singular
+from crossgrad_core.wording import (
+    did_you_mean,
+    in_one_line,
+    listed,
+    sentences,
+    singular,
+    with_article,
+)
 
 if TYPE_CHECKING:
     from importlib.metadata import Distribution
@@ -98,7 +105,7 @@ def find(slot: str, name: str) -> Entry:
         others = [entry.distribution for entry in found if entry.distribution != OURS]
         ours = len(others) < len(found)
         raise UserError(
-            f"{len(found)} installed packages offer a {singular(slot)} named {name!r}",
+            f"{len(found)} installed packages offer {with_article(singular(slot))} named {name!r}",
             where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in found),

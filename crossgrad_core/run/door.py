@@ -92,7 +92,7 @@ def _speaking(*, quiet: bool) -> Iterator[None]:
 
 
 def _way(*, quiet: bool, verbose: bool) -> app.Way:
-    return app.Way(int(verbose) - int(quiet), _say_nothing)
+    return app.Way(-1 if quiet else int(verbose), _say_nothing)
 
 
 def _say_nothing(table: str, folder: Path, words: Sequence[str]) -> None:

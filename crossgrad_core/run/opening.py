@@ -49,7 +49,10 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
         return RunConfig.model_validate(settings)
     except ValidationError as error:
         raise as_user_error(
-            error, RunConfig, subject="a run", todo="crossgrad run --help lists every setting"
+            error,
+            RunConfig,
+            subject="a run",
+            todo="docs/settings.md lists every setting, crossgrad run --help those with options",
         ) from error
 
 

@@ -34,9 +34,8 @@ def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[
         text = (content[: content.rfind(b"\n") + 1] if whole else content).decode("utf-8-sig")
         return list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(
-            f"{what} cannot be read", where=path, found=str(error), todo=todo
-        ) from error
+        found = getattr(error, "strerror", None) or str(error)
+        raise UserError(f"{what} cannot be read", where=path, found=found, todo=todo) from error
 
 
 def read_json(path: Path, most: int = LARGEST) -> object:
@@ -54,10 +53,10 @@ def read_json(path: Path, most: int = LARGEST) -> object:
         value: object = json.loads(read_file(path, _JSON, most).decode("utf-8-sig"))
     except RecursionError as error:
         raise ValueError("lists or objects within each other without an end") from error
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError("there is no such file") from error
     except OSError as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(error.strerror or str(error)) from error
     return value
 
 

@@ -286,6 +286,19 @@ def export_format(scene, tmp):
     return ["export", str(tmp), "--format", "doc"]
 
 
+def reader_of_another_format(scene, tmp):
+    return ["run", str(scene), "--reader", "nerfstudio", *BASE]
+
+
+def exposures_not_there(scene, tmp):
+    return ["run", str(scene), "--exposure", "gain", "--exposure-from", str(tmp / "no"), *BASE]
+
+
+def engine_without_options(scene, tmp):
+    (tmp / "grid.yaml").write_text("name: a\nscenes: [scene]\nbase: {steps: 2}\n")
+    return ["sweep", str(tmp / "grid.yaml"), "--dry-run", "--engine-option", "address=auto"]
+
+
 def plugin_not_there(scene, tmp):
     return ["plugins", "show", "symetric"]
 
@@ -300,7 +313,7 @@ MAKERS = [
     unknown_setting, set_without_value, zero_steps, steps_and_seconds, odd_pair, bad_background,
     no_such_device, used_output_folder, broken_config, config_not_there, init_is_no_ply,
     init_not_there, resume_of_no_run, test_list_names_nobody, eval_of_no_run, export_format,
-    plugin_not_there,
+    plugin_not_there, reader_of_another_format, exposures_not_there, engine_without_options,
 ]  # fmt: skip
 test_list_names_nobody.__test__ = False
 

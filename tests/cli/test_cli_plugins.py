@@ -298,3 +298,18 @@ def test_our_own_mistakes_keep_their_traceback(monkeypatch):
     with pytest.raises(RuntimeError, match="a bug"):
         command.main(["plugins", "list"])
     assert sys.excepthook is before
+
+
+def test_a_plugin_of_another_slot_is_pointed_to(ran):
+    code, _, err = ran("plugins", "show", "near-far", "--slot", "operators")
+    assert code == 2
+    assert "no plugin named 'near-far' among the operators" in err
+    assert "one among the samplers" in err
+
+
+def test_a_bad_value_is_told_without_the_words_of_a_library(ran):
+    for given in (("run", "--steps", "1e3"), ("render", "x", "--split", "foo")):
+        code, _, err = ran(*given)
+        assert code == 2
+        assert given[-2] in err
+        assert not any(words in err for words in ("Input should", "Value error", "parse string"))

@@ -10,7 +10,9 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
+from crossgrad_core.run import elsewhere as elsewhere_module
 from crossgrad_core.run.afterwards import figures, pictures
+from crossgrad_core.run.elsewhere import _alike
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 PLACE = {"scale": 7.0, "offset": (40.0, -20.0, 3.0)}
@@ -163,3 +165,32 @@ def test_a_scene_that_two_readers_take_is_read_as_the_run_s_own(trained, scene, 
     (both / "transforms.json").write_text('{"frames": []}')
     result, _ = figures.evaluated_on(trained, both)
     assert len(result.views) == 11
+
+
+def surface(seed, count):
+    """Points of a wavy sheet in a box of about one unit, another one for each seed."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    flat = rng.uniform(-1, 1, (count, 2))
+    waves = 0.3 * np.sin(3 * flat[:, 0] + seed) * np.cos(4 * flat[:, 1])
+    return np.column_stack([flat, waves]) @ turn.T
+
+
+def test_captures_of_one_place_are_told_from_those_of_another():
+    whole = surface(1, 6000)
+    own, other = whole[:4000], whole[4000:]
+    # Another capture shows a part of it, from nearby or with much around.
+    assert _alike(own, other)
+    assert _alike(own, other[other[:, 0] > 0.2])
+    assert _alike(own, np.concatenate([other, 3 * surface(5, 500)]))
+    assert not any(_alike(own, surface(seed, 2000)) for seed in range(2, 8))
+    # Of a few points nothing can be told.
+    assert _alike(own, surface(2, 20))
+
+
+def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
+    monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
+    figures.evaluate(trained, on=scene)
+    assert "is it the same place" in capsys.readouterr().out
+    pictures.render(trained, split="test", out=None, on=scene)
+    assert "is it the same place" in capsys.readouterr().out

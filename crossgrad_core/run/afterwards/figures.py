@@ -45,10 +45,10 @@ def evaluate(
     if ply is not None:
         result, gaussians, place = evaluated_file(folder, ply, how, on)
         told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
-        print("\n".join([*metric_lines(result), told, *_told_of(place)]))  # noqa: T201
+        print("\n".join([*metric_lines(result), told, *(place.remarks() if place else ())]))  # noqa: T201
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
-        print("\n".join([*metric_lines(result), *_told_of(there)]))  # noqa: T201
+        print("\n".join([*metric_lines(result), *there.remarks()]))  # noqa: T201
     else:
         print(final_table(*evaluated(folder, how)))  # noqa: T201
 
@@ -79,12 +79,6 @@ def evaluated_on(
             name = name_for(folder, ending(there.name), on)
             write_per_view(folder, result, f"per_view_on_{name}.csv")
         return result, there
-
-
-def _told_of(there: Elsewhere | None) -> list[str]:
-    if there is None or not there.trained:
-        return []
-    return [f"left out: {there.trained} of its views that the run was trained on"]
 
 
 def evaluated_file(

@@ -24,6 +24,7 @@ from crossgrad_core.run.results.panel_names import ending
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.system.writability import check_folder, check_new
+from crossgrad_core.wording import count
 
 
 def render(
@@ -50,11 +51,12 @@ def render(
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
         setup, state = how.open(folder)
-        scene, draw = setup.scene, renderer(setup, state)
+        scene, draw, remarks = setup.scene, renderer(setup, state), list[str]()
         views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
         own = folder_of(folder, state.step) / ("accepted" if is_changed(setup) else "")
         if on is not None:
             there, draw = elsewhere(setup, on), plain_renderer(setup, state)
+            remarks = there.remarks()
             views = there.views
             if out is None:
                 own /= f"on_{name_for(folder, ending(there.name), on)}"
@@ -69,7 +71,7 @@ def render(
         if out is not None:
             check_new(*(out / f"{file}.png" for file in writer.files.values()))
         measured(views, draw, setup.metrics, on_view=writer.write)
-        print(f"{len(views)} panels in {writer.folder}")  # noqa: T201
+        print("\n".join([*remarks, f"{count(len(views), 'panel')} in {writer.folder}"]))  # noqa: T201
 
 
 def fly(
@@ -121,4 +123,4 @@ def fly(
             if film != made:  # Of other frames.
                 film.unlink(missing_ok=True)
         told = f"film {made}" if made else f"no film: too many or too large without {ENCODER}"
-        print(f"{len(files)} frames in {out}, {told}")  # noqa: T201
+        print(f"{count(len(files), 'frame')} in {out}, {told}")  # noqa: T201

@@ -5,6 +5,7 @@ camera stands before jumps over its neighbours while one of the ground below a d
 Scenes that are photographed from very different distances have both (docs/schedules.md).
 """
 
+from math import log
 from typing import Final
 
 import torch
@@ -36,7 +37,7 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
     """
     if not len(positions):
         return
-    bound = torch.tensor(LIMIT).log().item()
+    bound = log(LIMIT)
     factors = (scales - _usual(scales)).clamp_(-bound, bound).exp_()
     arrays = [positions, steps, factors, quats]
     if is_native(arrays) and all(each.is_contiguous() for each in arrays):

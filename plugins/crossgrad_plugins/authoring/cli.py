@@ -59,8 +59,10 @@ def show(
     found = [entry for each in _slots(slot) for entry in offers(each)]
     chosen = [entry for entry in found if entry.name == name]
     if not chosen:
+        slots = [each for each in _slots(None) if any(e.name == name for e in offers(each))]
         raise UserError(
-            f"there is no plugin named {name!r}",
+            f"there is no plugin named {name!r}" + (f" among the {slot}" if slot else ""),
+            found=f"one among the {listed(slots)}" if slots else "",
             todo=sentences(
                 did_you_mean(name, [entry.name for entry in found]),
                 "`crossgrad plugins list` shows them all",

@@ -15,6 +15,7 @@ from crossgrad_core.commands import (
     entries,
     listed,
     singular,
+    with_article,
 )
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
@@ -27,7 +28,7 @@ build-backend = "hatchling.build"
 [project]
 name = "{name}"
 version = "0.1.0"
-description = "A {word} for crossgrad"
+description = "{a_word} for crossgrad"
 requires-python = ">=3.11"
 dependencies = ["crossgrad>={version},<{next}"]
 
@@ -41,7 +42,7 @@ test = ["pytest"]
 only-include = ["{module}.py"]
 """
 _TEST: Final = '''\
-"""The contract checks of a {word}."""
+"""The contract checks of {some_word}."""
 
 import pytest
 from {module} import {member}
@@ -96,7 +97,8 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
         "module": module,
         "member": member,
         "slot": slot,
-        "word": singular(slot),
+        "a_word": with_article(singular(slot)).capitalize(),
+        "some_word": with_article(singular(slot)),
         "group": OFFERED[slot],
         "checks": f"{singular(slot).upper()}_CHECKS",
         "version": f"{major}.{minor}",

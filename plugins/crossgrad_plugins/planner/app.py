@@ -52,7 +52,8 @@ def plan(
     if write is not None:
         # The bundled scene has a length by itself, which it would lose where the file names it.
         length = {} if config.seconds is None else {"seconds": config.seconds}
-        asked = {**settings, **length, "scene": str(config.scene)}
+        # Of another folder, too.
+        asked = {**settings, **length, "scene": str(Path(str(config.scene)).resolve())}
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:

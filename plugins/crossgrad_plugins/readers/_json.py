@@ -150,7 +150,13 @@ def read_json(path: Path) -> object:
     """
     try:
         return json_in(path, LARGEST)
-    except (FileNotFoundError, ValueError) as error:
+    except FileNotFoundError as error:
+        raise UserError(
+            "a file of this format is missing",
+            where=path,
+            todo="name another scene, or the --reader that it is for (`auto` finds out by itself)",
+        ) from error
+    except ValueError as error:
         raise _unreadable(path, str(error)) from error
 
 

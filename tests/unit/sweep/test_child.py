@@ -1,5 +1,6 @@
 """The process of a run, before it trains."""
 
+import os
 import subprocess
 import sys
 
@@ -27,7 +28,8 @@ def test_its_session_is_as_nice_as_the_sweep():
         timeout=60,
         check=True,
     )
-    assert done.stdout.split()[-2:] == ["nice", "5"]
+    # The tests themselves may be carried out with less priority.
+    assert done.stdout.split()[-2:] == ["nice", str(min(19, os.nice(0) + 5))]
 
 
 @pytest.mark.parametrize(("niceness", "said"), [(0, []), (7, ["7"])])

@@ -68,7 +68,6 @@ def test_the_script_says_what_is_asked_of_slurm(tmp_path):
     ("options", "found"),
     [
         ({"cluster": "slurm"}, "srun"),
-        ({"partitoin": "x"}, "partitoin"),
         ({"cluster": "local", "time": "1h"}, "1h"),
     ],
 )

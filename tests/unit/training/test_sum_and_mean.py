@@ -45,7 +45,7 @@ def _one_thread(keeps_threads):
     configure_threads(1)
 
 
-def setup_of(backbone, densifier, operator, views, rasterizer="numba"):
+def setup_of(backbone, densifier, operator, views, rasterizer="numba", way=None):
     chosen = {"backbone": backbone, "densifier": densifier}
     config = {slot: {"name": name, **NEEDED.get((slot, name), {})} for slot, name in chosen.items()}
     config |= {"operator": {"name": operator}, "sampler": {"name": "random"}, "views": views}
@@ -53,6 +53,7 @@ def setup_of(backbone, densifier, operator, views, rasterizer="numba"):
         "steps": STEPS,
         "start": {"name": "sfm"},
         "rasterizer": {"name": rasterizer},
+        "position_steps": way,
         **TIMES,
     }
     return assemble(RunConfig.model_validate(config), sample_scene(), "none")
@@ -68,8 +69,13 @@ class Trained:
     edited: list[int]
 
 
-def trained(setup, dtype=torch.float32):
+def trained(setup, dtype=torch.float32, seed=None):
+    """After all steps; from positions a unit in the last place aside, where a seed is given."""
     state = first_state(setup)
+    if seed is not None:
+        means = state.parameters["means"].detach()
+        draws = torch.randn(means.shape, generator=torch.Generator().manual_seed(seed))
+        state.parameters["means"] = torch.nextafter(means, means + draws.sign()).requires_grad_()
     state.parameters = {name: cast(tensor, dtype) for name, tensor in state.parameters.items()}
     sizes, edited = [], []
     since = copied(state)
@@ -135,9 +141,14 @@ def test_sum_and_mean_of_two_views_train_alike(backbone, densifier):
     assert edited[:1] == ([] if densifier == "none" else [20])
 
 
-def test_sum_and_mean_of_three_views_train_alike():
-    runs = [trained(setup_of("vanilla", "mcmc", name, 3)) for name in ("sum", "mean")]
-    assert overall(*runs) <= 1e-3
+@pytest.mark.parametrize("way", ["extent", "size"])
+def test_sum_and_mean_of_three_views_train_alike(way):
+    """A third is no binary number: they differ less than runs from positions a bit aside."""
+    of_sum = trained(setup_of("vanilla", "mcmc", "sum", 3, way=way))
+    of_mean = trained(setup_of("vanilla", "mcmc", "mean", 3, way=way))
+    aside = [trained(setup_of("vanilla", "mcmc", "sum", 3, way=way), seed=k) for k in range(3)]
+    # How much a bit becomes in sixty steps depends on the processor.
+    assert overall(of_sum, of_mean) <= max(1e-3, *(overall(of_sum, each) for each in aside))
 
 
 @pytest.mark.matrix

@@ -107,7 +107,8 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
         # Files that were written on a GPU are read without one.
         found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # What a damaged file raises is documented nowhere.
-        raise _unreadable(path, str(error).partition("\n")[0], todo) from error
+        # Not in torch's words, which end in the advice to execute what is in the file.
+        raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error
     if not isinstance(found, Mapping):
         raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
     return {name: tensor for name, tensor in found.items() if isinstance(tensor, Tensor)}

@@ -3,12 +3,13 @@
 An engine is imported when a sweep names it.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Final, Protocol
 
+from crossgrad_core.commands import UserError, listed
 from crossgrad_plugins.sweep.attempt import COMMAND, Worker
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.machine import Machine
@@ -87,6 +88,25 @@ class Engine(Protocol):
             UserError: The engine, an option of it, or its cluster is not there; nothing was begun.
         """
         ...
+
+
+def check_options(name: str, options: Iterable[str]) -> None:
+    """Refuses options that an engine does not have.
+
+    Raises:
+        UserError: Names them, and those that it has.
+    """
+    known: tuple[str, ...] = import_module(ENGINES[name]).OPTIONS
+    if unknown := sorted(set(options) - set(known)):
+        raise UserError(
+            f"the engine {name} has no such option"
+            if known
+            else f"the engine {name} has no options",
+            where="--engine-option",
+            expected=listed(known) if known else "",
+            found=listed(unknown),
+            todo="leave it out",
+        )
 
 
 def engine(name: str) -> Engine:

@@ -3,11 +3,14 @@
 from collections import Counter, deque
 from collections.abc import Iterator
 from time import sleep
+from typing import Final
 
 from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Worker, is_free
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.tries import Tries
+
+OPTIONS: Final = ()
 
 
 def carry_out(work: Work) -> Iterator[None]:

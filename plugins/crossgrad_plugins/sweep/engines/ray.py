@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, Final
 
-from crossgrad_core.commands import UserError, listed, listened_to
+from crossgrad_core.commands import UserError, listened_to
 from crossgrad_plugins.sweep.attempt import Outcome, Worker
 from crossgrad_plugins.sweep.elsewhere import carried_out
 from crossgrad_plugins.sweep.engines import Work
@@ -106,14 +106,6 @@ def _connected(work: Work) -> ModuleType:
             found=str(error),
             todo="pip install 'crossgrad[ray]'",
         ) from error
-    if unknown := work.options.keys() - set(OPTIONS):
-        raise UserError(
-            "the engine ray has no such option",
-            where="--engine-option",
-            expected=listed(OPTIONS),
-            found=listed(sorted(unknown)),
-            todo="leave it out",
-        )
     address = work.options.get("address")
     handlers = {number: signal.getsignal(number) for number in listened_to()}
     try:

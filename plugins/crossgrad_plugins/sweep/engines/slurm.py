@@ -11,7 +11,7 @@ from time import sleep
 from types import ModuleType
 from typing import Any, Final
 
-from crossgrad_core.commands import UserError, listed
+from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.attempt import Outcome, Worker
 from crossgrad_plugins.sweep.elsewhere import carried_out
 from crossgrad_plugins.sweep.engines import Work
@@ -43,7 +43,7 @@ def carry_out(work: Work) -> Iterator[None]:
 
 def script(work: Work) -> str:
     """What sbatch would be given for the whole sweep."""
-    _submitit(work)
+    _submitit()
     from submitit.slurm.slurm import _convert_mem, _make_sbatch_string
 
     parameters: dict[str, Any] = {
@@ -98,7 +98,7 @@ class _Crew:
 
     def __init__(self, work: Work) -> None:
         self._work = work
-        self._submitit = _submitit(work)
+        self._submitit = _submitit()
         self._executor = _executor(work, self._submitit)
         # Only Slurm has a queue; elsewhere everything that is handed in begins at once.
         queued = self._executor.cluster == "slurm"
@@ -189,8 +189,8 @@ def _minutes(work: Work) -> int:
     )
 
 
-def _submitit(work: Work) -> ModuleType:
-    """The library, once it is known that all options are."""
+def _submitit() -> ModuleType:
+    """The library."""
     try:
         import submitit
     except ImportError as error:
@@ -200,13 +200,5 @@ def _submitit(work: Work) -> ModuleType:
             found=str(error),
             todo="pip install 'crossgrad[slurm]'",
         ) from error
-    if unknown := work.options.keys() - set(OPTIONS):
-        raise UserError(
-            "the engine slurm has no such option",
-            where="--engine-option",
-            expected=listed(OPTIONS),
-            found=listed(sorted(unknown)),
-            todo="leave it out",
-        )
     found: ModuleType = submitit
     return found

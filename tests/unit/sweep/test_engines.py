@@ -1,0 +1,21 @@
+"""Options of engines are refused before anything begins."""
+
+import pytest
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.sweep.engines import ENGINES, check_options
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_an_option_that_an_engine_does_not_have_is_named(name):
+    check_options(name, ())
+    with pytest.raises(UserError, match=f"the engine {name} has no") as caught:
+        check_options(name, ["adress"])
+    assert caught.value.found == "adress"
+    # One without options lists none.
+    assert ("address" in caught.value.expected) == (name == "ray")
+
+
+def test_options_that_it_has_are_taken():
+    check_options("ray", ["address"])
+    check_options("slurm", ["time", "cluster"])

@@ -1,0 +1,191 @@
+"""Positions step along the axes of their Gaussians, by shares of their lengths."""
+
+from math import log
+
+import numba
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import entries
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint.contents import Checkpoint
+from crossgrad_core.run.migration import migrated
+from crossgrad_core.run.persist import check_settings, settings_of
+from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.adam.axes import LIMIT, step_along_axes
+from crossgrad_core.training.rates import axes_of
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.step import take_step
+
+BACKBONES = sorted(n for n, e in entries("backbones").items() if e.distribution == "crossgrad")
+ANCHORS = {"octree", "scaffold"}
+OPTIONS = {"scaffold": {"voxel_size": 1e-5}}
+
+
+def gaussians(count, seed, spread=1.5):
+    """Positions, steps, logarithms of lengths and rotations of any length, float32."""
+    rng = np.random.default_rng(seed)
+    arrays = [
+        rng.normal(size=(count, 3)),
+        rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-8, 0, (count, 1)),
+        rng.normal(-5.0, spread, (count, 3)),
+        rng.normal(size=(count, 4)) * 10.0 ** rng.uniform(-6, 6, (count, 1)),
+    ]
+    return [torch.from_numpy(each).float() for each in arrays]
+
+
+def expected(positions, steps, scales, quats):
+    """One Gaussian after the other, in float64, rotations by scipy."""
+    given = (positions, steps, scales, quats)
+    positions, steps, scales, quats = (each.double().numpy() for each in given)
+    rows = scales[:: -(-len(scales) // 1024)]
+    # torch's median of an even number is the lower one.
+    usual = np.sort(np.sort(rows, axis=1)[:, 1])[(len(rows) - 1) // 2]
+    factors = np.exp(np.clip(scales - usual, -log(LIMIT), log(LIMIT)))
+    moved = np.empty_like(positions)
+    for i, (w, x, y, z) in enumerate(quats):
+        turn = Rotation.from_quat([x, y, z, w]).as_matrix() if quats[i].any() else np.eye(3)
+        moved[i] = positions[i] + turn @ (factors[i] * (turn.T @ steps[i]))
+    return moved
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 1500])
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_steps_are_stretched_along_the_axes(count, kind):
+    positions, steps, scales, quats = gaussians(count, count)
+    quats[count // 2] = 0.0
+    want = expected(positions, steps, scales, quats)
+    given = [each.to(kind) for each in (steps, scales, quats)]
+    found = positions.to(kind)
+    step_along_axes(found, *given)
+    # Products and sums of numbers that are not larger than LIMIT times the step.
+    reach = LIMIT * steps.abs().amax(dim=1, keepdim=True).double().numpy()
+    bound = 32 * torch.finfo(kind).eps * (np.abs(want) + reach)
+    assert (np.abs(found.double().numpy() - want) <= bound).all()
+
+
+def test_gaussians_of_one_size_take_the_steps_of_adam():
+    positions, steps, _, quats = gaussians(100, 3)
+    found = positions.clone()
+    step_along_axes(found, steps, torch.full((100, 3), -4.0), quats)
+    assert torch.allclose(found, positions + steps, rtol=1e-6, atol=1e-7)
+
+
+def test_one_axis_takes_no_more_than_its_limit():
+    scales = torch.tensor([[-50.0, 0.0, 50.0]] + [[0.0, 0.0, 0.0]] * 4)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(5, 1)
+    found = torch.zeros(5, 3)
+    step_along_axes(found, torch.ones(5, 3), scales, quats)
+    assert torch.allclose(found[0], torch.tensor([1 / LIMIT, 1.0, LIMIT]))
+    assert torch.equal(found[1:], torch.ones(4, 3))
+
+
+def test_nothing_is_asked_of_no_gaussians():
+    step_along_axes(*(torch.zeros(0, columns) for columns in (3, 3, 3, 4)))
+
+
+def test_a_turned_scene_takes_turned_steps():
+    _, steps, scales, quats = gaussians(50, 5)
+    quats = torch.nn.functional.normalize(quats)
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
+    matrix = torch.from_numpy(turn.as_matrix()).float()
+    own = Rotation.from_quat(quats[:, [1, 2, 3, 0]].numpy())
+    turned_quats = torch.from_numpy((turn * own).as_quat()[:, [3, 0, 1, 2]]).float()
+    found, turned = torch.zeros(50, 3), torch.zeros(50, 3)
+    step_along_axes(found, steps, scales, quats)
+    step_along_axes(turned, steps @ matrix.T, scales, turned_quats)
+    assert torch.allclose(turned, found @ matrix.T, rtol=1e-4, atol=1e-6 * float(found.abs().max()))
+
+
+def test_threads_change_no_bit():
+    before = numba.get_num_threads()
+    found = []
+    try:
+        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(threads)
+            arrays = gaussians(40_000, 9)
+            step_along_axes(*arrays)
+            found.append(arrays[0])
+    finally:
+        numba.set_num_threads(before)
+    assert torch.equal(*found)
+
+
+def setup_of(backbone="vanilla", **settings):
+    choice = ComponentChoice.model_validate({"name": backbone, **OPTIONS.get(backbone, {})})
+    return assemble(
+        RunConfig(**{"steps": 10, "backbone": choice, **settings}), sample_scene(), "none"
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "by_size"),
+    [
+        ({}, True),
+        ({"steps": 29_999}, True),
+        ({"steps": 30_000}, False),
+        ({"steps": 30_000, "position_steps": "size"}, True),
+        ({"position_steps": "extent"}, False),
+        ({"preset": "inria"}, False),
+        ({"preset": "inria", "position_steps": "size"}, True),
+        ({"schedule": "absolute"}, False),
+        ({"schedule": "absolute", "reference": 10}, True),
+    ],
+)
+def test_short_runs_step_by_size(settings, by_size):
+    assert (axes_of(setup_of(**settings)) is not None) == by_size
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_a_step_moves_positions_along_the_axes(backbone):
+    moved = {}
+    for way in ("extent", "size"):
+        setup = setup_of(backbone, position_steps=None if backbone in ANCHORS else way)
+        state = first_state(setup)
+        names = setup.backbone.axes and (setup.backbone.positions, *setup.backbone.axes)
+        before = {name: tensor.detach().clone() for name, tensor in state.parameters.items()}
+        take_step(setup, state)
+        after = {name: tensor.detach() for name, tensor in state.parameters.items()}
+        moved[way] = before, after, names
+    before, after, names = moved["size"]
+    if backbone in ANCHORS:
+        assert axes_of(setup) is None
+        return
+    positions, *axes = names
+    wanted = before[positions].clone()
+    plain = moved["extent"][1][positions] - before[positions]
+    step_along_axes(wanted, plain, *(after[name] for name in axes))
+    # The difference of two positions has lost digits.
+    assert torch.allclose(after[positions], wanted, atol=1e-6)
+    assert not torch.allclose(after[positions], moved["extent"][1][positions], atol=1e-6)
+    others = [name for name in after if name not in {positions, "filter"}]
+    assert all(torch.equal(after[name], moved["extent"][1][name]) for name in others)
+
+
+@pytest.mark.parametrize("backbone", sorted(ANCHORS))
+def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
+    setup = setup_of(backbone)
+    config = setup.config.model_copy(update={"position_steps": "size"})
+    with pytest.raises(UserError, match="no Gaussians with axes"):
+        refuse_settings_for_nothing(config, setup)
+
+
+def test_runs_of_before_go_on_as_they_began(tmp_path):
+    assert migrated({"revisions": []}, tmp_path)["position_steps"] == "extent"
+    assert "position_steps" not in migrated({}, tmp_path)
+    # A setting that a checkpoint does not know yet is none that was changed.
+    config = setup_of().config
+    stored = settings_of(config)
+    del stored["position_steps"]
+    fields = {name: {} for name in ("parameters", "exp_avg", "exp_avg_sq", "adam_steps")}
+    rest = {"plugins": {}, "generators": {}, "scalars": {"settings": stored}}
+    checkpoint = Checkpoint(step=1, **fields, **rest)
+    check_settings(config, checkpoint)
+    stored["seed"] = 5
+    with pytest.raises(UserError, match=r"config\.yaml was changed"):
+        check_settings(config, checkpoint)
