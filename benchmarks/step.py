@@ -1,7 +1,8 @@
 """Median seconds of one whole training step on a fixed case, as one JSON line.
 
 A step is, as in a run: decode with SH degree 3, render, loss against a random photo, backward pass,
-one step of Adam, that of the colours by rows: of those drawn, which are brought up to date first.
+one step of Adam, that of the positions along the axes of their Gaussians, that of the colours by
+rows: of those drawn, which are brought up to date first.
 Each timed step follows one of another view, turned by `--turn`, so that some rows are behind.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
@@ -33,6 +34,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.numerics.spherical import SH_C0
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step, counted
+from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.adam.late import Late
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
@@ -105,7 +107,10 @@ class Trainer:
     def _optimize(self) -> None:
         gradients = {name: tensor.grad for name, tensor in self.parameters.items()}
         by_rows = {name: gradients.pop(name) for name in self.backbone.passed_on.values()}
-        adam_step(self.parameters, gradients, self.state, self.rates)
+        moved = torch.zeros_like(self.parameters["means"])
+        adam_step({**self.parameters, "means": moved}, gradients, self.state, self.rates)
+        axes = [self.parameters[name] for name in self.backbone.axes]
+        step_along_axes(self.parameters["means"], moved, *axes)
         for name, gradient in by_rows.items():
             if gradient is None:
                 continue

@@ -17,6 +17,7 @@ from crossgrad_core.commands import assemble, begin, configured
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.dropout import STREAM, dropped
 from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import rows_without_floaters
@@ -278,6 +279,15 @@ def test_a_steady_step_waits_as_often_as_the_documents_say(options):
             torch.cuda.set_sync_debug_mode("default")
     waits = [f"{w.filename}:{w.lineno}" for w in found if "synchronizing CUDA" in str(w.message)]
     assert len(waits) <= 3, waits
+
+
+def test_steps_along_axes_are_those_of_the_cpu():
+    draws = torch.Generator().manual_seed(0)
+    arrays = [torch.randn(5000, columns, generator=draws) for columns in (3, 3, 3, 4)]
+    on_gpu = [each.to("cuda") for each in arrays]
+    step_along_axes(*arrays)
+    step_along_axes(*on_gpu)
+    assert torch.allclose(on_gpu[0].cpu(), arrays[0], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
