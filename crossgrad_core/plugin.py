@@ -53,6 +53,7 @@ from crossgrad_core.contract.gramian_operator import (
     MatrixOperator,
     Weighting,
     diagonals,
+    transformed,
 )
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
 from crossgrad_core.contract.images import eight_bit, masked, unit_range
@@ -220,6 +221,7 @@ __all__ = [
     "set_for_nothing",
     "shows_bar",
     "size_text",
+    "transformed",
     "unit_range",
     "without_rounding",
 ]

@@ -140,16 +140,32 @@ def aggregate_by_gramians(
     gramians = gradients.gramians(granularity)
     present = gradients.present(granularity)
     given = operator_context(context, granularity, present)
-    answer = operator.transform(gramians, given, state, context.rng)
-    matrices, state = with_state(answer, np.ndarray, operator, "transform")
-    if matrices.ndim != gramians.ndim or matrices.shape[::2] != gramians.shape[::2]:
-        raise _misfit(operator, gramians, matrices)
+    matrices, state = transformed(operator, gramians, given, state, context.rng)
     weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
     # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
     counts = _counts(gradients, granularity, gramians, present)
     return Aggregated(gradients.combine(weights, granularity), counts), state
+
+
+def transformed(
+    operator: MatrixOperator,
+    gramians: NDArray[np.float64],
+    context: OperatorContext,
+    state: PluginState,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], PluginState]:
+    """What `transform` of an operator answers; operators that hold others ask these by it.
+
+    Raises:
+        UserError: The answer is none that has a meaning: it names the method.
+    """
+    answer = operator.transform(gramians, context, state, rng)
+    matrices, state = with_state(answer, np.ndarray, operator, "transform")
+    if matrices.ndim != gramians.ndim or matrices.shape[::2] != gramians.shape[::2]:
+        raise _misfit(operator, gramians, matrices)
+    return matrices, state
 
 
 def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from crossgrad_core.plugin import (
     UserError,
     component_name,
     hookimpl,
+    transformed,
 )
 from crossgrad_operators._nested import (
     OperatorField,
@@ -82,7 +83,8 @@ class Chain(GramianOperator):
             if seen.shape[1] != views:
                 raise _reshaped(self.links[place - 1], seen.shape[1], views)
             key = str(place)
-            matrices, states[key] = link.transform(seen, seen_context, inner_state(state, key), rng)
+            inner = inner_state(state, key)
+            matrices, states[key] = transformed(link, seen, seen_context, inner, rng)
             product = matrices @ product
             seen = product @ gramians @ product.swapaxes(1, 2)
             empty = _noise(seen, product, gramians)

@@ -18,6 +18,7 @@ from crossgrad_core.plugin import (
     Selection,
     hookimpl,
     plain_component,
+    transformed,
 )
 from crossgrad_operators._nested import (
     OperatorField,
@@ -138,9 +139,8 @@ class Dispatch(GramianOperator):
         states = {}
         for key in dict.fromkeys(served.tolist()):
             part = np.flatnonzero(served == key)
-            found, states[key] = operators[key].transform(
-                gramians[part], _part(context, part), inner_state(state, key), rng
-            )
+            inner, of_part = inner_state(state, key), _part(context, part)
+            found, states[key] = transformed(operators[key], gramians[part], of_part, inner, rng)
             # Rows are added in the end, so that fewer or more of them make no difference here.
             if found.shape[1] != gramians.shape[1]:
                 found = _in_first_row(found, gramians.shape[1])

@@ -135,3 +135,15 @@ def test_rules_for_blocks_that_do_not_exist_are_refused():
     operator = Dispatch(rules={"f_dcc": "sum", "geometry": "mean"})
     (found,) = operator.crossgrad_objections(selection(operator, 2))
     assert "'f_dcc'" in found
+
+
+@pytest.mark.parametrize("answer", [None, (np.eye(3), EMPTY_STATE), (None, EMPTY_STATE)])
+@pytest.mark.parametrize(
+    "outer",
+    [chain("sum", "pcgrad"), Dispatch(rules={"geometry": "pcgrad", "appearance": "pcgrad"})],
+)
+def test_a_wrong_answer_of_an_inner_operator_names_it(ask, monkeypatch, outer, answer):
+    monkeypatch.setattr(PCGrad, "transform", lambda self, *_: answer)
+    with pytest.raises(UserError) as caught:
+        ask(outer, ROWS)
+    assert "PCGrad" in f"{caught.value.what} {caught.value.where}"
