@@ -20,6 +20,7 @@ from crossgrad_core.numerics.kernel_cache import told_of_missing
 from crossgrad_core.registry.entries import build
 from crossgrad_core.system.cores import available_cores
 from crossgrad_core.training.adam.adam import adam_step, counted
+from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.setup import Setup
 
@@ -63,6 +64,7 @@ def compile_all(loss: ComponentChoice) -> None:
     measured.backward()  # type: ignore[no-untyped-call]
     values = torch.zeros((8, 3))
     adam_step({"all": values}, {"all": torch.ones_like(values)}, AdamState(), {"all": 1e-3})
+    step_along_axes(values, values, values, torch.zeros((8, 4)))
     compile_rows()
 
 

@@ -133,11 +133,15 @@ def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
     """Tensors of positions, scales and rotations, where positions step along axes; else None.
 
-    Runs as long as the published ones have the published steps.
+    Runs as long as the published ones have the published steps. Before the length of a run within
+    a budget is planned it counts as short: its kernels are then there, whatever is planned.
     """
-    config, backbone = setup.config, setup.backbone
-    short = config.preset != "inria" and _planned(config, setup.schedule) < REFERENCE
-    by_size = short if config.position_steps is None else config.position_steps == "size"
+    config, schedule, backbone = setup.config, setup.schedule, setup.backbone
+    waits = config.seconds is not None and config.steps is None and schedule.mode == "scaled"
+    short = waits or _planned(config, schedule) < REFERENCE
+    by_size = short and config.preset != "inria"
+    if config.position_steps is not None:
+        by_size = config.position_steps == "size"
     if not (by_size and backbone.positions and backbone.axes):
         return None
     return backbone.positions, *backbone.axes
