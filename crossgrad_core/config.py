@@ -218,8 +218,8 @@ class RunConfig(BaseModel):
             None,
             description="How far positions step: by a share of the scene's extent, as published, "
             "or along the axes of each Gaussian, by a share of their lengths. Default: size in "
-            "runs of fewer than 30,000 steps; extent in longer ones, with --preset inria, and of "
-            "anchors.",
+            "runs of fewer than 30,000 steps; extent in longer ones, with --preset inria, with "
+            "--schedule absolute without --reference, and of anchors.",
         )
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(

@@ -26,6 +26,7 @@ class AnalyticSplatting(Vanilla):
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = True
     passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     @override
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:

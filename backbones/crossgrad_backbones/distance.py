@@ -54,6 +54,7 @@ class DistanceConditioned(Vanilla):
 
     plain: ClassVar[bool] = False
     passed_on: ClassVar[Mapping[str, str]] = {"sh_rest": "f_rest"}
+    axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     condition_scales: bool = Field(True, description="scales depend on the distance")
     condition_opacities: bool = Field(True, description="opacities depend on the distance")

@@ -47,6 +47,7 @@ class MipSplatting(Vanilla):
     plain: ClassVar[bool] = False
     own_dilation: ClassVar[bool] = True
     passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
     parity: bool = Field(

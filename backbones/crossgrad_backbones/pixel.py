@@ -14,3 +14,4 @@ class PixelGS(Vanilla):
 
     default_densifier: ClassVar[str] = "pixel"
     passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes

@@ -37,7 +37,7 @@ class Backbone(Component):
             (floaters). Where it is empty, only edits move or remove rows.
         axes: Tensors [N, 3] of the logarithms of standard deviations and [N, 4] of rotations (wxyz,
             of any length) of Gaussians that primitives are, each about its position, which may then
-            step along these axes. Empty where primitives are none.
+            step along these axes. Empty where primitives are none. Of the very class, too.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -55,6 +55,9 @@ class Backbone(Component):
         # A class that inherits it may read in `decode` what its parent only hands over.
         if "passed_on" not in vars(cls):
             cls.passed_on = {}
+        # ... and hold its sizes and rotations in another way.
+        if "axes" not in vars(cls):
+            cls.axes = ()
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:

@@ -13,6 +13,8 @@ _FEWEST_SEEN = 3
 _MOST_TESTED = 50_000
 #: Of a length between cameras; what is behind them is rounding.
 _BITS = 40
+#: Of a coordinate of the input, what its rounding and that of some sums with it may make.
+_ROUNDED = 16 * float(np.finfo(np.float64).eps)
 
 
 def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
@@ -28,12 +30,15 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
     """Lengths [V] between camera centres, rounded to 2^-40 (1e-12) of the largest coordinate.
 
     What the mean of the training cameras is taken from differs by its rounding alone in layouts
-    that are regular, and a cut at the median, a rank or a logarithm would depend on it.
+    that are regular, and a cut at the median, a rank or a logarithm would depend on it. Where the
+    scene's input has coordinates that are so large that they are rounded more, that decides.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
-    if not 0.0 < largest < np.inf:
+    given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
+    least = max(largest * 2.0**-_BITS, given * scene.similarity.scale * _ROUNDED)
+    if not 0.0 < least < np.inf:
         return lengths
-    step = 2.0 ** (np.ceil(np.log2(largest)) - _BITS)
+    step = 2.0 ** np.ceil(np.log2(least))
     return np.asarray(np.round(lengths / step) * step)
 
 

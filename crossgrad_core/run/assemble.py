@@ -49,6 +49,7 @@ from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_views import operator_of, usual_views
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
+from crossgrad_core.training.rates import note_on_axes
 from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.regrouping import labels_of
 from crossgrad_core.training.rngs import make_streams
@@ -205,7 +206,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         plan=plan,
     )
     # The length of a run within a budget is not known yet.
-    timed = notes_on_length(setup) if config.seconds is None else ()
+    timed = (*note_on_axes(setup), *notes_on_length(setup)) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [each.name for each in config.operators]
     added = (

@@ -24,10 +24,9 @@ SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of captures of one place lie on the same surfaces: their distances from the run's have at
 #: most this share of the median that they have however the capture is turned about its middle.
-#: Two captures of a city have 0.1, those of six other places 0.6 and more.
 LEAST_ALIKE, TURNS = 0.4, 9
 #: Points that are looked at, at least and of either scene at most.
-FEWEST_POINTS, MOST_POINTS, MOST_OWN = 50, 2_000, 50_000
+FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,7 @@ class Elsewhere:
         told = []
         if not self.alike:
             told.append(
-                "the points of this scene lie no nearer to the run's than if it were turned at "
+                "the points of this scene lie hardly nearer to the run's than if it were turned at "
                 "random: look at its renders; is it the same place, in the same coordinates?"
             )
         if self.trained:
@@ -151,6 +150,8 @@ def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
     """Whether points lie near those of the run, and would not if they were turned."""
     from scipy.spatial import cKDTree
 
+    # What lies beyond the run's points says nothing: it may show more of the place.
+    points = points[((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1)]
     if min(len(own), len(points)) < FEWEST_POINTS:
         return True
     tree = cKDTree(_some(own, MOST_OWN))

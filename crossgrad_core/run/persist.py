@@ -118,13 +118,15 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
         return  # Of a version that wrote none, or whose settings may have other names.
     ours = settings_of(config)
-    # What it does not know is of a later state of this version, and was read as it was then.
-    changed = sorted(key for key in stored if ours.get(key) != stored[key])
+    # A setting that came later is none that was changed; an option of a component may be.
+    known = {key.partition(".")[0] for key in stored}
+    both = (key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known)
+    changed = sorted(key for key in both if ours.get(key) != stored.get(key))
     if changed:
         raise UserError(
             "config.yaml was changed since this run began",
             where=f"settings {listed(changed)}; step {checkpoint.step}",
-            expected=listed(f"{key}: {stored[key]}" for key in changed),
+            expected=listed(f"{key}: {stored.get(key)}" for key in changed),
             found=listed(f"{key}: {ours.get(key)}" for key in changed),
             todo="put them back, or start a new run with the changed file (--config)",
         )

@@ -28,6 +28,8 @@ _LOG = logging.getLogger(__name__)
 PROBE_STEPS = 12
 #: ... and the share of the budget that the probe takes beyond that.
 PROBE_SHARE = 0.01
+#: How often it begins again behind a kernel that had to be compiled.
+_TRIES = 8
 #: Share of the budget between two looks at the clock.
 LOOK_SHARE = 0.02
 #: A length that is off by a smaller share of what is left stays.
@@ -78,10 +80,11 @@ def most_steps(setup: Setup) -> int:
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
     """Steps that were taken on from a state, and the training seconds of a view in them.
 
-    Where a kernel had to be compiled, what was measured before and with it is left out.
+    Where a kernel had to be compiled, what was measured before and with it is left out, a few times
+    at most: some plugin may compile in every step.
     """
     timed_step(setup, state)
-    kind, pace, compiled = setup.config.clock, setup.schedule.pace, False
+    kind, pace, compiled, tries = setup.config.clock, setup.schedule.pace, False, _TRIES
 
     def begin_again(**_: bool) -> None:
         nonlocal compiled
@@ -91,8 +94,8 @@ def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float
     with told_of_missing(begin_again):
         while state.step - first < PROBE_STEPS or taken < PROBE_SHARE * seconds:
             timed_step(setup, state)
-            if compiled:
-                start, first, compiled = state.clock.copy(), state.step, False
+            if compiled and tries:
+                start, first, compiled, tries = state.clock.copy(), state.step, False, tries - 1
             taken = state.clock.trained(kind) - start.trained(kind)
     return state.step - first, taken / (pace.views(state.step) - pace.views(first))
 

@@ -8,7 +8,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Final
 
 import torch
 
@@ -24,14 +25,17 @@ from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.setup import Setup
 
+#: Seconds that the other process is waited for once this one has nothing left to compile.
+_PATIENCE: Final = 60.0
+
 
 @contextmanager
 def compiling_beside(setup: Setup) -> Iterator[None]:
     """Starts the other process with the first kernel that is missing, and waits for it at last.
 
-    Not where this one has one core, or one thread, to itself, and not for a GPU. Then all kernels
-    of steps by rows are in memory here, too: whether a view draws few rows or many, which have
-    kernels of their own, is found out on the clock.
+    Not where this one has one core, or one thread, to itself, and not for a GPU. At last, with or
+    without that process, all kernels of steps by rows are in memory here: whether a view draws few
+    rows or many, which have kernels of their own, is found out on the clock.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -47,7 +51,9 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
         with told_of_missing(start):
             yield
         for process in processes:
-            process.wait()
+            # One that hangs, in a plugin's import perhaps, keeps no run from training.
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_PATIENCE)
         if setup.by_rows:
             compile_rows()
     finally:

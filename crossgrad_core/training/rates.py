@@ -5,10 +5,12 @@ from typing import Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import BETAS, AdamRule
-from crossgrad_core.contract.blocks import LearningRate
+from crossgrad_core.contract.blocks import LearningRate, Parameters
 from crossgrad_core.contract.schedule import REFERENCE, Schedule
+from crossgrad_core.errors import UserError
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import faded
+from crossgrad_core.wording import listed
 
 #: The published rates are for `REFERENCE` steps. A run of fewer has them times the ratio of the two
 #: to this power: what its rates add up to falls with its length, but not as fast as the length.
@@ -26,6 +28,9 @@ HURRIED_MOST: Final = 6.3
 #: later ones, which they would hold back for the 1,000 steps of the published average.
 #: All measured by us (docs/schedules.md).
 MEMORY, LEAST_MEMORY = 1 / 50, 50
+
+#: Columns of positions, of the logarithms of standard deviations, and of rotations.
+_AXES: Final = (3, 3, 4)
 
 #: Blocks that learn in one of n steps have n to this power times their rate then.
 RESTED: Final = 0.5
@@ -120,7 +125,17 @@ def note_on_plan(setup: Setup) -> tuple[str, ...]:
     """Which rules a run within a budget has, once its length is planned."""
     config, schedule = setup.config, setup.schedule
     hurried = in_a_hurry(config, schedule, len(setup.train_views))
-    return (_hurry_note(config, schedule),) if hurried else ()
+    return ((_hurry_note(config, schedule),) if hurried else ()) + note_on_axes(setup)
+
+
+def note_on_axes(setup: Setup) -> tuple[str, ...]:
+    """How positions step, where that is not as published and the run did not ask for it."""
+    if setup.config.position_steps is not None or axes_of(setup) is None:
+        return ()
+    return (
+        "positions step along the axes of their Gaussians, by shares of their lengths "
+        "(--position-steps extent: by the scene's extent, as published)",
+    )
 
 
 def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
@@ -142,9 +157,30 @@ def axes_of(setup: Setup) -> tuple[str, str, str] | None:
     by_size = short and config.preset != "inria"
     if config.position_steps is not None:
         by_size = config.position_steps == "size"
-    if not (by_size and backbone.positions and backbone.axes):
-        return None
-    return backbone.positions, *backbone.axes
+    names = backbone.positions, *backbone.axes
+    # Rows of what is stepped by rows are not all up to date.
+    late = not set(setup.by_rows.values()).isdisjoint(names)
+    return names if by_size and all(names) and len(names) == len(_AXES) and not late else None
+
+
+def check_axes(setup: Setup, parameters: Parameters) -> None:
+    """Refuses tensors of other shapes than those that `Backbone.axes` promises.
+
+    Raises:
+        UserError: It names the backbone.
+    """
+    if (names := axes_of(setup)) is None:
+        return
+    rows = len(parameters[names[0]]) if names[0] in parameters else 0
+    found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
+    if found != [(rows, columns) for columns in _AXES]:
+        raise UserError(
+            "positions cannot step along the axes that the backbone names",
+            where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
+            expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
+            found=listed(map(str, found)),
+            todo="repair the plugin (docs/write-a-backbone.md), or --position-steps extent",
+        )
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:

@@ -21,6 +21,7 @@ from crossgrad_core.training.compile_ahead import compiling_beside
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
+from crossgrad_core.training.rates import check_axes
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.setup import Setup
@@ -48,6 +49,7 @@ def first_state(setup: Setup) -> TrainState:
         for name, tensor in parameters.items()
     }
     parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
+    check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = photo_parameters.started(setup)
     if photos is not None:

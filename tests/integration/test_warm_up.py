@@ -98,6 +98,7 @@ class _Process:
     """Takes the command and the end of it."""
 
     started: ClassVar[list[str]] = []
+    hangs: ClassVar[bool] = False
 
     def __init__(self, command, **options):
         self.started.append(command[-1])
@@ -105,8 +106,10 @@ class _Process:
     def terminate(self):
         self.started.append("terminated")
 
-    def wait(self):
+    def wait(self, timeout=None):
         self.started.append("waited for")
+        if self.hangs and timeout is not None:
+            raise subprocess.TimeoutExpired("compile", timeout)
 
 
 @pytest.fixture
@@ -136,6 +139,13 @@ def test_the_other_process_starts_with_the_first_missing_kernel(started):
     # It is not ended before it is ready.
     assert started[1:] == ["waited for", "terminated", "waited for"]
     assert kernel_cache._LISTENERS == []
+
+
+def test_a_process_that_hangs_is_ended(started, monkeypatch):
+    monkeypatch.setattr(_Process, "hangs", True)
+    with compile_ahead.compiling_beside(_setup()):
+        _miss()
+    assert started[1:] == ["waited for", "terminated", "waited for"]
 
 
 def test_the_other_process_ends_with_a_run_that_is_refused(started):
@@ -190,3 +200,19 @@ def test_a_probe_begins_again_behind_a_kernel_that_had_to_be_compiled(monkeypatc
     assert steps == budget.PROBE_STEPS
     assert state.step == 9 + budget.PROBE_STEPS
     assert each == pytest.approx(0.1)
+
+
+def test_a_probe_ends_where_every_step_compiles(monkeypatch):
+    clock = SimpleNamespace(trained=lambda kind: 1.0, copy=lambda: clock)
+    state = SimpleNamespace(step=0, clock=clock)
+    pace = SimpleNamespace(views=lambda step: step)
+    setup = SimpleNamespace(
+        config=SimpleNamespace(clock="wall"), schedule=SimpleNamespace(pace=pace)
+    )
+
+    def step(setup, state):
+        state.step += 1
+        _miss()
+
+    monkeypatch.setattr(budget, "timed_step", step)
+    assert budget._probed(setup, state, seconds=0.0)[0] == budget.PROBE_STEPS

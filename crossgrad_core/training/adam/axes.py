@@ -58,6 +58,9 @@ def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
 
 
 def _usual(scales: Tensor) -> Tensor:
-    """The median, of Gaussians evenly spread over memory, of the middle one of their axes."""
-    rows = scales[:: -(-len(scales) // _SAMPLE)]
-    return rows.median(dim=1).values.median()
+    """The median, of Gaussians evenly spread over memory, of the middle one of their axes.
+
+    What is not finite is left out, so that it spoils no other Gaussian.
+    """
+    middle = scales[:: -(-len(scales) // _SAMPLE)].sort(dim=1).values[:, 1]
+    return torch.where(middle.isfinite(), middle, torch.nan).nanmedian()

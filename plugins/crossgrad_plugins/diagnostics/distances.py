@@ -9,7 +9,7 @@ from scipy.stats import rankdata
 #: Correlations that differ by less are equal.
 _ROUNDING = 1e-9
 #: Decimals of a difference of logarithms that are no rounding.
-_DIGITS = 11
+_DIGITS = 9
 
 
 @dataclass(frozen=True, eq=False)

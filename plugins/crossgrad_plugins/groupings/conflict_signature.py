@@ -120,7 +120,7 @@ def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
-    # The known one is -1 now: of the others none is less.
-    if len(values) == 1 or values[-1] - values[-2] <= _SMALLEST_GAP:
+    # The known one is -1 now: of the others none is less. Two cameras that are alike leave 0.
+    if len(values) == 1 or min(values[-1], values[-1] - values[-2]) <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
     return (vectors[:, -1] > 0.0).astype(np.int64)

@@ -19,7 +19,7 @@ from crossgrad_core.commands import (
     writer_of,
 )
 from crossgrad_plugins.sweep.best import best_grid
-from crossgrad_plugins.sweep.engines import Work, engine
+from crossgrad_plugins.sweep.engines import Work, check_options, engine
 from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, with_scenes
 from crossgrad_plugins.sweep.layout import Layout
@@ -79,6 +79,7 @@ class Sweep:
 
     def __init__(self, request: Request, *, looks_only: bool = False) -> None:
         self.request = request
+        check_options(request.engine, (key for key, _ in request.options))
         grid = _grid(request)
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if not looks_only:  # Before the work of planning; the lock itself comes after it.

@@ -125,7 +125,7 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
     looks_only = bool(asked)
     announce(quiet=looks_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
-    from crossgrad_plugins.sweep.engines import ENGINES, check_options
+    from crossgrad_plugins.sweep.engines import ENGINES
 
     if engine not in ENGINES:
         raise UserError(
@@ -134,8 +134,6 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
             expected=", ".join(ENGINES),
             todo="leave it out to run on this machine",
         )
-    options = [_option(each) for each in engine_option or ()]
-    check_options(engine, (key for key, _ in options))
     found = Sweep(
         Request(
             path=grid,
@@ -147,7 +145,7 @@ def sweep(  # noqa: PLR0913, PLR0917 - one parameter per option of the command l
             threads=threads,
             memory=memory,
             engine=engine,
-            options=options,
+            options=[_option(each) for each in engine_option or ()],
         ),
         looks_only=looks_only,
     )

@@ -59,6 +59,18 @@ def test_a_strip_of_hundreds_of_photos_is_solved_to_rounding(count, shared):
     assert np.abs(fit.gains - (planted - planted.mean())).max() < 1e-9
 
 
+@pytest.mark.parametrize("count", [20, 150])
+def test_photos_that_all_share_points_are_solved_to_rounding(count):
+    # Each of 150 has points in common with nearly all others: found by iterations.
+    planted = np.random.default_rng(1).normal(0, 1, count)
+    fit = fitted(observed(planted, 100, 60, noise=0.0), count)
+    clean = observed(planted, 100, 60, noise=0.0)
+    stops = planted[clean.photos] + np.random.default_rng(2).normal(-2, 1, 100)[clean.points]
+    exact = fitted(replace(clean, stops=stops), count)
+    assert np.abs(exact.gains - (planted - planted.mean())).max() < 1e-8
+    assert np.abs(fit.gains - (planted - planted.mean())).max() < 0.1
+
+
 def test_parts_that_share_no_point_have_a_mean_of_zero_each():
     one = observed(np.array([1.0, 3.0]), 20, 20, noise=0.0)
     other = observed(np.array([-5.0, -5.5]), 20, 20, noise=0.0)

@@ -1,9 +1,13 @@
 """What every grouping promises, and what each does on a scene made for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from crossgrad_core.contract.poses import radial_distances
+from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.posed import posed_scene, posed_view
@@ -262,3 +266,13 @@ def test_cameras_at_one_height_over_a_tilted_ground_are_no_two_groups(cut):
     grouping = build("groupings", "altitude", {"cut": cut, "up": tuple(up)})
     with pytest.raises(UserError, match="leaves a group without training views"):
         grouping.fit(scene_at(rows), np.random.default_rng(0))
+
+
+def test_a_ring_in_large_coordinates_is_one_ring():
+    # Metres of a zone, whose rounding is that of millions.
+    frame = Similarity(np.array([4.5e5, 5.6e6, 100.0]), 1 / 60)
+    points = ring(60.0, 16, (4.5e5 + 11.3, 5.6e6 - 7.7, 120.1), 0.2)
+    scene = replace(scene_at(frame.to_local(points)), similarity=frame)
+    assert len(set(radial_distances(scene, scene.train_views))) == 1
+    with pytest.raises(UserError, match="leaves a group without training views"):
+        build("groupings", "radial", {}).fit(scene, np.random.default_rng(0))

@@ -194,3 +194,8 @@ def test_the_cut_parts_groups_that_share_nothing(size, seed):
     assert len(set(found[sides[order] > 0])) == 1
     assert len(set(found[sides[order] < 0])) == 1
     assert len(set(found)) == 2
+
+
+def test_two_cameras_that_are_alike_are_not_cut():
+    assert spectral_cut(np.ones((2, 2))).tolist() == [0, 0]
+    assert spectral_cut(np.ones((5, 5))).tolist() == [0] * 5

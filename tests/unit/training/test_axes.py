@@ -1,5 +1,6 @@
 """Positions step along the axes of their Gaussians, by shares of their lengths."""
 
+from dataclasses import replace
 from math import log
 
 import numba
@@ -7,9 +8,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
+from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
+from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.contents import Checkpoint
@@ -102,18 +106,71 @@ def test_a_turned_scene_takes_turned_steps():
     assert torch.allclose(turned, found @ matrix.T, rtol=1e-4, atol=1e-6 * float(found.abs().max()))
 
 
-def test_threads_change_no_bit():
-    before = numba.get_num_threads()
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS == 1, reason="there is one thread")
+def test_threads_change_no_bit(keeps_threads):
     found = []
-    try:
-        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
-            numba.set_num_threads(threads)
-            arrays = gaussians(40_000, 9)
-            step_along_axes(*arrays)
-            found.append(arrays[0])
-    finally:
-        numba.set_num_threads(before)
+    for threads in (1, 2):
+        configure_threads(threads)
+        arrays = gaussians(40_000, 9)
+        step_along_axes(*arrays)
+        found.append(arrays[0])
     assert torch.equal(*found)
+
+
+def test_a_gaussian_that_is_not_finite_spoils_no_other():
+    positions, steps, scales, quats = gaussians(9, 2)
+    want = positions.clone()
+    step_along_axes(want, steps, scales, quats)
+    for odd in (float("nan"), float("inf"), -float("inf")):
+        found, broken = positions.clone(), scales.clone()
+        broken[4] = odd
+        step_along_axes(found, steps, broken, quats)
+        # The median of eight and that of nine differ; all others are moved by it alike.
+        assert found[[*range(4), *range(5, 9)]].isfinite().all()
+
+
+def test_a_rotation_without_digits_is_none():
+    steps = torch.tensor([[1.0, 2.0, 3.0]]).repeat(3, 1)
+    quats = torch.tensor([[1e-20, 2e-20, 0.0, 1e-20], [1e-23, 0.0, 1e-23, 0.0], [0.0] * 4])
+    found = torch.zeros(3, 3)
+    step_along_axes(found, steps, torch.zeros(3, 3), quats)
+    assert torch.allclose(found, steps)
+
+
+class Round(Vanilla):
+    """Gaussians of one size each; the class says nothing of axes."""
+
+    @override
+    def create(self, scene, rng):
+        tensors = super().create(scene, rng)
+        scales = tensors["scales"].detach()[:, :1].clone().requires_grad_()
+        return {**tensors, "scales": scales}
+
+    @override
+    def decode(self, parameters, camera, phase):
+        return super().decode(
+            {**parameters, "scales": parameters["scales"].expand(-1, 3)}, camera, phase
+        )
+
+
+class RoundWithAxes(Round):
+    """Promises axes that it does not have."""
+
+    axes = ("scales", "quats")
+
+
+def with_backbone(backbone):
+    setup = setup_of(start={"name": "sfm"})
+    return replace(setup, selection=replace(setup.selection, backbone=backbone))
+
+
+def test_a_class_that_inherits_has_no_axes_unless_it_says_so():
+    assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
+    assert axes_of(with_backbone(Round())) is None
+    first_state(with_backbone(Round()))
+    with pytest.raises(UserError, match="cannot step along the axes") as caught:
+        first_state(with_backbone(RoundWithAxes()))
+    assert "(40, 1)" in caught.value.found
 
 
 def setup_of(backbone="vanilla", **settings):
@@ -182,10 +239,14 @@ def test_runs_of_before_go_on_as_they_began(tmp_path):
     config = setup_of().config
     stored = settings_of(config)
     del stored["position_steps"]
+    # A component, and an option of one, are known all the same.
+    given = config.model_copy(update={"grouping": ComponentChoice(name="altitude")})
     fields = {name: {} for name in ("parameters", "exp_avg", "exp_avg_sq", "adam_steps")}
     rest = {"plugins": {}, "generators": {}, "scalars": {"settings": stored}}
     checkpoint = Checkpoint(step=1, **fields, **rest)
     check_settings(config, checkpoint)
+    with pytest.raises(UserError, match=r"grouping\.name"):
+        check_settings(given, checkpoint)
     stored["seed"] = 5
     with pytest.raises(UserError, match=r"config\.yaml was changed"):
         check_settings(config, checkpoint)

@@ -11,7 +11,8 @@ _ROWS = 1 << 13
 #: Rows whose numbers are laid side by side, so that the compiler works on many of them at a time.
 _BLOCK = 64
 _ONE, _TWO = np.float32(1), np.float32(2)
-_SMALLEST = np.finfo(np.float32).tiny
+#: Squares below it have lost their digits.
+_SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]
 
@@ -21,13 +22,15 @@ def _stretch(given: _Floats, moved: _Floats) -> None:
     """Turns steps into the frames of the Gaussians, stretches them there, and turns them back.
 
     Args:
-        given: [10, _BLOCK] steps, factors and quaternions; of a zero one the frame is the world's.
+        given: [10, _BLOCK] steps, factors and quaternions; of one that is as good as zero the
+            frame is the world's.
         moved: [3, _BLOCK] the steps to take.
     """
     for j in range(_BLOCK):
         a, b, c = given[0, j], given[1, j], given[2, j]
         w, x, y, z = given[6, j], given[7, j], given[8, j], given[9, j]
-        twice = _TWO / max(w * w + x * x + y * y + z * z, _SMALLEST)
+        square = w * w + x * x + y * y + z * z
+        twice = _TWO * (square > _SMALLEST) / max(square, _SMALLEST)
         xx, yy, zz = twice * x * x, twice * y * y, twice * z * z
         xy, xz, yz = twice * x * y, twice * x * z, twice * y * z
         wx, wy, wz = twice * w * x, twice * w * y, twice * w * z

@@ -1,10 +1,11 @@
 """The brightness of photos and points from observations: a robust fit of two-way effects.
 
 Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. Iteratively
-reweighted least squares; the points are eliminated, and the equations of the gains, of which each
-has those of the photos with common points, are solved directly: along a strip of hundreds of photos
-iterations stop long before they are right. Where photos hang together in several parts that share
-no point, each part has a mean of 0.
+reweighted least squares; the points are eliminated. In what is left each photo stands beside those
+with common points. Where these are few, as along a strip of hundreds of photos, the gains are found
+directly: iterations would go on for long. Where they are many, iterations (conjugate gradients) are
+few, and the direct way is the long one. Where photos hang together in several parts that share no
+point, each part has a mean of 0.
 """
 
 from dataclasses import dataclass
@@ -19,6 +20,10 @@ _HUBER = 1.345
 #: Standard deviations of a normal law in one median absolute deviation.
 _NORMAL = 1.4826
 _ROUNDS = 12
+#: Photos that share points with each one, in the mean, up to which the direct way is the quick one.
+_FEW = 64
+#: What gains may be off by after iterations, in stops; rounding allows less.
+_TOLERANCE = 1e-8
 #: Residuals below it, in stops, are rounding of 8-bit values.
 _SMALLEST = 1e-3
 
@@ -50,13 +55,14 @@ def fitted(observations: Observations, photos: int) -> Fit:
     o = observations
     if not o.count:
         return Fit(np.zeros(photos), 0.0, 0.0)
-    parts = _parts(o, photos)
+    gains, parts = np.zeros(photos), _parts(o, photos)
+    few = _neighbours(o, photos) <= _FEW
     before = o.stops - _means(o.points, o.stops, np.ones(o.count))[o.points]
     residuals = before
     for _ in range(_ROUNDS):
         scale = max(_NORMAL * float(np.median(np.abs(residuals))), _SMALLEST)
         weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residuals), _SMALLEST))
-        gains = _solved(o, weights, parts)
+        gains = _direct(o, weights, parts) if few else _iterated(o, weights, gains)
         rest = o.stops - gains[o.photos]
         residuals = rest - _means(o.points, rest, weights)[o.points]
     means = np.bincount(parts, gains) / np.maximum(np.bincount(parts), 1)
@@ -80,24 +86,60 @@ def _means(points: NDArray[np.int64], values: _Floats, weights: _Floats) -> _Flo
     return np.asarray(np.bincount(points, values * weights) / np.bincount(points, weights))
 
 
-def _solved(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
+def _neighbours(o: Observations, photos: int) -> float:
+    """How many photos share points with each one, itself included, in the mean."""
+    from scipy.sparse import coo_array
+
+    shape = photos, int(o.points.max()) + 1
+    seen = coo_array((np.ones(o.count, np.int32), (o.photos, o.points)), shape=shape).tocsr()
+    return float((seen @ seen.T).nnz) / photos
+
+
+def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
     """The gains that minimise the weighted squares; 0 of the first photo of each part."""
     from scipy.sparse import coo_array
     from scipy.sparse.linalg import spsolve
 
-    gains = np.zeros(len(parts))
-    free = np.ones(len(parts), dtype=np.bool_)
+    gains, count = np.zeros(len(parts)), len(parts)
+    free = np.ones(count, dtype=np.bool_)
     free[np.unique(parts, return_index=True)[1]] = False
     if not free.any():
         return gains
-    shape = len(parts), int(o.points.max()) + 1
     of_points = np.bincount(o.points, weights)
-    shares = np.divide(1.0, of_points, out=np.zeros(shape[1]), where=of_points > 0.0)
-    weight = coo_array((weights, (o.photos, o.points)), shape=shape).tocsr()
-    every = np.arange(len(parts))
-    own = coo_array((np.bincount(o.photos, weights, len(parts)), (every, every)))
-    coupled = (own.tocsr() - (weight * shares) @ weight.T).tocsc()
+    weight = coo_array((weights, (o.photos, o.points)), shape=(count, len(of_points))).tocsr()
+    every = np.arange(count)
+    own = coo_array((np.bincount(o.photos, weights, count), (every, every)))
+    coupled = (own.tocsr() - (weight * (1.0 / of_points)) @ weight.T).tocsc()
     above = o.stops - _means(o.points, o.stops, weights)[o.points]
-    wanted = np.bincount(o.photos, weights * above, len(parts))
+    wanted = np.bincount(o.photos, weights * above, count)
     gains[free] = spsolve(coupled[free][:, free], wanted[free], permc_spec="MMD_AT_PLUS_A")
+    return gains
+
+
+def _iterated(o: Observations, weights: _Floats, start: _Floats) -> _Floats:
+    """The gains that minimise the weighted squares, by conjugate gradients (Jacobi)."""
+    count = len(start)
+    diagonal = np.bincount(o.photos, weights, count)
+    scale = 1.0 / np.maximum(diagonal, _SMALLEST)
+
+    def deviations(values: _Floats) -> _Floats:
+        """Sum over each photo of what its observations are above the means of their points."""
+        above = values - _means(o.points, values, weights)[o.points]
+        return np.asarray(np.bincount(o.photos, weights * above, count))
+
+    gains = start.copy()
+    gradient = deviations(o.stops - gains[o.photos])
+    enough = _TOLERANCE**2 * float(diagonal.sum())
+    direction = scale * gradient
+    length = float(gradient @ direction)
+    for _ in range(2 * count):
+        if length <= enough:
+            break
+        step = deviations(direction[o.photos])
+        along = float(direction @ step)
+        gains += length / along * direction
+        gradient = gradient - length / along * step
+        scaled = scale * gradient
+        length, former = float(gradient @ scaled), length
+        direction = scaled + length / former * direction
     return gains
