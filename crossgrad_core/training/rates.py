@@ -158,8 +158,8 @@ def axes_of(setup: Setup) -> tuple[str, str, str] | None:
     if config.position_steps is not None:
         by_size = config.position_steps == "size"
     names = backbone.positions, *backbone.axes
-    # Rows of what is stepped by rows are not all up to date.
-    late = not set(setup.by_rows.values()).isdisjoint(names)
+    # Rows of what may be stepped by rows are not all up to date.
+    late = not set(backbone.passed_on.values()).isdisjoint(names)
     return names if by_size and all(names) and len(names) == len(_AXES) and not late else None
 
 
