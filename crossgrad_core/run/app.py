@@ -52,7 +52,7 @@ from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.photo_parameters import known_starts
-from crossgrad_core.training.rates import note_on_plan
+from crossgrad_core.training.rates import note_on_axes, note_on_plan
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
@@ -239,7 +239,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
     idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
-    told = (note, *note_on_plan(setup), *notes_on_length(setup), *idle)
+    told = (note, *note_on_plan(setup), *note_on_axes(setup), *notes_on_length(setup), *idle)
     return replace(setup, notes=(*setup.notes, *told))
 
 

@@ -125,7 +125,7 @@ def note_on_plan(setup: Setup) -> tuple[str, ...]:
     """Which rules a run within a budget has, once its length is planned."""
     config, schedule = setup.config, setup.schedule
     hurried = in_a_hurry(config, schedule, len(setup.train_views))
-    return ((_hurry_note(config, schedule),) if hurried else ()) + note_on_axes(setup)
+    return (_hurry_note(config, schedule),) if hurried else ()
 
 
 def note_on_axes(setup: Setup) -> tuple[str, ...]:

@@ -162,6 +162,8 @@ def parameters_after(path, reader):
     config = RunConfig(
         scene=path,
         steps=STEPS,
+        # Steps by size are up to five times as long, and so is what rounding makes of them.
+        position_steps="extent",
         threads=1,
         start={"name": "sfm"},
         reader={"name": reader},

@@ -386,6 +386,19 @@ class BrightensAtRandom(Vanilla):
         return replace(gaussians, sh_dc=gaussians.sh_dc + chance)
 
 
+class AxesOfOneLength(Vanilla):
+    """Names as sizes what has other columns."""
+
+    axes = ("opacities", "quats")
+
+
+class AxesNowhere(Vanilla):
+    """Has axes, and no positions that they belong to."""
+
+    positions = ""
+    axes = ("scales", "quats")
+
+
 class PositionsNowhere(Vanilla):
     positions: ClassVar[str] = "centres"
 
@@ -852,6 +865,8 @@ DEFECTS = [
     (backbones.positions_are_those_of_primitives, PositionsNowhere),
     (backbones.positions_are_those_of_primitives, PositionsOfFourColumns),
     (backbones.positions_are_those_of_primitives, PositionsOfAll),
+    (backbones.axes_are_those_of_primitives, AxesOfOneLength),
+    (backbones.axes_are_those_of_primitives, AxesNowhere),
     (backbones.gradients_reach_every_block, FrozenQuats),
     (backbones.checkpoints_give_the_same_gaussians, CountsOnItself),
     (backbones.checkpoints_give_the_same_gaussians, Trembles),
