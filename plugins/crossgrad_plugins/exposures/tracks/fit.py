@@ -20,10 +20,11 @@ _HUBER = 1.345
 #: Standard deviations of a normal law in one median absolute deviation.
 _NORMAL = 1.4826
 _ROUNDS = 12
-#: Photos that share points with each one, in the mean, up to which the direct way is the quick one.
-_FEW = 64
+#: Photos that share points with each one, in the mean, up to which the direct way is the quick one,
+#: and photos in all up to which iterations cross any strip.
+_FEW, _SHORT = 64, 64
 #: What gains may be off by after iterations, in stops; rounding allows less.
-_TOLERANCE = 1e-8
+_TOLERANCE = 1e-5
 #: Residuals below it, in stops, are rounding of 8-bit values.
 _SMALLEST = 1e-3
 
@@ -56,7 +57,7 @@ def fitted(observations: Observations, photos: int) -> Fit:
     if not o.count:
         return Fit(np.zeros(photos), 0.0, 0.0)
     gains, parts = np.zeros(photos), _parts(o, photos)
-    few = _neighbours(o, photos) <= _FEW
+    few = photos > _SHORT and _neighbours(o, photos) <= _FEW
     before = o.stops - _means(o.points, o.stops, np.ones(o.count))[o.points]
     residuals = before
     for _ in range(_ROUNDS):
