@@ -125,6 +125,16 @@ def test_horizon_keeps_its_ratios_exactly(k):
     assert coarse[:6] == ["far", "far", "near"] * 2
 
 
+@pytest.mark.parametrize("percent", range(1, 100))
+def test_horizon_takes_its_first_stage_to_the_end(percent):
+    # All of it far, then all near: 0.29 of 100 steps are 29, though not in binary numbers.
+    sampler = Horizon(coarse=(99, 1), fine=(1, 99), coarse_share=percent / 100)
+    run = SamplerRun(sampler, scene(), UNEQUAL, 1, steps=100)
+    labels = [label for draw in run.draws(100) for label in draw.labels]
+    assert labels[:percent] == ["far"] * percent
+    assert labels[percent : percent + 2] == ["far", "near"][: 100 - percent]
+
+
 def test_horizon_shows_every_view_of_a_group_before_any_again():
     run = SamplerRun(Horizon(coarse=(1, 1)), scene(), UNEQUAL)
     far = [draw.views[0] for draw in run.draws(48) if draw.labels == ("far",)]
