@@ -26,6 +26,8 @@ _COUNT: Final = "count"
 #: States that an average is taken over, at most: those of neighbouring steps hardly differ, and
 #: sums of so few float32 numbers round by a millionth.
 SAMPLES: Final = 100
+#: Decimals of a number of steps that are no rounding.
+_DIGITS: Final = 6
 
 
 def final_decay_of(config: RunConfig) -> float:
@@ -78,7 +80,8 @@ def follow(setup: Setup, state: TrainState) -> None:
     if share == 0.0:
         return
     total = setup.schedule.total
-    before = int((1.0 - share) * total)
+    # A tenth of ten steps is one, though not in binary numbers.
+    before = int(round((1.0 - share) * total, _DIGITS))
     if state.step <= before:
         restart(state)  # The run has become longer.
         return

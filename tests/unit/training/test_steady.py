@@ -185,6 +185,7 @@ def fake(total, share, states=None):
 @pytest.mark.parametrize(
     ("total", "share", "count"),
     [
+        (10, 0.9, 9),
         (400, 0.1, 40),
         (400, 0.25, 100),
         (1000, 1.0, 100),
