@@ -16,6 +16,7 @@ def objections_to(selection: Selection) -> list[str]:
         *objections_to_views(selection.operator, selection),
         *_of_the_densifier(selection),
         *_of_the_rasterizer(selection),
+        *_of_the_resolution(selection),
     ]
 
 
@@ -71,6 +72,15 @@ def _of_the_rasterizer(selection: Selection) -> Iterator[str]:
         yield (
             f"rasterizer {names['rasterizer']} does not draw the pixel response "
             f"{backbone.response} of backbone {names['backbone']}"
+        )
+
+
+def _of_the_resolution(selection: Selection) -> Iterator[str]:
+    backbone, names = selection.backbone, selection.names
+    if selection.resolution.interlaced and backbone.response == "analytic":
+        yield (
+            f"resolution {names['resolution']} draws some of the pixels; the pixel response "
+            f"analytic of backbone {names['backbone']} is a mean over all of them"
         )
 
 

@@ -30,9 +30,14 @@ class Resolution(Component):
     A view of scale s is rendered with its camera in s times its size, and compared with its photo
     reduced to that size by area. Evaluation is always at full size. Screen statistics reach density
     control in units of the full photo.
+
+    Attributes:
+        interlaced: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, in
+            each step another one, and compared with these pixels of its photo.
     """
 
     slot: ClassVar[str] = "resolutions"
+    interlaced: ClassVar[bool] = False
 
     def fitted_to(self, scene: Scene) -> "Resolution":
         """This resolution with what it measures of the scene; by default as it is.

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewPlan
+from crossgrad_core.numerics.lots import lot
 
 ScheduleMode = Literal["scaled", "absolute"]
 Unit = Literal["views", "steps"]
@@ -263,7 +264,7 @@ class Schedule:
         photos or regimes by turns, none is left out.
         """
         turn, place = divmod(step - 1, self.sh_every)
-        return place != _mixed(turn) * self.sh_every >> 32
+        return place != lot(turn) * self.sh_every >> 32
 
     def densifies(self, step: int) -> bool:
         """Whether density control edits the primitives after this step."""
@@ -287,13 +288,6 @@ class Schedule:
         if every is None or not self.reaches(step, every):
             return False
         return self.counted(step) // every * every < self.densify_until
-
-
-def _mixed(number: int) -> int:
-    """A number of 32 bits that looks drawn by lot (the finalizer of MurmurHash3)."""
-    number = (number ^ number >> 16) * 0x85EBCA6B % 2**32
-    number = (number ^ number >> 13) * 0xC2B2AE35 % 2**32
-    return number ^ number >> 16
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:

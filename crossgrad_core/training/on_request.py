@@ -6,6 +6,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import RequestedRender
 from crossgrad_core.errors import UserError
+from crossgrad_core.training.interlaced import as_in_full
 from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -45,6 +46,7 @@ class OnRequest:
         gaussians = setup.backbone.decode(
             state.parameters, target.camera, setup.phase(state.step, training=True)
         )
+        gaussians = as_in_full(gaussians, setup.rasterizer, target.stride)
         if background is None:
             background = eval_background(setup)
         render = setup.rasterizer.render(gaussians, target.camera, background, outputs)

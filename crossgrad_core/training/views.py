@@ -36,6 +36,13 @@ from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.interlaced import (
+    as_in_full,
+    camera_of,
+    corner_of,
+    pixels_of,
+    stride_of,
+)
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import Leaves, leaves_of
 from crossgrad_core.training.scaled_photos import Pair, on_device
@@ -240,10 +247,11 @@ def _render_jointly(
 
 def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Prepared:
     """The photo of a view of the draw, and what is decoded for it."""
-    target = target_at(setup, state, draw.views[slot], scale)
+    target = target_at(setup, state, draw.views[slot], scale, slot)
     background = background_of(setup, state)
     state.laps.lap("photos")
-    gaussians = dropped(setup, state, _seen(setup, state, target.camera))
+    seen = as_in_full(_seen(setup, state, target.camera), setup.rasterizer, target.stride)
+    gaussians = dropped(setup, state, seen)
     state.laps.lap("decode")
     return _Prepared(slot, target, background, gaussians)
 
@@ -342,17 +350,36 @@ class Target:
         scale: Its sides over those of the view's own.
         photo: [H, W, 3] uint8.
         mask: [H, W] bool; None where every pixel counts.
+        stride: n where it is one pixel of each n x n of the photo.
     """
 
     camera: Camera
     scale: float
     photo: Tensor
     mask: Tensor | None
+    stride: int = 1
 
 
-def target_at(setup: Setup, state: TrainState, index: int, scale: float) -> Target:
-    """Camera and photo of a training view at a scale in (0, 1]."""
+def target_at(
+    setup: Setup, state: TrainState, index: int, scale: float, slot: int | None = None
+) -> Target:
+    """Camera and photo of a training view at a scale in (0, 1].
+
+    Args:
+        setup: The run.
+        state: Its state.
+        index: The training view.
+        scale: The scale.
+        slot: The place of the view in the draw, which has a part in the lot that decides on the
+            pixels of an interlaced view; None has the first of each n x n.
+    """
     view = setup.train_views[index]
+    stride = stride_of(scale) if setup.selection.resolution.interlaced else 1
+    if stride > 1:
+        corner = (0, 0) if slot is None else corner_of(state.step, slot, stride)
+        full = setup.scaled_photos.get(view, view.camera, partial(_decoded, state))
+        camera = camera_of(view.camera, stride, corner)
+        return Target(camera, scale, *pixels_of(full, stride, corner), stride)
     camera = camera_at(view.camera, scale)
     photo, mask = setup.scaled_photos.get(view, camera, partial(_decoded, state))
     return Target(camera, scale, photo, mask)

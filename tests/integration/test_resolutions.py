@@ -25,6 +25,7 @@ from crossgrad_plugins.resolutions.octaves import Octaves
 
 SPECTRAL = {"name": "spectral", "smallest": 4, "per_regime": "always"}
 OCTAVES = {"name": "octaves", "smallest": 4}
+INTERLACED = {"name": "interlaced", "smallest": 4}
 GROWTH = {"events": "steps", "densify_from": 4, "densify_until": 18, "densify_every": 6}
 
 
@@ -70,6 +71,7 @@ def notes(out):
 REVISIONS = {"revisions": [[3, 60], [11, 30]]}
 CASES = {
     "spectral": {"resolution": SPECTRAL},
+    "interlaced, a length that changes": {"resolution": INTERLACED, **REVISIONS},
     "octaves, a length that changes": {"resolution": OCTAVES, **REVISIONS},
     "spectral, a length that changes": {"resolution": SPECTRAL, **REVISIONS},
     "running losses, exposure, average": {

@@ -58,7 +58,7 @@ class GswarpRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
-        """Objects where the package is not there, and to backbones with a dilation of their own."""
+        """Objects where the package is not there, and to dilations that are not its own."""
         if selection.device not in self.devices:
             return []
         reasons = []
@@ -67,6 +67,9 @@ class GswarpRasterizer(Rasterizer):
         if selection.backbone.own_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]
             reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")
+        if selection.resolution.interlaced:
+            name = selection.names["resolution"]
+            reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, resolution {name} by less")
         return reasons
 
     @override

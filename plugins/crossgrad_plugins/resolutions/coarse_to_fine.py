@@ -63,7 +63,7 @@ class CoarseToFine(Resolution):
             regime = view.regime if view.regime in parts else next(iter(parts), "")
             scale = parts[regime].course.at(progress) if parts else 1.0
             reached[regime] = scale = max(scale, reached.get(regime, 0.0))
-            found.append(self._of_photo(view.camera, scale))
+            found.append(self.of_photo(view.camera, scale))
         return tuple(found), PluginState({_REACHED: cast("Json", reached)})
 
     @override
@@ -81,7 +81,7 @@ class CoarseToFine(Resolution):
         rendered = sum(part.photos * part.course.pixels(progress) for part in parts)
         return schedule.pace.views(step) * (rendered / every if every else 1.0)
 
-    def _of_photo(self, camera: Camera, scale: float) -> float:
+    def of_photo(self, camera: Camera, scale: float) -> float:
         """A scale that leaves a photo enough pixels."""
         least = self.smallest / min(camera.width, camera.height)
         return 1.0 if max(scale, least) >= FULL_FROM else max(scale, least)
