@@ -102,9 +102,12 @@ class RunConfig(BaseModel):
         description="What is added to the points that a run starts from. "
         f"Default: {defaults.START}; {defaults.BARE_START}, nothing, with --preset inria.",
     )
-    resolution: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
-        ComponentChoice(name=defaults.RESOLUTION),
-        description=f"At which scale a step renders its views. Default: {defaults.RESOLUTION}.",
+    resolution: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+        None,
+        description="At which scale a step renders its views. "
+        f"Default: {defaults.SHORT_RESOLUTION} in runs of fewer than 30,000 steps on a CPU; "
+        f"{defaults.RESOLUTION} in longer ones, on a GPU, with --preset inria, with --schedule "
+        "absolute without --reference, and where pixels are drawn as means.",
     )
     exporter: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.EXPORTER),

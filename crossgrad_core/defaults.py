@@ -17,6 +17,8 @@ BARE_START: Final = "sfm"
 #: The start that has points for a scene without any: a hint.
 START_ALONE: Final = "triangulated"
 RESOLUTION: Final = "full"
+#: The resolution of short runs on a CPU.
+SHORT_RESOLUTION: Final = "interlaced"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"

@@ -46,6 +46,7 @@ from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
+from crossgrad_core.run.usual_resolution import usual_resolution
 from crossgrad_core.run.usual_views import operator_of, usual_views
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
@@ -296,6 +297,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     options = _rasterizer_options(config, scene, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
+    usual = usual_resolution(config, views, backbone)
+    resolution_choice = _or_default(config.resolution, usual)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     exposure = _built(Exposure, config.exposure)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
@@ -309,7 +312,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "loss": config.loss.name,
         "exposure": fitted.name or config.exposure.name,
         "start": start_choice.name,
-        "resolution": config.resolution.name,
+        "resolution": resolution_choice.name,
         "exporter": config.exporter.name,
         "reader": reader,
     }
@@ -326,7 +329,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         loss=_built(Loss, config.loss),
         exposure=fitted.exposure,
         start=start,
-        resolution=_built(Resolution, config.resolution).fitted_to(scene),
+        resolution=_built(Resolution, resolution_choice).fitted_to(scene),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
         names=names,

@@ -1,15 +1,22 @@
-"""One pixel of each 2 x 2 for most of the run, all of them at its end."""
+"""Some of the pixels of a photo for most of the run, all of them at its end."""
 
-from typing import ClassVar
+from collections.abc import Mapping
+from math import ceil
+from statistics import median
+from typing import ClassVar, Literal
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Camera, Field
-from crossgrad_plugins.resolutions.octaves import Octaves
+from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed
+from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
+from crossgrad_plugins.resolutions.course import Course
+
+#: Share of the run up to which one pixel of each 8 x 8, and of each 4 x 4, is drawn at most.
+_EIGHTH, _QUARTER = 0.25, 0.5
 
 
-class Interlaced(Octaves):
-    """Draws one pixel of each 2 x 2 up to a share of the run, another one in each step.
+class Interlaced(CoarseToFine):
+    """Draws one pixel of each n x n up to a share of the run, another one in each step.
 
     Photos are not reduced: what is drawn is what the full render has at these pixels, so that the
     gradients of an error by pixels are right in the mean. Ours.
@@ -17,12 +24,50 @@ class Interlaced(Octaves):
 
     interlaced: ClassVar[bool] = True
 
-    quarter_until: float = Field(
-        0.0, ge=0, lt=1, description="share of the run with one pixel of each 4 x 4; 0: none"
+    until: float = Field(
+        0.8, gt=_QUARTER, lt=1, description="share of the run after which all pixels are drawn"
     )
-    half_until: float = Field(
-        0.8, ge=0, lt=1, description="share of the run after which all pixels are drawn"
+    least: int = Field(
+        60_000, ge=1, description="pixels that a render of the median photo has at least"
     )
+    coarsest: Literal[1, 2, 4, 8] | None = Field(
+        None, description="the n of the first steps; none: by the photos' pixels, and written down"
+    )
+
+    @override
+    def fitted_to(self, scene: Scene) -> "Interlaced":
+        if self.coarsest is not None:
+            return self
+        pixels = median(v.camera.width * v.camera.height for v in scene.train_views)
+        fitting = [n for n in (1, 2, 4, 8) if n == 1 or pixels >= self.least * n**2]
+        return self.model_copy(update={"coarsest": fitting[-1]})
+
+    @override
+    def window(self, schedule: Schedule) -> float:
+        return schedule.counted(schedule.total)
+
+    @override
+    def parts(self) -> Mapping[str, Part]:
+        return {"all": Part(Course(*map(tuple, zip(*self._stages(), strict=True))))}
+
+    def _stages(self) -> list[tuple[float, float]]:
+        """Shares of the run, and the scale up to each."""
+        stages = ((_EIGHTH, 8), (_QUARTER, 4), (self.until, 2))
+        return [(end, 1.0 / n) for end, n in stages if n <= (self.coarsest or 1)]
+
+    @override
+    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+        stages = [(end, round(1.0 / scale)) for end, scale in self._stages()]
+        if not stages:
+            return ()
+        ends = [schedule.step_of(ceil(end * self.window(schedule))) for end, _ in stages]
+        told = [
+            f"of each {n} x {n} to step {end}" for end, (_, n) in zip(ends, stages, strict=True)
+        ]
+        return (
+            f"resolution: one pixel {listed(told)}, in each step another one; then all "
+            "(--resolution full: from the start)",
+        )
 
     @override
     def of_photo(self, camera: Camera, scale: float) -> float:
