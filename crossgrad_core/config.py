@@ -105,9 +105,9 @@ class RunConfig(BaseModel):
     resolution: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
         description="At which scale a step renders its views. "
-        f"Default: {defaults.SHORT_RESOLUTION} in runs of fewer than 30,000 steps on a CPU; "
-        f"{defaults.RESOLUTION} in longer ones, on a GPU, with --preset inria, with --schedule "
-        "absolute without --reference, and where pixels are drawn as means.",
+        f"Default: {defaults.SHORT_RESOLUTION} on a CPU in runs within seconds or of fewer than "
+        f"30,000 steps whose growth follows a curve; {defaults.RESOLUTION} in others, with anchors "
+        "and filters, with --preset inria, and with --schedule absolute without --reference.",
     )
     exporter: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.EXPORTER),

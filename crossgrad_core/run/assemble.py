@@ -297,7 +297,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     options = _rasterizer_options(config, scene, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
-    usual = usual_resolution(config, views, backbone)
+    usual = usual_resolution(config, views, backbone, densifier, device.type)
     resolution_choice = _or_default(config.resolution, usual)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     exposure = _built(Exposure, config.exposure)

@@ -2,22 +2,32 @@
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
-from crossgrad_core.contract.schedule import REFERENCE
+from crossgrad_core.contract.schedule import REFERENCE, is_published
 from crossgrad_core.defaults import RESOLUTION, SHORT_RESOLUTION
+from crossgrad_core.training.schedules import growth_by
 
 
-def usual_resolution(config: RunConfig, views: ViewPlan, backbone: Backbone) -> str:
-    """Some of the pixels in short runs on a CPU, where pixels are most of a step; else all.
+def usual_resolution(
+    config: RunConfig, views: ViewPlan, backbone: Backbone, densifier: Densifier, device: str
+) -> str:
+    """Some of the pixels first in short runs on a CPU, where pixels are most of a step; else all.
 
-    Published schedules and runs as long as the published ones have all pixels, and so have
-    backbones whose pixels are means over their area. A run within seconds counts as short: its
-    length is not known yet.
+    Published schedules, and runs as long as the published ones, have all pixels. So have anchors
+    and filters, of which nothing is measured, and growth that no budget leads: of fewer pixels the
+    norms of gradients are larger. A run within seconds counts as short: its length is not known.
+
+    Args:
+        config: The configuration.
+        views: K over the run.
+        backbone: Its backbone.
+        densifier: Its densifier.
+        device: The type of its device.
     """
-    published = config.preset == "inria" or (
-        config.schedule == "absolute" and config.reference is None
-    )
+    published = config.preset == "inria" or is_published(config.schedule, config.reference)
     steps = config.steps if config.max_views is None else views.steps_of(config.max_views)
     short = config.seconds is not None or (steps or REFERENCE) < REFERENCE
-    suits = short and not published and backbone.response != "analytic"
-    return SHORT_RESOLUTION if suits and config.device == "cpu" else RESOLUTION
+    led = growth_by(config, budgeted=densifier.budgeted) == "curve"
+    suits = led and bool(backbone.axes) and backbone.response == "plain" and device == "cpu"
+    return SHORT_RESOLUTION if short and suits and not published else RESOLUTION

@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render, Screen
@@ -224,6 +225,22 @@ def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
             _same_gradient(name, _tensors(ours)[name].grad, tensor.grad)
 
 
+def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
+    """A dilation that Gaussians bring replaces its own, as where only some pixels are drawn."""
+    rasterizer = make()
+    try:
+        wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
+    except ValidationError:
+        raise cannot_tell("it has one dilation and no other") from None
+    some = _moved(sample_gaussians(harmonics=False), _device(rasterizer))
+    with torch.no_grad():
+        plain, own = (_drawn(each, some).image for each in (rasterizer, wider))
+        wide = _drawn(rasterizer, replace(some, dilation=1.0)).image
+    require(not torch.equal(plain, wide), "a dilation that Gaussians bring changes nothing")
+    error = float((own - wide).abs().max())
+    require(error < _ROUNDING, f"it changes pixels by {error:.2g} more than its own of that size")
+
+
 def _same_gradient(name: str, ours: Tensor | None, theirs: Tensor | None) -> None:
     if ours is None or theirs is None:
         require(ours is theirs, f"the gradient of {name} is missing")
@@ -288,4 +305,5 @@ RASTERIZER_CHECKS: tuple[Check[Rasterizer], ...] = (
     same_input_same_bits,
     rows_on_demand_are_asked_for,
     the_reference_draws_the_same,
+    dilations_of_gaussians_are_heeded,
 )

@@ -11,7 +11,7 @@ from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import sample_context
-from crossgrad_core.training.views import camera_at
+from crossgrad_core.training.views import photo_camera
 
 #: Views, or where they are more those of two steps, that are foreseen.
 _VIEWS, _STEPS = 8, 2
@@ -49,7 +49,7 @@ class Foresight:
         scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
         views = [setup.train_views[index] for draw in self._draws for index in draw]
         small = setup.scaled_photos
-        wanted = [view for view in views if not small.holds(view, camera_at(view.camera, scale))]
+        wanted = [v for v in views if not small.holds(v, photo_camera(setup, v, scale))]
         setup.photos_ahead.expect(wanted)
 
     def _follow(self, state: TrainState) -> None:

@@ -13,10 +13,11 @@ from crossgrad_core.training.scaled_photos import Pair
 Corner = tuple[int, int]
 
 
-def stride_of(scale: float) -> int:
-    """The n of a scale 1 / n; 1 where it is none, so that its photos are reduced."""
+def stride_of(scale: float, camera: Camera) -> int:
+    """The n of a scale 1 / n; 1 where it is none, or a side is shorter: its photo is reduced."""
     whole = round(1.0 / scale)
-    return whole if isclose(whole * scale, 1.0) else 1
+    fits = isclose(whole * scale, 1.0) and whole <= min(camera.width, camera.height)
+    return whole if fits else 1
 
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
@@ -53,7 +54,8 @@ def pixels_of(pair: Pair, stride: int, corner: Corner) -> Pair:
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
     """The Gaussians with the dilation of the full photo, in pixels n times as wide.
 
-    With it the render of `camera_of` has the very values that the full one has at its pixels.
+    With it the render of `camera_of` has the values that the full one has at its pixels, but for
+    Gaussians so far beyond the border that their positions are clamped there.
     """
     if stride == 1:
         return gaussians

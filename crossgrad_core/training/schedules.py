@@ -33,17 +33,18 @@ def counting_of(config: RunConfig, views: ViewPlan, photos: int, *, budgeted: bo
     """
     plain = Counting(unit_of(config), views, photos, config.reference, config.fewest_edits or 0)
     # Without a budget early growth copies nearly everything, and a short run ends lower.
-    if config.fewest_edits is not None or _growth(config, budgeted=budgeted) == "free":
+    if config.fewest_edits is not None or growth_by(config, budgeted=budgeted) == "free":
         return plain
     return replace(plain, fewest_edits=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
 
 
 def growth_of(setup: Setup) -> Literal["free", "curve"]:
     """How the number of primitives grows: as was asked for, else as suits the densifier."""
-    return _growth(setup.config, budgeted=setup.densifier.budgeted)
+    return growth_by(setup.config, budgeted=setup.densifier.budgeted)
 
 
-def _growth(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
+def growth_by(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
+    """The same before there is a run; `budgeted`: `Densifier.budgeted` of its densifier."""
     if config.growth is not None:
         return config.growth
     # A bound that somebody names is a bound and no aim, and published times have published growth.
@@ -65,7 +66,7 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
-    led = _growth(config, budgeted=densifier.budgeted) == "curve"
+    led = growth_by(config, budgeted=densifier.budgeted) == "curve"
     if led and schedule.length < REFERENCE:
         # They hold back growth, which the curve does, and with them goes what fills the far ground.
         schedule = replace(schedule, reset_every=None)

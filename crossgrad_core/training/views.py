@@ -360,9 +360,7 @@ class Target:
     stride: int = 1
 
 
-def target_at(
-    setup: Setup, state: TrainState, index: int, scale: float, slot: int | None = None
-) -> Target:
+def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: int = 0) -> Target:
     """Camera and photo of a training view at a scale in (0, 1].
 
     Args:
@@ -371,18 +369,24 @@ def target_at(
         index: The training view.
         scale: The scale.
         slot: The place of the view in the draw, which has a part in the lot that decides on the
-            pixels of an interlaced view; None has the first of each n x n.
+            pixels of an interlaced view.
     """
     view = setup.train_views[index]
-    stride = stride_of(scale) if setup.selection.resolution.interlaced else 1
+    stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)
+    pair = setup.scaled_photos.get(view, camera, partial(_decoded, state))
     if stride > 1:
-        corner = (0, 0) if slot is None else corner_of(state.step, slot, stride)
-        full = setup.scaled_photos.get(view, view.camera, partial(_decoded, state))
-        camera = camera_of(view.camera, stride, corner)
-        return Target(camera, scale, *pixels_of(full, stride, corner), stride)
-    camera = camera_at(view.camera, scale)
-    photo, mask = setup.scaled_photos.get(view, camera, partial(_decoded, state))
-    return Target(camera, scale, photo, mask)
+        corner = corner_of(state.step, slot, stride)
+        camera, pair = camera_of(camera, stride, corner), pixels_of(pair, stride, corner)
+    return Target(camera, scale, *pair, stride)
+
+
+def photo_camera(setup: Setup, view: View, scale: float) -> Camera:
+    """The camera of the photo that a view of that scale takes its pixels from."""
+    return view.camera if _stride_at(setup, view, scale) > 1 else camera_at(view.camera, scale)
+
+
+def _stride_at(setup: Setup, view: View, scale: float) -> int:
+    return stride_of(scale, view.camera) if setup.selection.resolution.interlaced else 1
 
 
 def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> Tensor | None:

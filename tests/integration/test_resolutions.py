@@ -25,7 +25,7 @@ from crossgrad_plugins.resolutions.octaves import Octaves
 
 SPECTRAL = {"name": "spectral", "smallest": 4, "per_regime": "always"}
 OCTAVES = {"name": "octaves", "smallest": 4}
-INTERLACED = {"name": "interlaced", "smallest": 4}
+INTERLACED = {"name": "interlaced", "smallest": 4, "least": 16}
 GROWTH = {"events": "steps", "densify_from": 4, "densify_until": 18, "densify_every": 6}
 
 

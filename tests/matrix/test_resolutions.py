@@ -29,7 +29,7 @@ def names(slot):
 
 
 OPTIONS = {
-    "interlaced": {"smallest": 4},
+    "interlaced": {"smallest": 4, "least": 16},
     "octaves": {"smallest": 4},
     "spectral": {"smallest": 4, "per_regime": "always"},
 }

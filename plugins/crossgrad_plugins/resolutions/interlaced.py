@@ -1,7 +1,7 @@
 """Some of the pixels of a photo for most of the run, all of them at its end."""
 
 from collections.abc import Mapping
-from math import ceil
+from math import ceil, isqrt
 from statistics import median
 from typing import ClassVar, Literal
 
@@ -25,10 +25,10 @@ class Interlaced(CoarseToFine):
     interlaced: ClassVar[bool] = True
 
     until: float = Field(
-        0.8, gt=_QUARTER, lt=1, description="share of the run after which all pixels are drawn"
+        0.8, gt=_QUARTER, le=0.95, description="share of the run after which all pixels are drawn"
     )
     least: int = Field(
-        60_000, ge=1, description="pixels that a render of the median photo has at least"
+        60_000, ge=1, description="pixels that a render has at least where not all are drawn"
     )
     coarsest: Literal[1, 2, 4, 8] | None = Field(
         None, description="the n of the first steps; none: by the photos' pixels, and written down"
@@ -38,9 +38,8 @@ class Interlaced(CoarseToFine):
     def fitted_to(self, scene: Scene) -> "Interlaced":
         if self.coarsest is not None:
             return self
-        pixels = median(v.camera.width * v.camera.height for v in scene.train_views)
-        fitting = [n for n in (1, 2, 4, 8) if n == 1 or pixels >= self.least * n**2]
-        return self.model_copy(update={"coarsest": fitting[-1]})
+        most = median(self._most(view.camera) for view in scene.train_views)
+        return self.model_copy(update={"coarsest": max(n for n in (1, 2, 4, 8) if n <= most)})
 
     @override
     def window(self, schedule: Schedule) -> float:
@@ -71,5 +70,9 @@ class Interlaced(CoarseToFine):
 
     @override
     def of_photo(self, camera: Camera, scale: float) -> float:
-        side = min(camera.width, camera.height)
-        return 1.0 / max(1, min(round(1.0 / scale), side // self.smallest))
+        return 1.0 / min(round(1.0 / scale), self._most(camera))
+
+    def _most(self, camera: Camera) -> int:
+        """The n that a photo has at most."""
+        by_side = min(camera.width, camera.height) // self.smallest
+        return max(1, min(by_side, isqrt(camera.width * camera.height // self.least)))

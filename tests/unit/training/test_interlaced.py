@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +10,14 @@ import torch
 from support.gaussians import posed_camera, random_gaussians
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.contexts import Draw, ScaleContext
+from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.run.migration import migrated
+from crossgrad_core.testing.fixtures import sample_scene, step_fields
 from crossgrad_core.training.interlaced import (
     as_in_full,
     camera_of,
@@ -21,6 +26,7 @@ from crossgrad_core.training.interlaced import (
     stride_of,
 )
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.views import target_at
 
@@ -93,7 +99,12 @@ def test_every_corner_has_its_turn_whatever_sampler_goes_through_the_photos(stri
     ("scale", "stride"), [(1.0, 1), (0.5, 2), (1 / 3, 3), (0.25, 4), (0.6, 1), (0.45, 1), (0.2, 5)]
 )
 def test_strides_are_those_of_whole_numbers(scale, stride):
-    assert stride_of(scale) == stride
+    assert stride_of(scale, posed_camera()) == stride
+
+
+def test_no_stride_is_wider_than_the_photo():
+    assert stride_of(1 / 8, posed_camera(8, 9)) == 8
+    assert stride_of(1 / 8, posed_camera(9, 7)) == 1
 
 
 def test_masks_are_taken_at_the_same_pixels():
@@ -105,17 +116,110 @@ def test_masks_are_taken_at_the_same_pixels():
 
 
 @pytest.mark.parametrize(
-    ("side", "smallest", "expected"),
-    [(400, 96, 0.5), (191, 96, 1.0), (192, 96, 0.5), (100, 96, 1.0), (20, 96, 1.0), (16, 4, 0.5)],
+    ("width", "height", "scale", "expected"),
+    [
+        (640, 400, 1 / 2, 2),
+        (640, 400, 1 / 8, 2),  # 60,000 pixels
+        (400, 298, 1 / 2, 1),
+        (2000, 150, 1 / 2, 1),  # a shorter side of 96
+        (1600, 1200, 1 / 8, 5),
+        (4000, 3000, 1 / 8, 8),
+        (5, 3, 1 / 2, 1),
+    ],
 )
-def test_no_side_has_less_than_the_smallest(side, smallest, expected):
-    resolution = build("resolutions", "interlaced", {"smallest": smallest})
-    camera = replace(posed_camera(), width=2 * side, height=side)
-    assert resolution.of_photo(camera, 0.5) == expected
+def test_every_photo_keeps_enough_pixels(width, height, scale, expected):
+    resolution = build("resolutions", "interlaced", {})
+    assert 1 / resolution.of_photo(posed_camera(width, height), scale) == pytest.approx(expected)
+
+
+def scene_of(width, height):
+    plain = sample_scene()
+    views = (replace(v, camera=v.camera.resized(width, height)) for v in plain.views)
+    return replace(plain, views=tuple(views))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "coarsest", "scales", "note"),
+    [
+        (400, 298, 1, [(200, 1.0)], None),
+        (640, 400, 2, [(160, 1 / 2), (40, 1.0)], "2 x 2 to step 160"),
+        (1600, 1200, 4, [(100, 1 / 4), (60, 1 / 2), (40, 1.0)],
+         "4 x 4 to step 100, of each 2 x 2 to step 160"),
+        (4000, 3000, 8, [(50, 1 / 8), (50, 1 / 4), (60, 1 / 2), (40, 1.0)],
+         "8 x 8 to step 50, of each 4 x 4 to step 100, of each 2 x 2 to step 160"),
+    ],
+)  # fmt: skip
+def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
+    scene, schedule = scene_of(width, height), Schedule.for_run(200)
+    resolution = build("resolutions", "interlaced", {}).fitted_to(scene)
+    assert resolution.coarsest == coarsest
+    state, found = PluginState(), []
+    for step in range(1, 201):
+        context = ScaleContext(
+            **{**step_fields(step), "scene": scene, "schedule": schedule,
+               "rng": np.random.default_rng(0)},
+            draw=Draw((0,)), last=None,
+        )  # fmt: skip
+        (scale,), state = resolution.scales(context, state)
+        found.append(scale)
+    assert found == [scale for count, scale in scales for _ in range(count)]
+    remarks = resolution.remarks(schedule)
+    if note is None:
+        assert remarks == ()
+    else:
+        (remark,) = remarks
+        assert f"one pixel of each {note}, in each step another one; then all" in remark
+    pixels = sum(count * scale**2 for count, scale in scales)
+    assert resolution.pixels(schedule, 200) == pytest.approx(pixels)
+
+
+USUAL = {
+    "a short run": ({}, "interlaced"),
+    "views": ({"steps": None, "max_views": 2000}, "interlaced"),
+    "seconds": ({"steps": None, "seconds": 60}, "interlaced"),
+    "as long as published": ({"steps": 30_000}, "full"),
+    "no length": ({"steps": None}, "full"),
+    "views as many": ({"steps": None, "max_views": 30_000}, "full"),
+    "the preset": ({"preset": "inria"}, "full"),
+    "absolute": ({"schedule": "absolute"}, "full"),
+    "of another length": ({"schedule": "absolute", "reference": 2000}, "interlaced"),
+    "free growth": ({"growth": "free"}, "full"),
+    "a bound": ({"max_gaussians": 500}, "full"),
+    "no growth": ({"densifier": {"name": "none"}}, "full"),
+    "anchors": ({"backbone": {"name": "scaffold"}}, "full"),
+    "a filter": ({"backbone": {"name": "mip"}}, "full"),
+    "means over pixels": ({"backbone": {"name": "analytic"}}, "full"),
+    "named": ({"resolution": {"name": "octaves"}}, "octaves"),
+    "the processor by number": ({"device": "cpu:0"}, "interlaced"),
+}
+
+
+@pytest.mark.parametrize("case", USUAL)
+def test_some_pixels_first_is_for_short_runs_of_plain_gaussians(case):
+    settings, expected = USUAL[case]
+    given = {"steps": 2000, **settings}
+    setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
+    assert setup.selection.names["resolution"] == expected
+
+
+def test_runs_of_before_go_on_with_all_pixels():
+    rest = migrated({"revisions": [], "steps": 100}, Path("config.yaml"))
+    assert rest["resolution"] == {"name": "full"}
+
+
+def test_a_rasterizer_with_one_dilation_is_refused():
+    gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
+    selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
+    told = gswarp.crossgrad_objections(selection)
+    assert any("resolution interlaced by less" in each for each in told)
 
 
 def assembled(**settings):
-    given = {"resolution": {"name": "interlaced", "smallest": 4}, "steps": 20, **settings}
+    given = {
+        "resolution": {"name": "interlaced", "smallest": 4, "least": 16, "coarsest": 2},
+        "steps": 20,
+        **settings,
+    }
     return assemble(RunConfig.model_validate(given), sample_scene(), "none")
 
 
@@ -138,8 +242,9 @@ def test_pixels_are_those_of_the_photo_and_another_step_has_others():
         assert (target.camera.height, target.camera.width) == target.photo.shape[:2]
         found.append((column, row))
     assert len(set(found)) == 4
-    # What a plugin asks for between steps is always the same.
-    assert torch.equal(target_at(setup, state, 0, 0.5).photo, photo[0::2, 0::2])
+    on_request = OnRequest(setup, state, counted=False)(0, 0.5)
+    assert torch.equal(on_request.photo, target_at(setup, state, 0, 0.5).photo)
+    assert on_request.gaussians.dilation == pytest.approx(0.3 / 4)
     assert target_at(setup, state, 0, 1.0, slot=0).stride == 1
 
 
