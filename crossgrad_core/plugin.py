@@ -71,7 +71,7 @@ from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Photo, Pinhole, Scene, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.contract.schedule import SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
+from crossgrad_core.contract.schedule import REFERENCE, SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.start import MorePoints, Start
@@ -104,6 +104,7 @@ __all__ = [
     "LOCAL",
     "NO_EDIT",
     "ONE_MODE",
+    "REFERENCE",
     "SHORTEST_ANCHOR_INTERVAL",
     "AfterStepContext",
     "AggregateContext",

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import cast
 
 from typing_extensions import override
@@ -44,7 +45,7 @@ class CoarseToFine(Resolution):
 
     @abstractmethod
     def window(self, schedule: Schedule) -> float:
-        """The count, of views or of steps, from which on every view has its full size."""
+        """The count, of views or of steps, from which on every view has its full size; 0: all."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, Part]:
@@ -56,7 +57,8 @@ class CoarseToFine(Resolution):
     ) -> tuple[tuple[float, ...], PluginState]:
         # A run has fitted it before its first step: nothing is measured here.
         parts = cast("CoarseToFine", self.fitted_to(context.scene)).parts()
-        progress = context.schedule.counted(context.step - 1) / self.window(context.schedule)
+        window = self.window(context.schedule)
+        progress = context.schedule.counted(context.step - 1) / window if window else inf
         reached = dict(cast("Mapping[str, float]", state.values.get(_REACHED, {})))
         found = []
         for view in context.views:
@@ -75,7 +77,10 @@ class CoarseToFine(Resolution):
 
     @override
     def pixels(self, schedule: Schedule, step: int) -> float:
-        progress = schedule.counted(step) / self.window(schedule)
+        window = self.window(schedule)
+        if not window:
+            return super().pixels(schedule, step)
+        progress = schedule.counted(step) / window
         parts = self.parts().values()
         every = progress * sum(part.photos for part in parts)
         rendered = sum(part.photos * part.course.pixels(progress) for part in parts)

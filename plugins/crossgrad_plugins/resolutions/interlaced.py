@@ -1,18 +1,21 @@
 """Some of the pixels of a photo for most of the run, all of them at its end."""
 
 from collections.abc import Mapping
-from math import ceil, isqrt
+from math import ceil, isqrt, log
 from statistics import median
 from typing import ClassVar, Literal
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed
+from crossgrad_core.plugin import REFERENCE, Camera, Field, Scene, Schedule, listed
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
 from crossgrad_plugins.resolutions.course import Course
 
-#: Share of the run up to which one pixel of each 8 x 8, and of each 4 x 4, is drawn at most.
-_EIGHTH, _QUARTER = 0.25, 0.5
+#: Share of a short run up to which one pixel of each 2 x 2 is drawn; it falls with the logarithm of
+#: the length from this count on, to 0 at the published length.
+_SHARE, _SHORT = 0.8, 3_000
+#: Shares of that up to which it is one of each 8 x 8, and of each 4 x 4.
+_EIGHTH, _QUARTER = 0.3, 0.6
 
 
 class Interlaced(CoarseToFine):
@@ -24,8 +27,11 @@ class Interlaced(CoarseToFine):
 
     interlaced: ClassVar[bool] = True
 
-    until: float = Field(
-        0.8, gt=_QUARTER, le=0.95, description="share of the run after which all pixels are drawn"
+    until: float | None = Field(
+        None,
+        ge=0,
+        le=0.95,
+        description="share of the run after which all pixels are drawn; none: by its length",
     )
     least: int = Field(
         60_000, ge=1, description="pixels that a render has at least where not all are drawn"
@@ -43,26 +49,26 @@ class Interlaced(CoarseToFine):
 
     @override
     def window(self, schedule: Schedule) -> float:
-        return schedule.counted(schedule.total)
+        whole = schedule.counted(schedule.total)
+        if self.until is not None:
+            return self.until * whole
+        left = log(REFERENCE / whole) / log(REFERENCE / _SHORT)
+        return _SHARE * min(1.0, max(0.0, left)) * whole
 
     @override
     def parts(self) -> Mapping[str, Part]:
-        return {"all": Part(Course(*map(tuple, zip(*self._stages(), strict=True))))}
-
-    def _stages(self) -> list[tuple[float, float]]:
-        """Shares of the run, and the scale up to each."""
-        stages = ((_EIGHTH, 8), (_QUARTER, 4), (self.until, 2))
-        return [(end, 1.0 / n) for end, n in stages if n <= (self.coarsest or 1)]
+        stages = ((_EIGHTH, 8), (_QUARTER, 4), (1.0, 2))
+        there = [(end, 1.0 / n) for end, n in stages if n <= (self.coarsest or 1)]
+        return {"all": Part(Course(*map(tuple, zip(*there, strict=True))))}
 
     @override
     def remarks(self, schedule: Schedule) -> tuple[str, ...]:
-        stages = [(end, round(1.0 / scale)) for end, scale in self._stages()]
-        if not stages:
+        (part,), window = self.parts().values(), self.window(schedule)
+        stages = zip(part.course.ends, part.course.scales, strict=True)
+        ends = [(schedule.step_of(ceil(end * window)), round(1.0 / scale)) for end, scale in stages]
+        told = [f"of each {n} x {n} to step {end}" for end, n in ends]
+        if not told or not window:
             return ()
-        ends = [schedule.step_of(ceil(end * self.window(schedule))) for end, _ in stages]
-        told = [
-            f"of each {n} x {n} to step {end}" for end, (_, n) in zip(ends, stages, strict=True)
-        ]
         return (
             f"resolution: one pixel {listed(told)}, in each step another one; then all "
             "(--resolution full: from the start)",

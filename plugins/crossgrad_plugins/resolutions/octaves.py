@@ -21,7 +21,7 @@ class Octaves(CoarseToFine):
         0.2, ge=0, lt=1, description="share of the run that has 1/4 of the size; 0: none"
     )
     half_until: float = Field(
-        0.4, ge=0, lt=1, description="share of the run after which photos have their full size"
+        0.4, ge=0, le=0.95, description="share of the run after which photos have their full size"
     )
 
     @model_validator(mode="after")

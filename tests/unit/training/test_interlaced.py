@@ -143,10 +143,10 @@ def scene_of(width, height):
     [
         (400, 298, 1, [(200, 1.0)], None),
         (640, 400, 2, [(160, 1 / 2), (40, 1.0)], "2 x 2 to step 160"),
-        (1600, 1200, 4, [(100, 1 / 4), (60, 1 / 2), (40, 1.0)],
-         "4 x 4 to step 100, of each 2 x 2 to step 160"),
-        (4000, 3000, 8, [(50, 1 / 8), (50, 1 / 4), (60, 1 / 2), (40, 1.0)],
-         "8 x 8 to step 50, of each 4 x 4 to step 100, of each 2 x 2 to step 160"),
+        (1600, 1200, 4, [(96, 1 / 4), (64, 1 / 2), (40, 1.0)],
+         "4 x 4 to step 96, of each 2 x 2 to step 160"),
+        (4000, 3000, 8, [(48, 1 / 8), (48, 1 / 4), (64, 1 / 2), (40, 1.0)],
+         "8 x 8 to step 48, of each 4 x 4 to step 96, of each 2 x 2 to step 160"),
     ],
 )  # fmt: skip
 def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
@@ -171,6 +171,24 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
         assert f"one pixel of each {note}, in each step another one; then all" in remark
     pixels = sum(count * scale**2 for count, scale in scales)
     assert resolution.pixels(schedule, 200) == pytest.approx(pixels)
+
+
+@pytest.mark.parametrize(
+    ("steps", "share"),
+    [(100, 0.8), (3000, 0.8), (9487, 0.4), (29_999, 0.0), (30_000, 0.0), (40_000, 0.0)],
+)
+def test_longer_runs_have_all_pixels_sooner(steps, share):
+    resolution = build("resolutions", "interlaced", {"coarsest": 2})
+    schedule = Schedule.for_run(steps)
+    assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
+    assert resolution.pixels(schedule, steps) == pytest.approx((1 - 0.75 * share) * steps, rel=1e-3)
+    assert bool(resolution.remarks(schedule)) == (steps < 30_000)
+    assert build("resolutions", "interlaced", {"until": 0.5}).window(schedule) == 0.5 * steps
+
+
+def test_a_run_as_long_as_the_published_ones_has_all_pixels_from_its_first_step():
+    setup = assembled(steps=30_000)
+    assert timed_step(setup, first_state(setup)).scales == (1.0,)
 
 
 USUAL = {
