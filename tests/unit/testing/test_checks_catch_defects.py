@@ -306,6 +306,11 @@ class LessOpaque(Torch):
         return super().render(thinner, camera, background, outputs)
 
 
+class OneDilation(Torch):
+    def render(self, gaussians, camera, background, outputs=frozenset()):
+        return super().render(replace(gaussians, dilation=None), camera, background, outputs)
+
+
 class LooseTensor(Vanilla):
     def blocks(self):
         return super().blocks()[:-1]
@@ -850,6 +855,7 @@ DEFECTS = [
     (rasterizers.same_input_same_bits, Flickers),
     (rasterizers.rows_on_demand_are_asked_for, AsksForNoRows),
     (rasterizers.the_reference_draws_the_same, LessOpaque),
+    (rasterizers.dilations_of_gaussians_are_heeded, OneDilation),
     (backbones.blocks_cover_the_parameters, LooseTensor),
     (backbones.created_from_the_scene, GlobalStart),
     (backbones.the_default_densifier_is_there, DensifierOfAnchors),

@@ -87,17 +87,19 @@ def test_nothing_is_foreseen_of_a_sampler_that_fails():
     assert setup.photos_ahead.names == []
 
 
-def test_photos_that_are_kept_in_a_smaller_size_are_not_decoded_for_it():
+@pytest.mark.parametrize(("resolution", "width"), [("octaves", WIDTH // 2), ("interlaced", WIDTH)])
+def test_photos_that_are_kept_in_the_size_they_are_taken_from_are_not_decoded(resolution, width):
     class OddOnesKept:
         def holds(self, view, camera):
             asked.append(camera.width)
             return view.name in odd
 
-    setup = replace(setup_of("epoch"), scaled_photos=OddOnesKept())
+    setup = setup_of("epoch", resolution={"name": resolution})
+    setup = replace(setup, scaled_photos=OddOnesKept())
     odd, asked = {view.name for view in setup.train_views[1::2]}, []
     state = first_state(setup)
     state.last = StepRecord(0, (0,), ("",), None, (0.1,), 1, {}, 0.0, scales=(0.5,))
     Foresight(setup).look(state)
-    assert set(asked) == {WIDTH // 2}
+    assert set(asked) == {width}
     (expected,) = setup.photos_ahead.names
     assert expected and not odd & set(expected)
