@@ -1,7 +1,7 @@
 """A scale that grows in steps over a part of a run, the window."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
@@ -32,6 +32,11 @@ class Course:
         """Scales that last equally long and fill the window together."""
         count = len(scales)
         return cls(tuple((part + 1) / count for part in range(count)), tuple(scales))
+
+    @classmethod
+    def of_stages(cls, stages: Iterable[tuple[float, float]]) -> "Course":
+        """Scales with the share of the window at which each ends."""
+        return cls(*map(tuple, zip(*stages, strict=True)))
 
     def at(self, progress: float) -> float:
         """The scale after that share of the window."""

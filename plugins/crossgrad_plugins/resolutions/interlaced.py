@@ -59,7 +59,7 @@ class Interlaced(CoarseToFine):
     def parts(self) -> Mapping[str, Part]:
         stages = ((_EIGHTH, 8), (_QUARTER, 4), (1.0, 2))
         there = [(end, 1.0 / n) for end, n in stages if n <= (self.coarsest or 1)]
-        return {"all": Part(Course(*map(tuple, zip(*there, strict=True))))}
+        return {"all": Part(Course.of_stages(there))}
 
     @override
     def remarks(self, schedule: Schedule) -> tuple[str, ...]:

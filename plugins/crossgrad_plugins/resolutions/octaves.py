@@ -38,7 +38,7 @@ class Octaves(CoarseToFine):
     def parts(self) -> Mapping[str, Part]:
         stages = ((0.0, self.quarter_until, 0.25), (self.quarter_until, self.half_until, 0.5))
         there = [(end, scale) for start, end, scale in stages if start < end]
-        return {"all": Part(Course(*map(tuple, zip(*there, strict=True))))}
+        return {"all": Part(Course.of_stages(there))}
 
     @override
     def remarks(self, schedule: Schedule) -> tuple[str, ...]:
