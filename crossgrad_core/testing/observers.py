@@ -44,7 +44,7 @@ from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager
-from crossgrad_core.run.assemble import select
+from crossgrad_core.run.select import select
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS

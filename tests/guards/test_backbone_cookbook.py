@@ -8,6 +8,7 @@ import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
@@ -40,12 +41,12 @@ def test_the_shown_test_is_parametrized_by_the_checks(shown):
 
 
 def test_the_shown_backbone_trains(shown, monkeypatch):
-    built = assembling.build
+    built = selecting.build
 
     def with_spheres(slot, name, options):
         return shown["Spheres"]() if name == "spheres" else built(slot, name, options)
 
-    monkeypatch.setattr(assembling, "build", with_spheres)
+    monkeypatch.setattr(selecting, "build", with_spheres)
     config = RunConfig(
         steps=60,
         backbone=ComponentChoice(name="spheres"),

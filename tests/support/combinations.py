@@ -20,7 +20,8 @@ from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.registry.entries import build, load, offers
-from crossgrad_core.run.assemble import reasons_against, select
+from crossgrad_core.run.assemble import reasons_against
+from crossgrad_core.run.select import select
 from crossgrad_core.testing.fixtures import sample_scene
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")

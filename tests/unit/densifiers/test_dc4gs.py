@@ -18,6 +18,7 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
 from crossgrad_core.testing.records import view_record
 from crossgrad_core.training.loop import timed_step
@@ -295,7 +296,7 @@ def test_a_run_splits_and_asks_for_directions_only_while_it_needs_them(rasterize
 
 
 def test_a_rasterizer_without_directions_is_refused(monkeypatch):
-    build = assembling.build
+    build = selecting.build
 
     def blind(slot, name, options):
         component = build(slot, name, options)
@@ -308,7 +309,7 @@ def test_a_rasterizer_without_directions_is_refused(monkeypatch):
 
         return Blind()
 
-    monkeypatch.setattr(assembling, "build", blind)
+    monkeypatch.setattr(selecting, "build", blind)
     with pytest.raises(IncompatibleSelectionError) as refused:
         setup_of("numba")
     assert "densifier dc4gs needs the screen statistics directions" in refused.value.found

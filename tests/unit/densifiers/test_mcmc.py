@@ -18,6 +18,7 @@ from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.contract.topology import NO_EDIT, Edit, apply_to_moment, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.fixtures import sample_gaussians, sample_scene, step_fields
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
@@ -280,12 +281,12 @@ class WithoutOpacities(Vanilla):
 
 
 def test_a_backbone_without_opacities_is_refused_with_the_reason(monkeypatch):
-    build = assembling.build
+    build = selecting.build
 
     def with_other_backbone(slot, name, options):
         return WithoutOpacities() if slot is Backbone else build(slot, name, options)
 
-    monkeypatch.setattr(assembling, "build", with_other_backbone)
+    monkeypatch.setattr(selecting, "build", with_other_backbone)
     with pytest.raises(IncompatibleSelectionError, match="cannot work together") as refused:
         setup_of()
     assert "densifier mcmc edits the tensors opacities" in refused.value.found

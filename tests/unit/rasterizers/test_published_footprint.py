@@ -12,7 +12,7 @@ from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
 from crossgrad_plugins.rasterizers.reference.projection import project
 
@@ -131,7 +131,7 @@ def test_what_is_too_faint_to_draw_counts_as_seen(name):
 def options_of(**settings):
     scene = replace(sample_scene(), similarity=replace(sample_scene().similarity, scale=0.01))
     config = RunConfig.model_validate({"steps": 5, **settings})
-    selection, _ = assembling.select(config, scene, "none")
+    selection, _ = selecting.select(config, scene, "none")
     return selection.rasterizer
 
 
@@ -155,7 +155,7 @@ def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
         def render(self, gaussians, camera, background, outputs=frozenset()):
             raise NotImplementedError
 
-    monkeypatch.setattr(assembling, "load", lambda slot, name: Common)
+    monkeypatch.setattr(selecting, "load", lambda slot, name: Common)
     with pytest.raises(UserError) as caught:
         options_of(preset="inria")
     assert "footprint of the original code" in str(caught.value)

@@ -16,6 +16,7 @@ from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
@@ -66,7 +67,7 @@ class Analytic(Vanilla):
 @pytest.fixture
 def assembled(monkeypatch):
     own = {"numbered": Numbered, "reversing": Reversing, "plain": Plain, "an": Analytic}
-    built = assembling.build
+    built = selecting.build
 
     def build_own(slot, name, options):
         return own[name](**options) if name in own else built(slot, name, options)
@@ -75,7 +76,7 @@ def assembled(monkeypatch):
         chosen = {name: ComponentChoice(name=value) for name, value in settings.items()}
         return assembling.assemble(RunConfig(steps=10, **chosen), sample_scene(), "none")
 
-    monkeypatch.setattr(assembling, "build", build_own)
+    monkeypatch.setattr(selecting, "build", build_own)
     return make
 
 

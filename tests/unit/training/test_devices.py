@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.assemble import choose_device
+from crossgrad_core.run.devices import choose_device
 
 
 @pytest.fixture

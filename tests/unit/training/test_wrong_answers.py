@@ -18,7 +18,7 @@ from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
-from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import select as selecting
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import photo_parameters, regrouping, room, start, steady
@@ -87,12 +87,12 @@ def test_what_a_backbone_decodes_are_gaussians(answer):
     ],
 )
 def test_what_is_fitted_to_the_scene_is_of_its_kind(monkeypatch, base, slot, name, answer):
-    original, wrong = assembling._built, of_slot(slot, name, "fitted_to", answer)
+    original, wrong = selecting._built, of_slot(slot, name, "fitted_to", answer)
 
     def built(kind, choice):
         return wrong if kind is base else original(kind, choice)
 
-    monkeypatch.setattr(assembling, "_built", built)
+    monkeypatch.setattr(selecting, "_built", built)
     with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
         assemble(RunConfig(steps=10), sample_scene(), "none")
 

@@ -1,0 +1,211 @@
+"""The components of a run: those it names and the usual ones, fitted to its scene."""
+
+from typing import Any, TypeVar
+
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.component import Component, answered, pair
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.exposure import Exposure, Fitted
+from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.loss import Loss
+from crossgrad_core.contract.metric import Metric
+from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.poses import is_in_image
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.selection import Selection
+from crossgrad_core.contract.start import Start
+from crossgrad_core.defaults import BARE_START, METRICS, START, START_ALONE
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build, load
+from crossgrad_core.run.devices import choose_device
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.results.metrics_csv import columns_for
+from crossgrad_core.run.usual_resolution import usual_resolution
+from crossgrad_core.run.usual_views import operator_of, usual_views
+from crossgrad_core.wording import listed
+
+#: The base class of a slot.
+C = TypeVar("C", bound=Component)
+
+
+def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
+    """The components, loaded and fitted to the scene, and notes on what was chosen or left out.
+
+    Raises:
+        UserError: A name or option is wrong.
+    """
+    start_choice = _or_default(config.start, _usual_start(config))
+    start = _built(Start, start_choice)
+    _require_points(config, scene, start)
+    _require_shown_points(config, scene, start)
+    device = choose_device(config.device)
+    notes: list[str] = list(scene.notes)
+    sampler = _built(Sampler, config.sampler)
+    operator, operator_name = operator_of(config)
+    backbone = _built(Backbone, config.backbone)
+    fitting = backbone.fitted_to(scene)
+    backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
+    notes += left_out
+    densifier_choice = _or_default(config.densifier, backbone.default_densifier)
+    densifier = _built(Densifier, densifier_choice)
+    wanted = Wanted(
+        device=device.type,
+        response=backbone.response,
+        outputs=densifier.needs,
+        options=frozenset({"footprint"} if config.preset == "inria" else ()),
+    )
+    rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
+    notes += choosing
+    options = _rasterizer_options(config, scene, rasterizer_name)
+    rasterizer = build(Rasterizer, rasterizer_name, options)
+    views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
+    usual = usual_resolution(config, views, backbone, densifier, device.type)
+    resolution_choice = _or_default(config.resolution, usual)
+    grouping_choice = _grouping_choice(config, sampler, operator, notes)
+    exposure = _built(Exposure, config.exposure)
+    fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
+    notes += fitted.notes
+    names = {
+        "backbone": config.backbone.name,
+        "sampler": config.sampler.name,
+        "operator": operator_name,
+        "densifier": densifier_choice.name,
+        "rasterizer": rasterizer_name,
+        "loss": config.loss.name,
+        "exposure": fitted.name or config.exposure.name,
+        "start": start_choice.name,
+        "resolution": resolution_choice.name,
+        "exporter": config.exporter.name,
+        "reader": reader,
+    }
+    grouping = None
+    if grouping_choice is not None:
+        grouping = _built(Grouping, grouping_choice)
+        names["grouping"] = grouping_choice.name
+    selection = Selection(
+        backbone=backbone,
+        sampler=sampler,
+        operator=operator,
+        densifier=densifier,
+        rasterizer=rasterizer,
+        loss=_built(Loss, config.loss),
+        exposure=fitted.exposure,
+        start=start,
+        resolution=_built(Resolution, resolution_choice).fitted_to(scene),
+        exporter=_built(Exporter, config.exporter),
+        metrics=_metrics(config, scene, notes),
+        names=names,
+        views_per_step=max(views.counts),
+        device=device.type,
+        grouping=grouping,
+        view_plan=views,
+    )
+    return selection, notes
+
+
+def _usual_start(config: RunConfig) -> str:
+    """The start of a run that names none."""
+    bare = config.preset == "inria" or config.reading.init != "points"
+    return BARE_START if bare else START
+
+
+def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
+    if not len(scene.points) and config.reading.init == "points" and not start.alone:
+        raise UserError(
+            "the scene has no SfM points to start from",
+            where=config.scene or scene.name,
+            todo=f"find some in the photos (--start {START_ALONE}), or start from random ones "
+            "(--init random) or from those of a file (--init FILE.ply)",
+        )
+
+
+def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None:
+    if not len(scene.points) or config.reading.init != "points" or start.alone:
+        return
+    if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
+        raise UserError(
+            "no training photo shows any of the scene's points: there is nothing to train",
+            where=config.scene or scene.name,
+            expected="points and cameras in one frame, with the cameras looking at the points",
+            found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
+            todo=f"mend the model, or find points in the photos (--start {START_ALONE})",
+        )
+
+
+def _built(slot: type[C], choice: ComponentChoice) -> C:
+    return build(slot, choice.name, choice.options)
+
+
+def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:
+    """The metrics by name; of those by default only what gives each column a name of its own.
+
+    Raises:
+        UserError: Two columns of metrics.csv would have one name.
+    """
+    metrics: dict[str, Metric] = {}
+    regimes = sorted({view.regime for view in scene.test_views})
+    for name, choice in {each.name: each for each in config.metrics}.items():
+        metric = _built(Metric, choice)
+        columns = columns_for(regimes, [each.figure for each in (*metrics.values(), metric)])
+        twice = sorted({each for each in columns if columns.count(each) > 1})
+        if not twice:
+            metrics[name] = metric
+        elif name in METRICS.split("+"):
+            notes.append(f"metric {name} is left out: metrics.csv has a column {listed(twice)}")
+        else:
+            raise UserError(
+                f"two columns of metrics.csv would be called {listed(twice)}",
+                where=f"metrics {listed((*metrics, name))}; regimes {listed(regimes)}",
+                expected="figures whose names are no other's, nor those of another one in a regime",
+                todo=f"leave metric {name} out, or rename the folder of photos",
+            )
+    return metrics
+
+
+def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
+    """The choice, where its name is left open with the default one."""
+    if choice is None:
+        return ComponentChoice(name=name)
+    return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
+
+
+def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:
+    options = dict(config.rasterizer.options)
+    if config.preset == "inria":
+        if "footprint" not in load("rasterizers", name).model_fields:
+            raise UserError(
+                f"rasterizer {name} does not have the footprint of the original code",
+                where="--preset inria",
+                expected="a rasterizer with the option footprint",
+                todo="leave --rasterizer out: auto takes one that has it; or leave the preset out",
+            )
+        options.setdefault("footprint", "3-sigma")
+        # The published near plane is 0.2 units of the input frame.
+        options.setdefault("near", 0.2 * scene.similarity.scale)
+    return options
+
+
+def _grouping_choice(
+    config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]
+) -> ComponentChoice | None:
+    if config.grouping is not None and config.grouping.name != AUTO:
+        return config.grouping
+    # Labels that the sampler makes up leave a grouping nothing to do.
+    of_operator = None if sampler.own_labels else operator.usual_grouping
+    name = sampler.default_grouping or of_operator
+    if name is not None:
+        return _or_default(config.grouping, name)
+    if config.grouping is not None:
+        raise UserError(
+            "neither the sampler nor the operator uses a grouping that could have options",
+            where="grouping",
+            todo="name the grouping with --grouping, or leave its options out",
+        )
+    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
+    return None
