@@ -43,7 +43,7 @@ class WithPlugins(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            error.message = _plain(error.message)
+            error.message = _plain(error)
             raise
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
@@ -54,10 +54,17 @@ class WithPlugins(TyperGroup):
             self.commands.setdefault(name, PluginCommand(entry))
 
 
-def _plain(message: str) -> str:
-    """What is wrong with a value, without the words of the library that found it."""
-    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
-    return message.partition(", unable to parse")[0]
+def _plain(error: typer.BadParameter) -> str:
+    """What is wrong with a value, and which one, without the words of the library that found it."""
+    from pydantic import ValidationError
+
+    message = error.message.removeprefix("Value error, ").replace("Input should be", "must be")
+    message = message.partition(", unable to parse")[0]
+    cause = error.__cause__
+    if not isinstance(cause, ValidationError):
+        return message
+    found = cause.errors()[0]["input"]
+    return message if repr(found) in message else f"{message}; found {found!r}"
 
 
 class PluginCommand(TyperCommand):

@@ -312,4 +312,5 @@ def test_a_bad_value_is_told_without_the_words_of_a_library(ran):
         code, _, err = ran(*given)
         assert code == 2
         assert given[-2] in err
+        assert repr(given[-1]) in err
         assert not any(words in err for words in ("Input should", "Value error", "parse string"))
