@@ -5,7 +5,8 @@ r"""The end of runs of so many seconds, by the code of several commits, in turns
         --seconds 5 10 20 30:10 70:23.3 140:46.7 --seeds 1 2 3 4 5 6
     python benchmarks/time_to_quality.py table OUT
 
-`30:10` gives the first code 30 and the second one 10 seconds. Files of both are drawn on the views
+`30:10` gives the first code 30 and the second one 10 seconds; `--steps` instead of `--seconds` ends
+runs after so many steps, on a machine that others use, too. Files of both are drawn on the views
 that the last code held out, which the first one has to hold out, too. Runs have 400 px, or as many
 as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of
 a pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
@@ -24,6 +25,7 @@ import csv
 import json
 import math
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -81,17 +83,18 @@ def run(given: argparse.Namespace) -> None:
             code.train(given.scene[0], warm, *kind, "--steps", "700")
     for seed, scene, lengths in _cases(given):
         folders = {
-            code: given.out / f"{scene.name}-{lengths.replace(':', '_')}-{code.name}-{seed}"
+            code: given.out / f"{scene.name}-{re.sub('[: ]', '_', lengths)}-{code.name}-{seed}"
             for code in codes
         }
         if all((folder / "row.json").exists() for folder in folders.values()):
             continue
-        each = lengths.split(":")
+        numbers, _, unit = lengths.partition(" ")
+        each, option = numbers.split(":"), f"--{unit or 'seconds'}"
         pairs = [(code, each[n % len(each)]) for n, code in enumerate(codes)]
-        for code, seconds in pairs if seed % 2 else reversed(pairs):
+        for code, length in pairs if seed % 2 else reversed(pairs):
             if not _finished(folders[code]):
                 shutil.rmtree(folders[code], ignore_errors=True)
-                code.train(scene, folders[code], *kind, "--seconds", seconds, "--seed", str(seed))
+                code.train(scene, folders[code], *kind, option, length, "--seed", str(seed))
         for code, folder in folders.items():
             row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
             # By the slow renderer only where photos are small.
@@ -114,7 +117,7 @@ def _held_out(folder: Path) -> set[str]:
 def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
     for seed in given.seeds:
         for scene in given.scene:
-            for lengths in given.seconds:
+            for lengths in (*given.seconds, *(f"{each} steps" for each in given.steps)):
                 yield seed, scene, lengths
 
 
@@ -158,7 +161,7 @@ def table(given: argparse.Namespace) -> None:
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
         by_case[row["scene"], row["lengths"]].setdefault(row["code"], {})[row["seed"]] = row
-    cases = sorted(by_case.items(), key=lambda case: (case[0][0], float(case[0][1].split(":")[0])))
+    cases = sorted(by_case.items(), key=lambda case: (case[0][0], _first(case[0][1])))
     titles = "scene | code | commit | training s | seeds | PLY, dB | viewer.py, dB | steps"
     print(f"| {titles} | Gaussians |\n{'|---' * 9}|")
     for (scene, _), codes in cases:
@@ -190,7 +193,7 @@ def _print_gains(
         for lengths, by_scene in gains.items()
         for scene, own in by_scene.items()
     ]
-    titles = f"scene | seconds | {code} - old, dB | 95 % | 90 % | pairs | verdict"
+    titles = f"scene | length | {code} - old, dB | 95 % | 90 % | pairs | verdict"
     print(f"\n| {titles} |\n{'|---' * 7}|")
     for (*what, each), verdict in zip(found, verdicts([e for *_, e in found]), strict=True):
         print(f"| {' | '.join([*what, *_gain(each), verdict.value])} |")
@@ -228,6 +231,11 @@ def share(given: argparse.Namespace) -> None:
         print(f"| {' | '.join(cells)} |")
 
 
+def _first(lengths: str) -> float:
+    """How long the first code ran."""
+    return float(lengths.partition(" ")[0].split(":")[0])
+
+
 def _cells(own: list[Row]) -> Iterator[str]:
     yield ", ".join(sorted({row["commit"] for row in own}))
     yield f"{fmean(row['seconds'] for row in own):.1f}"
@@ -249,7 +257,8 @@ def main() -> None:
     runs.add_argument("out", type=Path)
     runs.add_argument("--code", action="append", required=True, metavar="NAME=CROSSGRAD [OPTIONS]")
     runs.add_argument("--scene", action="append", type=Path, required=True)
-    runs.add_argument("--seconds", nargs="+", required=True, metavar="S[:S]")
+    runs.add_argument("--seconds", nargs="+", default=[], metavar="S[:S]")
+    runs.add_argument("--steps", nargs="+", default=[], metavar="N[:N]")
     runs.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5, 6])
     runs.add_argument("--core", nargs="+", type=int, default=[0])
     runs.add_argument("--max-size", type=int, default=400, metavar="PIXELS")
