@@ -40,7 +40,7 @@ from crossgrad_core.commands import assemble, begin, configured, read_scene
 from crossgrad_core.run.results.reading import read_run
 from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.views import target_at
+from crossgrad_core.training.targets import target_at
 
 if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup

@@ -22,7 +22,7 @@ from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import shown
-from crossgrad_core.training.views import eval_background
+from crossgrad_core.training.targets import eval_background
 
 
 @dataclass(frozen=True)

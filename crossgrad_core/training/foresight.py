@@ -11,7 +11,7 @@ from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import sample_context
-from crossgrad_core.training.views import photo_camera
+from crossgrad_core.training.targets import photo_camera
 
 #: Views, or where they are more those of two steps, that are foreseen.
 _VIEWS, _STEPS = 8, 2

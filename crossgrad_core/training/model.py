@@ -8,7 +8,7 @@ from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.rates import rule_at
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import eval_background
+from crossgrad_core.training.targets import eval_background
 
 
 def model_of(setup: Setup, state: TrainState) -> Model:

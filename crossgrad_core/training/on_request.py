@@ -10,7 +10,7 @@ from crossgrad_core.training.interlaced import as_in_full
 from crossgrad_core.training.photo_parameters import exposed
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.views import eval_background, target_at, weights_of
+from crossgrad_core.training.targets import eval_background, target_at, weights_of
 
 
 @dataclass(frozen=True, eq=False)

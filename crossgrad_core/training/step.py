@@ -35,19 +35,13 @@ from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
+from crossgrad_core.training.regularize import TensorGradients, add_regularization, joined
 from crossgrad_core.training.room import room_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import follow, restart
-from crossgrad_core.training.views import (
-    Rendered,
-    TensorGradients,
-    add_regularization,
-    context_fields,
-    joined,
-    render_views,
-    scales_of,
-)
+from crossgrad_core.training.targets import context_fields
+from crossgrad_core.training.views import Rendered, render_views, scales_of
 from crossgrad_core.wording import listed
 
 

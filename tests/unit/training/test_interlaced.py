@@ -28,7 +28,7 @@ from crossgrad_core.training.interlaced import (
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.on_request import OnRequest
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.views import target_at
+from crossgrad_core.training.targets import target_at
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 CORNERS = [(2, 0, 0), (2, 1, 0), (2, 0, 1), (2, 1, 1), (3, 2, 1), (4, 3, 3), (5, 1, 4)]

@@ -16,7 +16,7 @@ from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 from crossgrad_core.testing.contract import admitted
 from crossgrad_core.training.operator_scale import OperatorScale, Scale, neutral
-from crossgrad_core.training.views import joined
+from crossgrad_core.training.regularize import joined
 
 TENSORS = ("means", "f_dc", "net.weight", "net.bias")
 #: methods.md 8 and 11.11.
