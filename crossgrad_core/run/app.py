@@ -331,10 +331,12 @@ def resumed(
                 found=f"all {total} steps done",
                 todo="start a new run; --init point_cloud.ply starts from its Gaussians",
             )
-        stop = setup.config.stop_after
-        if stop is not None and stop <= step:
+        stop, follows_clock = setup.config.stop_after, setup.config.planned_seconds is not None
+        if stop is not None and (stop <= step or (stop > total and not follows_clock)):
             raise UserError(
-                "the run is past the step at which it is to stop",
+                "the run is past the step at which it is to stop"
+                if stop <= step
+                else "the run ends before the step at which it is to stop",
                 where="--stop-after",
                 expected=f"a step from {step + 1} to {total}",
                 found=str(stop),

@@ -14,7 +14,7 @@ def check_clock(config: RunConfig) -> None:
     """
     if config.seconds is None or config.clock == "wall":
         return
-    if config.device != "cpu":
+    if torch.device(config.device).type != "cpu":
         raise UserError(
             "CPU time does not tell what a GPU does",
             where="--clock cpu",

@@ -28,7 +28,7 @@ from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_resolution import usual_resolution
 from crossgrad_core.run.usual_views import operator_of, usual_views
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, singular
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
@@ -40,8 +40,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    start_choice = _or_default(config.start, _usual_start(config))
-    start = _built(Start, start_choice)
+    start, start_name = _named_or(_usual_start(config), Start, config.start)
     _require_points(config, scene, start)
     _require_shown_points(config, scene, start)
     device = choose_device(config.device)
@@ -52,8 +51,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     fitting = backbone.fitted_to(scene)
     backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
-    densifier_choice = _or_default(config.densifier, backbone.default_densifier)
-    densifier = _built(Densifier, densifier_choice)
+    usual_densifier = backbone.default_densifier
+    densifier, densifier_name = _named_or(usual_densifier, Densifier, config.densifier)
     wanted = Wanted(
         device=device.type,
         response=backbone.response,
@@ -66,7 +65,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     rasterizer = build(Rasterizer, rasterizer_name, options)
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
     usual = usual_resolution(config, views, backbone, densifier, device.type)
-    resolution_choice = _or_default(config.resolution, usual)
+    resolution, resolution_name = _named_or(usual, Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
     exposure = _built(Exposure, config.exposure)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
@@ -75,12 +74,12 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "backbone": config.backbone.name,
         "sampler": config.sampler.name,
         "operator": operator_name,
-        "densifier": densifier_choice.name,
+        "densifier": densifier_name,
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
         "exposure": fitted.name or config.exposure.name,
-        "start": start_choice.name,
-        "resolution": resolution_choice.name,
+        "start": start_name,
+        "resolution": resolution_name,
         "exporter": config.exporter.name,
         "reader": reader,
     }
@@ -97,7 +96,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         loss=_built(Loss, config.loss),
         exposure=fitted.exposure,
         start=start,
-        resolution=_built(Resolution, resolution_choice).fitted_to(scene),
+        resolution=resolution.fitted_to(scene),
         exporter=_built(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
         names=names,
@@ -140,6 +139,29 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None
 
 def _built(slot: type[C], choice: ComponentChoice) -> C:
     return build(slot, choice.name, choice.options)
+
+
+def _named_or(usual: str, slot: type[C], choice: ComponentChoice | None) -> tuple[C, str]:
+    """The component that is named, else the usual one with the options that are given; its name.
+
+    Raises:
+        UserError: An option is wrong; where the component was not named, it says how to name one.
+    """
+    if choice is not None and choice.name != AUTO:
+        return _built(slot, choice), choice.name
+    try:
+        return _built(slot, _or_default(choice, usual)), usual
+    except UserError as error:
+        todo = (
+            f"{usual} is what this run takes by itself: --{singular(slot.slot)} NAME takes another"
+        )
+        raise UserError(
+            error.what,
+            where=error.where,
+            expected=error.expected,
+            found=error.found,
+            todo=f"{error.todo}; {todo}",
+        ) from error
 
 
 def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:

@@ -106,9 +106,11 @@ def _overlaid(
     assigned: Sequence[tuple[tuple[str, ...], object]],
 ) -> Settings:
     """The settings with those that were given later."""
-    if any(path in LENGTHS for path in (*chosen, *(path for path, _ in assigned))):
-        # A new length replaces the earlier one as a whole.
-        settings = {key: value for key, value in settings.items() if (key,) not in LENGTHS}
+    lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
+    if lengths:
+        # A new length replaces the earlier one as a whole, and with seconds go those of the CPU.
+        gone = {*LENGTHS, *(() if ("seconds",) in lengths else [("clock",)])}
+        settings = {key: value for key, value in settings.items() if (key,) not in gone}
     # Names first: choosing another component drops the options of the one it replaces.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):

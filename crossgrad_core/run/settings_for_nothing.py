@@ -144,6 +144,10 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
         yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not in seconds; add --seconds"
+    stop, total = config.stop_after, setup.schedule.total
+    # A run within a budget may become longer.
+    if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
+        yield "stop_after", f"the run ends after step {total}"
     if config.fewest_edits and not setup.schedule.fewest_edits:
         why = "are published or have times that were set are not made to fit"
         yield "fewest_edits", f"edits that count steps, {why}"

@@ -16,7 +16,8 @@ def usual_resolution(
 
     Published schedules, and runs as long as the published ones, have all pixels. So have anchors
     and filters, of which nothing is measured, and growth that no budget leads: of fewer pixels the
-    norms of gradients are larger. A run within seconds counts as short: its length is not known.
+    norms of gradients are larger, which only growth reads. A run within seconds counts as short:
+    its length is not known.
 
     Args:
         config: The configuration.
@@ -28,6 +29,6 @@ def usual_resolution(
     published = config.preset == "inria" or is_published(config.schedule, config.reference)
     steps = config.steps if config.max_views is None else views.steps_of(config.max_views)
     short = config.seconds is not None or (steps or REFERENCE) < REFERENCE
-    led = growth_by(config, budgeted=densifier.budgeted) == "curve"
+    led = not densifier.edits or growth_by(config, budgeted=densifier.budgeted) == "curve"
     suits = led and bool(backbone.axes) and backbone.response == "plain" and device == "cpu"
     return SHORT_RESOLUTION if short and suits and not published else RESOLUTION

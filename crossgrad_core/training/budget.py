@@ -34,8 +34,9 @@ _TRIES = 8
 LOOK_SHARE = 0.02
 #: A length that is off by a smaller share of what is left stays.
 TOLERANCE = 0.02
-#: A step that no run reaches.
+#: A step that no run reaches, and one before it from which on photos have their full size.
 _NEVER = 10**9
+_FULL_SIZE = _NEVER - _NEVER // 100
 #: Share of the newest stretch in the smoothed cost of a step. Views differ, and other programs
 #: come and go.
 SMOOTHING = 0.25
@@ -51,24 +52,32 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     """
     _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
-    state = first_state(unwatched(setup))
-    pace, share = probed.schedule.pace, setup.pixel_share
+    state, pace, measured = first_state(unwatched(setup)), setup.schedule.pace, setup
+    state.step = _FULL_SIZE
     steps, each = _probed(probed, state, seconds)
-    note = f"{steps} probed steps took {each * pace.at(1) * 1000:.1f} ms each"
-    pixels = setup.selection.resolution.pixels(probed.schedule, 1) / pace.at(1)
+    note = f"{steps} probed steps took {each * pace.at(_FULL_SIZE) * 1000:.1f} ms each"
+    crowd = Crowd.of(setup, state)
+
+    def fitting() -> int:
+        return _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
+
+    # How many pixels the first steps draw may depend on the length.
+    first = _without_edits(schedule_for(setup, fits := fitting()), fits)
+    pixels = setup.selection.resolution.pixels(first, 1) / first.pace.at(1)
     if pixels < 1.0:
-        first, state.step = each, _NEVER - _NEVER // 100
-        steps, each = _probed(probed, state, seconds)
-        note += f", {steps} at full size {each * pace.at(_NEVER) * 1000:.1f} ms"
-        share = min(1.0, max(0.0, (1.0 - first / each) / (1.0 - pixels)))
-    measured, crowd = replace(setup, pixel_share=share), Crowd.of(setup, state)
-    fits = _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
+        del state  # Its views remember the scale that they have reached.
+        state = first_state(unwatched(setup))
+        steps, small = _probed(replace(probed, schedule=first), state, seconds)
+        note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"
+        share = min(1.0, max(0.0, (1.0 - small / each) / (1.0 - pixels)))
+        measured = replace(setup, pixel_share=share)
+        fits = fitting()
     total = min(fits, most_steps(setup))
     if total < fits:
         note += f", of which {fits} fit into that time; the bound on views allows {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
-    return total, f"{text}the length follows the clock as the run goes", share
+    return total, f"{text}the length follows the clock as the run goes", measured.pixel_share
 
 
 def most_steps(setup: Setup) -> int:
@@ -78,26 +87,29 @@ def most_steps(setup: Setup) -> int:
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
-    """Steps that were taken on from a state, and the training seconds of a view in them.
+    """How often the step after a state's was taken, and the training seconds of a view in it.
 
     Where a kernel had to be compiled, what was measured before and with it is left out, a few times
     at most: some plugin may compile in every step.
     """
+    kind, step, compiled, tries = setup.config.clock, state.step, False, _TRIES
     timed_step(setup, state)
-    kind, pace, compiled, tries = setup.config.clock, setup.schedule.pace, False, _TRIES
 
     def begin_again(**_: bool) -> None:
         nonlocal compiled
         compiled = True
 
-    start, first, taken = state.clock.copy(), state.step, 0.0
+    start, count, taken = state.clock.copy(), 0, 0.0
     with told_of_missing(begin_again):
-        while state.step - first < PROBE_STEPS or taken < PROBE_SHARE * seconds:
+        while count < PROBE_STEPS or taken < PROBE_SHARE * seconds:
+            # Always the same one, so that views keep their scale.
+            state.step = step
             timed_step(setup, state)
+            count += 1
             if compiled and tries:
-                start, first, compiled, tries = state.clock.copy(), state.step, False, tries - 1
+                start, count, compiled, tries = state.clock.copy(), 0, False, tries - 1
             taken = state.clock.trained(kind) - start.trained(kind)
-    return state.step - first, taken / (pace.views(state.step) - pace.views(first))
+    return count, taken / (count * setup.schedule.pace.at(step + 1))
 
 
 class Length(Protocol):
@@ -239,11 +251,11 @@ def _told(before: Setup, after: Setup) -> Setup:
     return after
 
 
-def _without_edits(schedule: Schedule) -> Schedule:
+def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
     """A schedule whose steps cost what most do: statistics, all SH bands and levels, no edits."""
     return replace(
         schedule,
-        total=_NEVER,
+        total=total,
         sh_interval=1,
         coarse_until=0,
         densify_from=0,

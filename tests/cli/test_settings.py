@@ -52,6 +52,24 @@ def test_options_win_over_the_file_and_assignments_over_both(config):
 
 
 @pytest.mark.parametrize(
+    ("options", "assignments", "clock"),
+    [
+        ({"steps": 5}, [], None),
+        ({}, ["max_views=5"], None),
+        ({"steps": 5, "clock": "cpu"}, [], "cpu"),
+        ({"seconds": 5.0}, [], "cpu"),
+        ({"seed": 5}, [], "cpu"),
+    ],
+)
+def test_seconds_that_are_replaced_take_their_clock_with_them(
+    tmp_path, options, assignments, clock
+):
+    path = tmp_path / "config.yaml"
+    path.write_text("seconds: 3.0\nclock: cpu\n")
+    assert merged(path, options, assignments).get("clock") == clock
+
+
+@pytest.mark.parametrize(
     ("options", "assignments"), [({"seconds": 5.0}, []), ({}, ["seconds=5.0"])]
 )
 def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):

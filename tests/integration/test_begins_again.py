@@ -67,8 +67,8 @@ def test_a_run_that_was_killed_before_its_table(whole, killed):
     assert measured(killed) == measured(whole)[:1]
 
 
-@pytest.mark.parametrize("stop", [1, 2])
-def test_a_step_to_stop_at_that_is_past_is_refused(killed, stop):
+@pytest.mark.parametrize("stop", [1, 2, 10_000])
+def test_a_step_to_stop_at_that_is_past_or_never_comes_is_refused(killed, stop):
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
     before = (killed / "log.txt").read_bytes()
     with pytest.raises(UserError, match=r"a step from 3 to (.|\n)*found: +" + str(stop)):

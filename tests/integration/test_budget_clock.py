@@ -77,7 +77,11 @@ def test_cpu_time_that_is_no_work_is_refused(settings, threads, why, monkeypatch
 
 @pytest.mark.parametrize(
     ("settings", "threads"),
-    [({"seconds": 1.0, "clock": "cpu"}, 1), ({"seconds": 1.0}, 2)],
+    [
+        ({"seconds": 1.0, "clock": "cpu"}, 1),
+        ({"seconds": 1.0, "clock": "cpu", "device": "cpu:0"}, 1),
+        ({"seconds": 1.0}, 2),
+    ],
 )
 def test_other_budgets_may_have_threads(settings, threads, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)

@@ -42,10 +42,10 @@ class Interlaced(CoarseToFine):
 
     @override
     def fitted_to(self, scene: Scene) -> "Interlaced":
-        if self.coarsest is not None:
-            return self
-        most = median(self._most(view.camera) for view in scene.train_views)
-        return self.model_copy(update={"coarsest": max(n for n in (1, 2, 4, 8) if n <= most)})
+        most = [self._most(view.camera) for view in scene.train_views]
+        # An n that somebody names is that of the photos that are large enough for it.
+        n = median(most) if self.coarsest is None else min(self.coarsest, max(most))
+        return self.model_copy(update={"coarsest": max(each for each in (1, 2, 4, 8) if each <= n)})
 
     @override
     def window(self, schedule: Schedule) -> float:
@@ -67,8 +67,15 @@ class Interlaced(CoarseToFine):
         stages = zip(part.course.ends, part.course.scales, strict=True)
         ends = [(schedule.step_of(ceil(end * window)), round(1.0 / scale)) for end, scale in stages]
         told = [f"of each {n} x {n} to step {end}" for end, n in ends]
-        if not told or not window:
-            return ()
+        if not told:
+            return (
+                f"resolution: all pixels from the start, as photos have fewer than "
+                f"{4 * self.least:,} or a side shorter than {2 * self.smallest} "
+                "(--set resolution.least=N)",
+            )
+        if not window:
+            why = "this share of the run is 0" if self.until == 0 else "the run is a long one"
+            return (f"resolution: all pixels from the start: {why} (--set resolution.until=SHARE)",)
         return (
             f"resolution: one pixel {listed(told)}, in each step another one; then all "
             "(--resolution full: from the start)",

@@ -163,11 +163,10 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
         (scale,), state = resolution.scales(context, state)
         found.append(scale)
     assert found == [scale for count, scale in scales for _ in range(count)]
-    remarks = resolution.remarks(schedule)
+    (remark,) = resolution.remarks(schedule)
     if note is None:
-        assert remarks == ()
+        assert "all pixels from the start, as photos have fewer than 240,000 or" in remark
     else:
-        (remark,) = remarks
         assert f"one pixel of each {note}, in each step another one; then all" in remark
     pixels = sum(count * scale**2 for count, scale in scales)
     assert resolution.pixels(schedule, 200) == pytest.approx(pixels)
@@ -182,7 +181,8 @@ def test_longer_runs_have_all_pixels_sooner(steps, share):
     schedule = Schedule.for_run(steps)
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
     assert resolution.pixels(schedule, steps) == pytest.approx((1 - 0.75 * share) * steps, rel=1e-3)
-    assert bool(resolution.remarks(schedule)) == (steps < 30_000)
+    (remark,) = resolution.remarks(schedule)
+    assert ("all pixels from the start: the run is a long one" in remark) == (steps >= 30_000)
     assert build("resolutions", "interlaced", {"until": 0.5}).window(schedule) == 0.5 * steps
 
 
@@ -203,7 +203,7 @@ USUAL = {
     "of another length": ({"schedule": "absolute", "reference": 2000}, "interlaced"),
     "free growth": ({"growth": "free"}, "full"),
     "a bound": ({"max_gaussians": 500}, "full"),
-    "no growth": ({"densifier": {"name": "none"}}, "full"),
+    "no growth": ({"densifier": {"name": "none"}}, "interlaced"),
     "anchors": ({"backbone": {"name": "scaffold"}}, "full"),
     "a filter": ({"backbone": {"name": "mip"}}, "full"),
     "means over pixels": ({"backbone": {"name": "analytic"}}, "full"),
@@ -218,6 +218,21 @@ def test_some_pixels_first_is_for_short_runs_of_plain_gaussians(case):
     given = {"steps": 2000, **settings}
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
     assert setup.selection.names["resolution"] == expected
+
+
+@pytest.mark.parametrize(("asked", "coarsest"), [(1, 1), (2, 2), (4, 4), (8, 4)])
+def test_an_n_that_is_named_is_that_of_photos_that_are_large_enough(asked, coarsest):
+    scene = scene_of(400, 298)
+    large = replace(scene.views[0], camera=scene.views[0].camera.resized(1600, 1200))
+    scene = replace(scene, views=(large, *scene.views[1:]), train=(0, 1, 2))
+    resolution = build("resolutions", "interlaced", {"coarsest": asked}).fitted_to(scene)
+    assert resolution.coarsest == coarsest
+    assert resolution.fitted_to(scene).coarsest == coarsest
+
+
+def test_a_run_without_a_stage_says_that_a_share_of_zero_was_asked_for():
+    resolution = build("resolutions", "interlaced", {"coarsest": 2, "until": 0.0})
+    assert "this share of the run is 0" in resolution.remarks(Schedule.for_run(100))[0]
 
 
 def test_runs_of_before_go_on_with_all_pixels():
