@@ -209,6 +209,9 @@ class RunConfig(BaseModel):
         description="Multiplies all learning rates of the backbone. Default: 1 from 30,000 steps "
         "on and with --preset inria, more in shorter runs.",
     )
+    beta1: float | None = Field(
+        None, ge=0, lt=1, description="decay of Adam's first moment; by the length of the run"
+    )
     beta2: float | None = Field(
         None,
         ge=0.9,

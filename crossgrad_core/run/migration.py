@@ -58,6 +58,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         # and ends as it did.
         rest.setdefault("events", "steps")
         rest.setdefault("rate_factor", 1.0)
+        rest.setdefault("beta1", 0.9)
         rest.setdefault("beta2", 0.999)
         rest.setdefault("position_steps", "extent")
         rest.setdefault("final_decay", 0.0)

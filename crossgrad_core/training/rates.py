@@ -1,6 +1,6 @@
 """The learning rates of a step and how Adam averages in it."""
 
-from math import sqrt
+from math import log, sqrt
 from typing import Final
 
 from crossgrad_core.config import RunConfig
@@ -28,6 +28,12 @@ HURRIED_MOST: Final = 6.3
 #: later ones, which they would hold back for the 1,000 steps of the published average.
 #: All measured by us (docs/schedules.md).
 MEMORY, LEAST_MEMORY = 1 / 50, 50
+
+#: The first moment averages over 3 steps, not 10, in runs of up to so many views; from there its
+#: decay rises with the logarithm of the length, to the published one at the published length. Views
+#: differ: what the last ten asked for is of other places, and steps that are large by then. Ours.
+SHORT_BETA1: Final = 0.7
+SHORT: Final = 3_000
 
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
@@ -67,16 +73,27 @@ def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float,
 
     Under the batch rule those for one view per step.
     """
-    first, second = BETAS
+    first, second = _first_beta(config, schedule), BETAS[1]
     if config.beta2 is not None:
         return first, config.beta2
     if not in_a_hurry(config, schedule, photos):
-        return BETAS
+        return first, second
     steps, memory = _planned(config, schedule), _memory(config, schedule)
     if config.batch_rule == "sqrt":
         # K times as fast with K views per step; the floor is one of steps all the same.
         memory *= schedule.pace.views(steps) / steps
     return first, min(second, 1.0 - 1.0 / memory)
+
+
+def _first_beta(config: RunConfig, schedule: Schedule) -> float:
+    """The decay of Adam's first moment."""
+    if config.beta1 is not None:
+        return config.beta1
+    if config.preset == "inria" or config.batch_rule == "sqrt":
+        return BETAS[0]
+    views = max(1, schedule.pace.views(_planned(config, schedule)))
+    short = log(REFERENCE / views) / log(REFERENCE / SHORT)
+    return BETAS[0] - (BETAS[0] - SHORT_BETA1) * min(1.0, max(0.0, short))
 
 
 def _length(schedule: Schedule) -> int:
@@ -105,6 +122,11 @@ def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, .
         ratio = f"({REFERENCE:,} / steps)"
         if config.rate_factor is None:
             notes.append(f"{published} {ratio}^{SHORTNESS}, at most {MOST}")
+        if config.beta1 is None and config.batch_rule == "none":
+            notes.append(
+                f"Adam's first moment: beta1 {SHORT_BETA1} where the steps draw up to {SHORT:,} "
+                f"views, {BETAS[0]} as published from {REFERENCE:,} on"
+            )
         if config.beta2 is None and photos:
             rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
             memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
@@ -116,6 +138,9 @@ def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, .
     factor = factor_of(config, schedule, photos)
     if config.rate_factor is None and factor != 1.0:
         notes.append(f"{published} {factor:.3g}")
+    first = _first_beta(config, schedule)
+    if config.beta1 is None and first != BETAS[0]:
+        notes.append(f"Adam's first moment: beta1 {first:.3g} (--set beta1={BETAS[0]} as published)")
     if in_a_hurry(config, schedule, photos):
         notes.append(_hurry_note(config, schedule))
     return tuple(notes)

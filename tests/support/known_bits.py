@@ -39,6 +39,7 @@ USUAL: Mapping[str, Any] = {
     "start": "sfm",
     "sampler": "random",
     "views": 2,
+    "beta1": 0.9,
     "beta2": 0.999,
     "floaters": "keep",
     "position_steps": "extent",
