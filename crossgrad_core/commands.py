@@ -17,6 +17,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
+from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import disk_errors, is_leftover, write_atomically
@@ -67,6 +68,7 @@ __all__ = [
     "FAILED",
     "GROUPS",
     "LISTS",
+    "LOCK",
     "OFFERED",
     "OWN_COMMANDS",
     "VERSION",

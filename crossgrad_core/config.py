@@ -53,7 +53,7 @@ class RunConfig(BaseModel):
         "scene.",
     )
     out: Annotated[Path | None, Flag("DIR", RESULTS)] = Field(
-        None, description="Output folder; it must not hold a run. Default: below runs/."
+        None, description="Output folder, a new or an empty one. Default: below runs/."
     )
 
     backbone: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
@@ -210,7 +210,7 @@ class RunConfig(BaseModel):
         "on and with --preset inria, more in shorter runs.",
     )
     beta1: float | None = Field(
-        None, ge=0, lt=1, description="decay of Adam's first moment; by the length of the run"
+        None, ge=0, lt=1, description="decay of Adam's first moment; less in shorter runs"
     )
     beta2: float | None = Field(
         None,

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.component import Component, answered
 from crossgrad_core.contract.scene import Scene
 
 
@@ -51,8 +51,11 @@ class Start(Component):
 
     def begun(self, scene: Scene) -> Scene:
         """The scene with the added points behind its own, whose indices stay what they are."""
-        more = self.more_points(scene)
-        if more is None or not len(more.positions):
+        answer = self.more_points(scene)
+        if answer is None:
+            return scene
+        more = answered(answer, MorePoints, self, "more_points")
+        if not len(more.positions):
             return scene
         unknown = np.full(len(scene.points), np.nan)
         return replace(

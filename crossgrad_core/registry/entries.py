@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
+from crossgrad_core.registry.signatures import wrong_signatures
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
@@ -129,7 +130,8 @@ def load(slot: "str | type[Component]", name: str) -> "type[Component]":
 
     Raises:
         UserError: The name is unknown or ambiguous, the plugin fails to import, or what it offers
-            is no complete subclass of the slot's base class.
+            is no complete subclass of the slot's base class, or has methods that take other
+            arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
@@ -296,6 +298,14 @@ def _checked(entry: Entry, found: object) -> "type[Component]":
     if isabstract(found):
         missing = sorted(getattr(found, "__abstractmethods__", ()))
         raise _wrong_kind(entry, base, f"{found.__name__} without the methods {listed(missing)}")
+    for name, expected, given in wrong_signatures(found, base):
+        raise UserError(
+            f"{word} {entry.name} has a method that takes other arguments",
+            where=sentences(entry.origin, defined_at(getattr(found, name))),
+            expected=f"{name}{expected}",
+            found=f"{name}{given}",
+            todo=f"repair or uninstall {entry.distribution}",
+        )
     return found
 
 

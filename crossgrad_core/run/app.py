@@ -329,7 +329,7 @@ def resumed(
                 "the run is finished",
                 where=folder,
                 found=f"all {total} steps done",
-                todo="start a new run; --init point_cloud.ply starts from its Gaussians",
+                todo=f"start a new run; --init {folder / files[1]} starts from its Gaussians",
             )
         stop, follows_clock = setup.config.stop_after, setup.config.planned_seconds is not None
         if stop is not None and (stop <= step or (stop > total and not follows_clock)):

@@ -96,8 +96,8 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
                 where=folder / CHECKPOINTS,
                 expected=f"step {step}, which the results in the folder are of",
                 found="none",
-                todo="its files are as they were, and --init point_cloud.ply starts from its "
-                "Gaussians; `crossgrad run --config FOLDER/config.yaml` repeats it elsewhere",
+                todo="its files are as they were, and --init with its point_cloud.ply starts from "
+                "its Gaussians; `crossgrad run --config FOLDER/config.yaml` repeats it elsewhere",
             )
 
 

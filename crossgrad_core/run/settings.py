@@ -108,8 +108,9 @@ def _overlaid(
     """The settings with those that were given later."""
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
     if lengths:
-        # A new length replaces the earlier one as a whole, and with seconds go those of the CPU.
-        gone = {*LENGTHS, *(() if ("seconds",) in lengths else [("clock",)])}
+        # A new length replaces the earlier one as a whole, where it was to stop on the way, and
+        # with seconds go those of the CPU.
+        gone = {*LENGTHS, ("stop_after",), *(() if ("seconds",) in lengths else [("clock",)])}
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
     # Names first: choosing another component drops the options of the one it replaces.
     for given in (list(chosen.items()), assigned):

@@ -41,7 +41,7 @@ def disk_full(path: Path, needed: int | None) -> UserError:
         where=path,
         expected=f"{size_text(needed)} free" if needed is not None else "",
         found=f"{size_text(free_bytes(path))} free",
-        todo="free some space, or choose another disk with --out",
+        todo="free some space, or choose another disk",
     )
 
 
@@ -51,7 +51,7 @@ def read_only(path: Path) -> UserError:
         "cannot write here",
         where=path,
         expected="a folder that you may write to",
-        todo="check its permissions, or choose another place with --out",
+        todo="check its permissions, or choose another place",
     )
 
 

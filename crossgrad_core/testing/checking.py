@@ -12,7 +12,7 @@ from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.commands import load_command
 from crossgrad_core.registry.places import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
-from crossgrad_core.wording import in_one_line, singular
+from crossgrad_core.wording import in_one_line, listed, singular
 
 #: `check(make)`, see `crossgrad_core.testing.contract`; of any slot.
 AnyCheck: TypeAlias = Callable[[Any], None]
@@ -52,7 +52,8 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
         where = raised_at(error, entry.package) or _announced_at(entry)
-        lost = Result("it can be loaded", failure=f"{error.found or error.what}", where=where)
+        told = [error.found or error.what, *([f"not {error.expected}"] if error.expected else [])]
+        lost = Result("it can be loaded", failure=listed(told), where=where)
         return [*names, lost]
     if entry.slot == COMMANDS:
         where, package = _announced_at(entry), entry.package

@@ -1,5 +1,6 @@
 """The learning rates of a step and how Adam averages in it."""
 
+from collections.abc import Iterator
 from math import log, sqrt
 from typing import Final
 
@@ -34,6 +35,8 @@ MEMORY, LEAST_MEMORY = 1 / 50, 50
 #: differ: what the last ten asked for is of other places, and steps that are large by then. Ours.
 SHORT_BETA1: Final = 0.7
 SHORT: Final = 3_000
+
+_RATES: Final = f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times"
 
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
@@ -115,35 +118,37 @@ def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, .
     """How rates and Adam differ from what is published, where the run asked for nothing."""
     if config.preset == "inria":
         return ()
-    notes = []
-    published = f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times"
     # The length of a run within a budget is not known yet.
     if config.seconds is not None and schedule.mode != "absolute":
-        ratio = f"({REFERENCE:,} / steps)"
-        if config.rate_factor is None:
-            notes.append(f"{published} {ratio}^{SHORTNESS}, at most {MOST}")
-        if config.beta1 is None and config.batch_rule == "none":
-            notes.append(
-                f"Adam's first moment: beta1 {SHORT_BETA1} where the steps draw up to {SHORT:,} "
-                f"views, {BETAS[0]} as published from {REFERENCE:,} on"
-            )
-        if config.beta2 is None and photos:
-            rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
-            memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
-            notes.append(
-                f"if these are fewer than {HURRY} views of each training photo: "
-                f"{rates if config.rate_factor is None else ''}{memory}, {LEAST_MEMORY} at least"
-            )
-        return tuple(notes)
-    factor = factor_of(config, schedule, photos)
+        return tuple(_rules(config, photos))
+    notes, factor = [], factor_of(config, schedule, photos)
     if config.rate_factor is None and factor != 1.0:
-        notes.append(f"{published} {factor:.3g}")
-    first = _first_beta(config, schedule)
-    if config.beta1 is None and first != BETAS[0]:
-        notes.append(f"Adam's first moment: beta1 {first:.3g} (--set beta1={BETAS[0]} as published)")
+        notes.append(f"{_RATES} {factor:.3g}")
+    first, published = _first_beta(config, schedule), BETAS[0]
+    if config.beta1 is None and first != published:
+        notes.append(f"Adam's first moment: beta1 {first:.3g} (--set beta1={published}: published)")
     if in_a_hurry(config, schedule, photos):
         notes.append(_hurry_note(config, schedule))
     return tuple(notes)
+
+
+def _rules(config: RunConfig, photos: int) -> Iterator[str]:
+    """How they are going to differ, by the length that a budget allows."""
+    ratio = f"({REFERENCE:,} / steps)"
+    if config.rate_factor is None:
+        yield f"{_RATES} {ratio}^{SHORTNESS}, at most {MOST}"
+    if config.beta1 is None and config.batch_rule == "none":
+        yield (
+            f"Adam's first moment: beta1 {SHORT_BETA1} where the steps draw up to {SHORT:,} "
+            f"views, {BETAS[0]} as published from {REFERENCE:,} on"
+        )
+    if config.beta2 is None and photos:
+        rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
+        memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
+        yield (
+            f"if these are fewer than {HURRY} views of each training photo: "
+            f"{rates if config.rate_factor is None else ''}{memory}, {LEAST_MEMORY} at least"
+        )
 
 
 def note_on_plan(setup: Setup) -> tuple[str, ...]:

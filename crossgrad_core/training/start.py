@@ -6,14 +6,17 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
+from torch import Tensor
 
 from crossgrad_core.config import AUTO
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.component import answered
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.defaults import EXPORTER
+from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.training import photo_parameters
@@ -26,6 +29,7 @@ from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
 #: Random initial points where a scene has none (`--init random`).
@@ -74,12 +78,12 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     reading, scene = setup.config.reading, setup.scene
     if reading.init_file is not None:
         gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, scene.similarity)
-        return setup.backbone.adopt(gaussians, scene, rng), None
+        return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
     if reading.init == "random":
         begun = with_random_points(scene, rng)
     else:
         begun = setup.selection.start.begun(scene)
-    parameters = setup.backbone.create(begun, rng)
+    parameters = _made(setup, setup.backbone.create(begun, rng), "create")
     present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
     if bound is None or bound == AUTO or present <= bound:
         return parameters, None
@@ -92,6 +96,26 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
         # Where several points make one primitive, or one makes several, it takes more than one try.
         share *= min(_LESS, wanted / made)
     return parameters, present
+
+
+def _made(setup: Setup, answer: object, method: str) -> Parameters:
+    """The parameters that a method of the backbone answered with.
+
+    Raises:
+        UserError: They are not those that its blocks name.
+    """
+    parameters = answered(answer, dict, setup.backbone, method)
+    wanted = [name for block in setup.blocks for name in block.tensors]
+    have = [name for name, tensor in parameters.items() if isinstance(tensor, Tensor)]
+    if not set(wanted) <= set(have):
+        raise UserError(
+            f"{type(setup.backbone).__name__}.{method} makes other tensors than its blocks name",
+            where=f"backbone {setup.selection.names['backbone']}",
+            expected=listed(wanted),
+            found=listed(have) or "none",
+            todo="repair the plugin, or choose another one",
+        )
+    return parameters
 
 
 def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:

@@ -69,6 +69,14 @@ def test_seconds_that_are_replaced_take_their_clock_with_them(
     assert merged(path, options, assignments).get("clock") == clock
 
 
+def test_a_step_to_stop_at_is_that_of_its_length(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("steps: 40\nstop_after: 20\n")
+    assert merged(path, {"seed": 5}, [])["stop_after"] == 20
+    assert "stop_after" not in merged(path, {"steps": 5}, [])
+    assert merged(path, {"steps": 5, "stop_after": 3}, [])["stop_after"] == 3
+
+
 @pytest.mark.parametrize(
     ("options", "assignments"), [({"seconds": 5.0}, []), ({}, ["seconds=5.0"])]
 )
@@ -83,6 +91,7 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
     then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0, "beta2": 0.999}
+    then |= {"beta1": 0.9}
     then |= {"floaters": "keep", "position_steps": "extent", "resolution": {"name": "full"}}
     expected = {"seconds": 5.0, "seed": 1, **then}
     assert merged(path, options, assignments) == expected

@@ -46,7 +46,9 @@ def trained(number, *plugins, **settings):
 @pytest.mark.parametrize("step", [1, 20, 40])
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
     plain, doubled = (
-        assembled(backbone={"name": backbone}, rate_factor=factor, final_decay=0.0, beta2=0.999)
+        assembled(
+            backbone={"name": backbone}, rate_factor=factor, final_decay=0.0, beta1=0.9, beta2=0.999
+        )
         for factor in (1.0, 2.0)
     )
     published = {
@@ -111,10 +113,50 @@ PASSES = 360
 def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, beta2, views):
     setup = assembled(max_views=length, steps=None, views=views, **settings)
     assert len(setup.train_views) == 9
-    assert all(rule_at(setup, step) == AdamRule((0.9, beta2)) for step in (1, length // views))
+    first = 0.9 if {"preset", "schedule"} & settings.keys() else 0.7
+    assert all(rule_at(setup, step) == AdamRule((first, beta2)) for step in (1, length // views))
     told = [note for note in setup.notes if "second moment" in note]
     assert len(told) == (beta2 == 0.98)
     assert all("fewer than 40 views " in note and " over 50 steps " in note for note in told)
+
+
+@pytest.mark.parametrize(
+    ("settings", "beta1"),
+    [
+        ({"steps": 5}, 0.7),
+        ({"steps": 3_000}, 0.7),
+        ({"steps": 1_500, "views": 2}, 0.7),
+        ({"steps": 9_487}, 0.8),
+        ({"steps": 4_743, "views": 2}, 0.8),
+        ({"steps": None, "max_views": 9_487, "views": 1}, 0.8),
+        ({"steps": 30_000}, 0.9),
+        ({"steps": 90_000}, 0.9),
+        ({"steps": 5, "preset": "inria"}, 0.9),
+        ({"steps": 5, "schedule": "absolute"}, 0.9),
+        ({"steps": 5, "schedule": "absolute", "reference": 2_000}, 0.7),
+        ({"steps": 5, "batch_rule": "sqrt", "views": 2}, 0.8),
+        ({"steps": 5, "beta1": 0.5}, 0.5),
+        ({"steps": 30_000, "beta1": 0.0}, 0.0),
+        ({"steps": 5, "beta1": 0.5, "preset": "inria"}, 0.5),
+    ],
+)
+def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, beta1):
+    setup = assembled(**{"views": 1, **settings})
+    for step in (1, 5):
+        assert rule_at(setup, step).betas[0] == pytest.approx(beta1, abs=1e-4)
+    told = [note for note in setup.notes if "first moment" in note]
+    ours = "beta1" not in settings and "batch_rule" not in settings and beta1 < 0.9
+    assert len(told) == ours
+    assert all(f"beta1 {beta1:.3g} (--set beta1=0.9: published)" in note for note in told)
+
+
+def test_the_first_moment_of_a_budget_is_told_as_a_rule():
+    told = [n for n in assembled(steps=None, seconds=60.0).notes if "first moment" in n]
+    assert told == [
+        "Adam's first moment: beta1 0.7 where the steps draw up to 3,000 views, 0.9 as published "
+        "from 30,000 on"
+    ]
+    assert not any("first" in n for n in assembled(steps=None, seconds=60.0, beta1=0.9).notes)
 
 
 @pytest.mark.parametrize("steps", [60, 5_000])
@@ -139,7 +181,7 @@ def test_the_rule_that_a_run_was_planned_with_stays_when_the_clock_changes_it(
 ):
     setup = assembled(steps=planned)
     setup = replace(setup, schedule=replace(setup.schedule, total=steps))
-    assert rule_at(setup, 1) == AdamRule((0.9, beta2))
+    assert rule_at(setup, 1) == AdamRule((0.7, beta2))
     assert note_on_plan(setup) == tuple(n for n in setup.notes if "second moment" in n)
 
 
@@ -164,7 +206,8 @@ def test_where_the_clock_decides_the_rates_follow_its_plan():
     own = assembled(steps=None, seconds=60.0, rate_factor=2.0)
     (note,) = (note for note in own.notes if "second moment" in note)
     assert note.startswith("if these are") and "30,000" not in note
-    assert not any("moment" in n for n in assembled(steps=None, seconds=60.0, beta2=0.99).notes)
+    own = assembled(steps=None, seconds=60.0, beta2=0.99)
+    assert not any("second moment" in note for note in own.notes)
     shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
     published, planned = (rates_at(each, 1)["opacities"] for each in (setup, shorter))
     assert planned == pytest.approx(EIGHTH * published)

@@ -22,3 +22,14 @@ def test_a_run_of_a_grid_is_carried_out_once(tmp_path, capsys):
     assert summary.stat().st_mtime_ns == written
     assert ended("sweep", grid, "--out", out, "--list") == 0
     assert f"{summary.parent.name}  finished " in capsys.readouterr().out
+
+
+def test_a_folder_that_holds_something_else_stays_as_it_is(tmp_path, capsys):
+    write_tiny_scene(tmp_path / "tiny", views=6)
+    grid, out = tmp_path / "grid.yaml", tmp_path / "out"
+    grid.write_text(yaml.safe_dump({"scenes": ["tiny"], "base": {"steps": 2}}))
+    out.mkdir()
+    (out / "config.yaml").write_text("steps: 3")
+    assert ended("sweep", grid, "--out", out) == 2
+    assert "something else than a sweep" in capsys.readouterr().err
+    assert [each.name for each in out.iterdir()] == ["config.yaml"]

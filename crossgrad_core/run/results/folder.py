@@ -7,6 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.system.files import disk_errors, disk_full, free_bytes, is_leftover
@@ -93,7 +94,8 @@ def check_out(out: Path | None) -> None:
             where=out,
             expected="a new or empty folder",
             found=", ".join(there[:4]) + (f" of {writer}" if writer else ""),
-            todo="choose another --out, or continue that run with --resume",
+            todo="choose another --out"
+            + (", or continue that run with --resume" if CONFIG in there else ""),
         )
 
 

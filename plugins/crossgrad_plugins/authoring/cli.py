@@ -127,7 +127,7 @@ def _slots(slot: str | None) -> tuple[str, ...]:
         raise UserError(
             f"there is no slot named {slot!r}",
             expected=f"one of {listed(OFFERED)}",
-            todo=sentences(did_you_mean(slot, OFFERED), "leave --slot out to see all of them"),
+            todo=sentences(did_you_mean(slot, OFFERED), "`crossgrad plugins list` shows all slots"),
         )
     return (group,)
 

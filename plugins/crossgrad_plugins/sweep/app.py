@@ -7,6 +7,7 @@ from pathlib import Path
 
 from crossgrad_core.commands import (
     FAILED,
+    LOCK,
     UserError,
     check_file,
     check_folder,
@@ -84,6 +85,7 @@ class Sweep:
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if not looks_only:  # Before the work of planning; the lock itself comes after it.
             _refuse_a_second(self.layout.out)
+            _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)
         finish()
         self.machine: Machine | None = None
@@ -236,6 +238,19 @@ def _refuse_a_second(out: Path) -> None:
             where=out,
             found=writer,
             todo="wait until it ends, stop it, or choose another --out; --list shows how far it is",
+        )
+
+
+def _refuse_what_is_no_sweep(layout: Layout) -> None:
+    out = layout.out
+    there = sorted({each.name for each in out.iterdir()} - {LOCK}) if out.is_dir() else []
+    if there and not layout.records.is_dir():
+        raise UserError(
+            "the folder holds something else than a sweep",
+            where=out,
+            expected="a new or empty folder, or one that a sweep has begun",
+            found=listed(there[:4]),
+            todo="choose another --out",
         )
 
 

@@ -7,7 +7,15 @@ from math import prod
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from crossgrad_core.commands import UserError, did_you_mean, layered, listed, read_settings
 from crossgrad_plugins.sweep.problems import Problem, refuse
@@ -27,6 +35,8 @@ _RESERVED = {
 #: Settings that options of the sweep are for.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
 _SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
+#: What is wrong, in the words of the file, where the library's are those of a language.
+_IN_YAML = {"tuple_type": "should be a list", "too_short": "should not be empty"}
 _WITH_DISTRIBUTION = frozenset({"min", "max", "distribution", "mu", "sigma", "q", "probabilities"})
 
 
@@ -127,6 +137,13 @@ class Grid(_Part):
     parameters: dict[str, Parameter] = Field(default_factory=dict)
     metric: Metric = Metric()
 
+    @field_validator("name")
+    @classmethod
+    def _is_a_folder(cls, name: str | None) -> str | None:
+        if name is not None and (name in {"", ".", ".."} or set(name) & {"/", "\\", "\0"}):
+            raise ValueError("is the name of a folder below runs/sweeps, without slashes")
+        return name
+
     @model_validator(mode="before")
     @classmethod
     def _axes_with_names(cls, given: object) -> object:
@@ -223,7 +240,7 @@ def read_grid(path: Path) -> Grid:
     try:
         grid = Grid.model_validate(content)
     except ValidationError as error:
-        refuse([_problem(each) for each in error.errors(include_url=False)], path)
+        refuse([_problem(each) for each in _own(error.errors(include_url=False))], path)
         raise
     here = path.resolve().parent
     scenes = tuple(each and _absolute(each, here) for each in grid.scenes)
@@ -236,6 +253,16 @@ def _absolute(scene: str, here: Path) -> str:
     return str((here / Path(scene).expanduser()).resolve())
 
 
+def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The errors without those that say that too little is left of a list without its bad parts."""
+    return [
+        each
+        for each in errors
+        if each["type"] != "too_short"
+        or not any(o["loc"][: len(each["loc"])] == each["loc"] for o in errors if o is not each)
+    ]
+
+
 def _problem(error: Mapping[str, Any]) -> Problem:
     """What pydantic found, with its place in the file."""
     path = [part for part in error["loc"] if part != "dict"]
@@ -245,6 +272,7 @@ def _problem(error: Mapping[str, Any]) -> Problem:
         below = "base" if len(path) == 1 else "settings"
         return Problem(place, f"is no part of a grid; settings go below {below}", hint)
     message = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    message = _IN_YAML.get(error["type"], message)
     found = "" if error["type"] in {"missing", "value_error"} else f", not {error['input']!r}"
     return Problem(place, f"{message}{found}")
 

@@ -27,6 +27,22 @@ class Demanding(Good):
 class Unfinished(Grouping):
     pass
 
+class Few(Good):
+    def fit(self, scene):
+        return Rule(lambda views: ("near",) * len(views))
+
+class Many(Good):
+    def fit(self, scene, rng, probe, more):
+        return Rule(lambda views: ("near",) * len(views))
+
+class Without(Good):
+    def fit(self, scene, rng):
+        return Rule(lambda views: ("near",) * len(views))
+
+class Any(Good):
+    def fit(self, *arguments, **more):
+        return Rule(lambda views: ("near",) * len(views))
+
 something = 7
 """
 
@@ -54,6 +70,7 @@ def good(install):
         "demanding": "made_up:Demanding",
         "unfinished": "made_up:Unfinished",
         "seven": "made_up:something",
+        **{name: f"made_up:{name.title()}" for name in ("few", "many", "without", "any")},
         "gone": "made_up:Gone",
         "lost": "made_up_lost:Lost",
     }
@@ -198,6 +215,31 @@ def test_what_is_no_component_is_refused(good, name, found):
     error = refusal("groupings", name)
     assert error.expected == "a complete subclass of crossgrad_core.plugin.Grouping"
     assert error.found == found
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("few", "fit(self, scene)"),
+        ("many", "fit(self, scene, rng, probe, more)"),
+        ("without", "fit(self, scene, rng)"),
+    ],
+)
+def test_methods_that_cannot_be_called_like_those_of_their_slot_are_refused(good, name, found):
+    error = refusal("groupings", name)
+    assert error.found == found
+    assert error.expected.startswith("fit(self, scene: ")
+    assert "from made-up 1.0" in error.where and "made_up.py:" in error.where
+
+
+def test_methods_that_take_more_are_none_of_them(good):
+    assert registry.build("groupings", "any", {})
+
+
+@pytest.mark.parametrize("slot", GROUPS)
+def test_our_own_take_what_they_are_called_with(slot):
+    for name in registry.entries(slot):
+        registry.load(slot, name)
 
 
 def test_a_component_of_another_slot_is_refused(install):

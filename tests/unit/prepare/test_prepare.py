@@ -426,6 +426,13 @@ def test_photos_at_the_root_ask_for_a_place(capsys):
     assert "reader.scene=FOLDER" in capsys.readouterr().err
 
 
+def test_without_photos_there_is_nothing_to_prepare(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert ended("run", "--prepare") == 2
+    assert "there are no photos to prepare" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):
     """And not a line of pycolmap's beside it."""
     rng = np.random.default_rng(0)

@@ -45,9 +45,14 @@ def test_out_may_be_new_or_empty(tmp_path: Path, exists: bool):
 
 def test_results_are_never_overwritten(tmp_path: Path):
     (tmp_path / "metrics.csv").write_text("precious")
-    with pytest.raises(UserError, match=r"never overwritten(.|\n)*metrics\.csv(.|\n)*--resume"):
+    with pytest.raises(UserError, match=r"never overwritten(.|\n)*metrics\.csv") as caught:
         create_run_folder(NAME, out=tmp_path)
     assert (tmp_path / "metrics.csv").read_text() == "precious"
+    # There is no run that could go on.
+    assert "--resume" not in caught.value.todo
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(UserError, match="--resume"):
+        create_run_folder(NAME, out=tmp_path)
 
 
 def test_who_writes_into_the_folder_is_told(tmp_path: Path):

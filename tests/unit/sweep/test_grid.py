@@ -90,7 +90,11 @@ WRONG = {
     "method: bayes": "method: ",
     "parameters: {rate: {min: 0, max: 1}}": "nothing is drawn from distributions (max, min)",
     "parameters: {rate: [1, 2]}": "must be `values: [...]`",
-    "parameters: {rate: {values: []}}": "parameters.rate.values",
+    "parameters: {rate: {values: []}}": "parameters.rate.values: should not be empty, not []",
+    "parameters: {rate: {values: sum}}": "parameters.rate.values: should be a list, not 'sum'",
+    "name: ../esc": "name: is the name of a folder below runs/sweeps",
+    "name: ..": "name: is the name of a folder",
+    "name: ''": "name: is the name of a folder",
     "parameters: {rate: {values: [1], value: 2}}": "exactly one of",
     "base: {out: x}": "base.out: is not for a grid to set",
     "base: {threads: 2}": "say --threads",
@@ -113,6 +117,12 @@ def test_what_is_wrong_is_said_with_its_place(tmp_path, text):
         read_grid(written(tmp_path, text))
     assert WRONG[text] in str(caught.value)
     assert str(tmp_path / "grid.yaml") in str(caught.value)
+
+
+def test_a_list_that_is_empty_without_its_wrong_parts_is_wrong_once(tmp_path):
+    with pytest.raises(UserError) as caught:
+        read_grid(written(tmp_path, "seeds: [-1]"))
+    assert "not be empty" not in str(caught.value) and "2 things" not in str(caught.value)
 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path):

@@ -76,6 +76,27 @@ def test_what_a_backbone_decodes_are_gaussians(answer):
     assert error.expected == "Gaussians"
 
 
+@pytest.mark.parametrize("answer", [None, 3, (1, 2)])
+def test_what_a_backbone_creates_are_tensors(answer):
+    error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
+    assert "Wrong.create gave a wrong answer" in error.what
+
+
+@pytest.mark.parametrize("answer", [{}, {"moans": torch.zeros(3, 3)}, {"means": None}])
+def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
+    error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
+    assert "Wrong.create makes other tensors than its blocks name" in error.what
+    assert error.expected.startswith("means, scales")
+    assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
+
+
+@pytest.mark.parametrize("answer", [3, ()])
+def test_what_a_start_adds_are_points(answer):
+    error = refused(setup_of({"start": of_slot("starts", "sfm", "more_points", answer)}))
+    assert "Wrong.more_points gave a wrong answer" in error.what
+    assert error.expected == "MorePoints"
+
+
 @pytest.mark.parametrize(
     ("base", "slot", "name", "answer"),
     [

@@ -1,0 +1,41 @@
+"""Whether the methods of a component take what crossgrad calls them with."""
+
+from collections.abc import Iterator
+from inspect import Parameter, Signature, isfunction, signature
+from typing import Final
+
+_POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+
+
+def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
+    """Methods that cannot be called like those of the base class that they replace.
+
+    Hooks are left out: they may take fewer arguments.
+
+    Args:
+        found: A subclass of `base`.
+        base: The base class of a slot.
+
+    Yields:
+        The name, the signature of the base class and the one that was found.
+    """
+    for name in dir(base):
+        theirs, own = getattr(base, name), getattr(found, name)
+        if name.startswith(("_", "crossgrad_")) or own is theirs:
+            continue
+        if isfunction(theirs) and isfunction(own):
+            expected, given = signature(theirs), signature(own)
+            if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
+                yield name, str(expected), str(given)
+
+
+def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
+    """Whether a call with all arguments, or with those that have no default, can be made."""
+    passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
+    positional = [each for each in passed if each.kind in _POSITIONAL]
+    named = {each.name: None for each in passed if each.kind is Parameter.KEYWORD_ONLY}
+    try:
+        given.bind(*(None for _ in positional), **named)
+    except TypeError:
+        return False
+    return True
