@@ -172,7 +172,9 @@ def table(given: argparse.Namespace) -> None:
         if "old" in codes:
             # A code that ran alone is held against the first ones that ran as long as `old` did.
             old[scene, lengths] = codes["old"]
-            old.setdefault((scene, lengths.split(":")[0]), codes["old"])
+            first, _, unit = lengths.partition(" ")
+            alone = " ".join([first.split(":")[0], *([unit] if unit else [])])
+            old.setdefault((scene, alone), codes["old"])
     for code in sorted({code for _, codes in cases for code in codes} - {"old"}):
         _print_gains(code, cases, old)
 
@@ -269,6 +271,8 @@ def main() -> None:
     shares.set_defaults(do=share)
     shares.add_argument("out", type=Path)
     given = parser.parse_args()
+    if given.do is run and not (given.seconds or given.steps):
+        runs.error("say how long runs are: --seconds or --steps")
     given.do(given)
 
 

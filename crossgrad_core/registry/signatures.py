@@ -1,10 +1,12 @@
 """Whether the methods of a component take what crossgrad calls them with."""
 
 from collections.abc import Iterator
-from inspect import Parameter, Signature, isfunction, signature
+from inspect import Parameter, Signature, getattr_static, isfunction, signature
 from typing import Final
 
 _POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+#: Where the methods are defined that crossgrad calls.
+_CONTRACT: Final = "crossgrad_core.contract."
 
 
 def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
@@ -19,12 +21,15 @@ def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
     Yields:
         The name, the signature of the base class and the one that was found.
     """
-    for name in dir(base):
-        theirs, own = getattr(base, name), getattr(found, name)
+    contract = [each for each in base.__mro__ if each.__module__.startswith(_CONTRACT)]
+    names = dict.fromkeys(name for each in contract for name in vars(each))
+    for name in names:
+        theirs, own = getattr_static(base, name), getattr_static(found, name)
         if name.startswith(("_", "crossgrad_")) or own is theirs:
             continue
         if isfunction(theirs) and isfunction(own):
-            expected, given = signature(theirs), signature(own)
+            # A decorator may pass arguments of its own: what it takes itself counts.
+            expected, given = signature(theirs), signature(own, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
                 yield name, str(expected), str(given)
 

@@ -340,7 +340,7 @@ def resumed(
                 where="--stop-after",
                 expected=f"a step from {step + 1} to {total}",
                 found=str(stop),
-                todo="name a later step, or leave it out to train to the end",
+                todo="name one of these, or leave it out to train to the end",
             )
         if step < total:
             state.clock.load += _decoded(setup, way)

@@ -107,10 +107,12 @@ def _overlaid(
 ) -> Settings:
     """The settings with those that were given later."""
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
+    had = {(key,) for key, value in settings.items() if value is not None} & {*LENGTHS}
     if lengths:
-        # A new length replaces the earlier one as a whole, where it was to stop on the way, and
-        # with seconds go those of the CPU.
-        gone = {*LENGTHS, ("stop_after",), *(() if ("seconds",) in lengths else [("clock",)])}
+        # A new length replaces the earlier one as a whole: with what it counted, and where it was
+        # to stop on the way.
+        timed = bool(had & {("seconds",), ("planned_seconds",)}) and ("seconds",) not in lengths
+        gone = had | ({("stop_after",)} if had else set()) | ({("clock",)} if timed else set())
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
     # Names first: choosing another component drops the options of the one it replaces.
     for given in (list(chosen.items()), assigned):

@@ -62,8 +62,9 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         return _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
 
     # How many pixels the first steps draw may depend on the length.
-    first = _without_edits(schedule_for(setup, fits := fitting()), fits)
-    pixels = setup.selection.resolution.pixels(first, 1) / first.pace.at(1)
+    fits = fitting()
+    first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
+    pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
         del state  # Its views remember the scale that they have reached.
         state = first_state(unwatched(setup))
@@ -87,7 +88,9 @@ def most_steps(setup: Setup) -> int:
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
-    """How often the step after a state's was taken, and the training seconds of a view in it.
+    """How many steps were taken from a state on, and the training seconds of a view in them.
+
+    They are its next `PROBE_STEPS`, again and again: later ones may draw more pixels.
 
     Where a kernel had to be compiled, what was measured before and with it is left out, a few times
     at most: some plugin may compile in every step.
@@ -102,14 +105,16 @@ def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float
     start, count, taken = state.clock.copy(), 0, 0.0
     with told_of_missing(begin_again):
         while count < PROBE_STEPS or taken < PROBE_SHARE * seconds:
-            # Always the same one, so that views keep their scale.
-            state.step = step
+            state.step = step + count % PROBE_STEPS
             timed_step(setup, state)
             count += 1
             if compiled and tries:
                 start, count, compiled, tries = state.clock.copy(), 0, False, tries - 1
             taken = state.clock.trained(kind) - start.trained(kind)
-    return count, taken / (count * setup.schedule.pace.at(step + 1))
+    pace = setup.schedule.pace
+    rounds, rest = divmod(count, PROBE_STEPS)
+    views = [pace.views(step + steps) - pace.views(step) for steps in (PROBE_STEPS, rest)]
+    return count, taken / (rounds * views[0] + views[1])
 
 
 class Length(Protocol):
@@ -256,10 +261,10 @@ def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
     return replace(
         schedule,
         total=total,
-        sh_interval=1,
+        sh_from=3,
         coarse_until=0,
         densify_from=0,
-        densify_until=_NEVER,
+        densify_until=schedule.counted(_NEVER),
         densify_every=_NEVER,
         reset_every=None,
     )

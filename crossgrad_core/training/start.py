@@ -52,7 +52,8 @@ def first_state(setup: Setup) -> TrainState:
         name: tensor.detach().to(setup.device).requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
-    parameters = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
+    prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
+    parameters = _made(setup, prepared, "prepare")
     check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = photo_parameters.started(setup)
@@ -91,7 +92,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     wanted = (BEGINNING if grows else 1.0) * bound
     share, made = wanted / present, present
     while made > bound and share * len(begun.points) >= 1.0:
-        parameters = setup.backbone.create(thinned(begun, share, rng), rng)
+        parameters = _made(setup, setup.backbone.create(thinned(begun, share, rng), rng), "create")
         made = primitives_of(setup.blocks, parameters)
         # Where several points make one primitive, or one makes several, it takes more than one try.
         share *= min(_LESS, wanted / made)
@@ -102,10 +103,12 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
     """The parameters that a method of the backbone answered with.
 
     Raises:
-        UserError: They are not those that its blocks name.
+        UserError: They are none, or not those that its blocks name once it has prepared them.
     """
     parameters = answered(answer, dict, setup.backbone, method)
-    wanted = [name for block in setup.blocks for name in block.tensors]
+    per_primitive = [block.tensors for block in setup.blocks if block.per_primitive]
+    first = [names[0] for names in per_primitive[:1]]
+    wanted = first if method != "prepare" else [n for block in setup.blocks for n in block.tensors]
     have = [name for name, tensor in parameters.items() if isinstance(tensor, Tensor)]
     if not set(wanted) <= set(have):
         raise UserError(

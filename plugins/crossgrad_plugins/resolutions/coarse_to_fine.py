@@ -15,6 +15,7 @@ from crossgrad_core.plugin import (
     PluginState,
     Resolution,
     ScaleContext,
+    Scene,
     Schedule,
 )
 from crossgrad_plugins.resolutions.course import Course
@@ -55,8 +56,7 @@ class CoarseToFine(Resolution):
     def scales(
         self, context: ScaleContext, state: PluginState
     ) -> tuple[tuple[float, ...], PluginState]:
-        # A run has fitted it before its first step: nothing is measured here.
-        parts = cast("CoarseToFine", self.fitted_to(context.scene)).parts()
+        parts = self.measured(context.scene).parts()
         window = self.window(context.schedule)
         progress = context.schedule.counted(context.step - 1) / window if window else inf
         reached = dict(cast("Mapping[str, float]", state.values.get(_REACHED, {})))
@@ -67,6 +67,10 @@ class CoarseToFine(Resolution):
             reached[regime] = scale = max(scale, reached.get(regime, 0.0))
             found.append(self.of_photo(view.camera, scale))
         return tuple(found), PluginState({_REACHED: cast("Json", reached)})
+
+    def measured(self, scene: Scene) -> "CoarseToFine":
+        """Fitted to the scene, which a run has done before its first step."""
+        return cast("CoarseToFine", self.fitted_to(scene))
 
     @override
     def remarks(self, schedule: Schedule) -> tuple[str, ...]:

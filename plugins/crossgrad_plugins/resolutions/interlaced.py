@@ -48,6 +48,11 @@ class Interlaced(CoarseToFine):
         return self.model_copy(update={"coarsest": max(each for each in (1, 2, 4, 8) if each <= n)})
 
     @override
+    def measured(self, scene: Scene) -> CoarseToFine:
+        # In each step: not all photos are looked at again.
+        return self if self.coarsest is not None else self.fitted_to(scene)
+
+    @override
     def window(self, schedule: Schedule) -> float:
         whole = schedule.counted(schedule.total)
         if self.until is not None:
@@ -69,9 +74,9 @@ class Interlaced(CoarseToFine):
         told = [f"of each {n} x {n} to step {end}" for end, n in ends]
         if not told:
             return (
-                f"resolution: all pixels from the start, as photos have fewer than "
+                "resolution: all pixels from the start, as asked for or as photos have fewer than "
                 f"{4 * self.least:,} or a side shorter than {2 * self.smallest} "
-                "(--set resolution.least=N)",
+                "(--set resolution.least=N, resolution.coarsest=N)",
             )
         if not window:
             why = "this share of the run is 0" if self.until == 0 else "the run is a long one"

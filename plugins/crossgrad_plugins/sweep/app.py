@@ -14,6 +14,7 @@ from crossgrad_core.commands import (
     count,
     exit_code,
     finish,
+    is_leftover,
     listed,
     locked,
     write_mapping,
@@ -243,13 +244,16 @@ def _refuse_a_second(out: Path) -> None:
 
 def _refuse_what_is_no_sweep(layout: Layout) -> None:
     out = layout.out
-    there = sorted({each.name for each in out.iterdir()} - {LOCK}) if out.is_dir() else []
-    if there and not layout.records.is_dir():
+    if not out.is_dir():
+        return
+    check_folder(out)
+    there = {e.name for e in out.iterdir() if e.name != LOCK and not is_leftover(e)}
+    if there and not there & {"settings", "output", "workers", layout.plan.name}:
         raise UserError(
             "the folder holds something else than a sweep",
             where=out,
             expected="a new or empty folder, or one that a sweep has begun",
-            found=listed(there[:4]),
+            found=listed(sorted(there)[:4]),
             todo="choose another --out",
         )
 

@@ -11,8 +11,15 @@ from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.slots import GROUPS
 
 GOOD = """
+from functools import wraps
 from pydantic import Field
 from crossgrad_core.plugin import Rule, Grouping
+
+def helped(function):
+    @wraps(function)
+    def wrapper(*arguments):
+        return function(*arguments, "help")
+    return wrapper
 
 class Good(Grouping):
     share: float = Field(0.5, gt=0, lt=1, description="share of near views")
@@ -43,8 +50,25 @@ class Any(Good):
     def fit(self, *arguments, **more):
         return Rule(lambda views: ("near",) * len(views))
 
+class Static(Good):
+    @staticmethod
+    def fit(scene, rng, probe=None):
+        return Rule(lambda views: ("near",) * len(views))
+
+class Decorated(Good):
+    @helped
+    def fit(self, scene, rng, probe, helper):
+        return Rule(lambda views: ("near",) * len(views))
+
+class Own(Good):
+    def copy(self):
+        return self
+
 something = 7
 """
+
+
+OTHERS = ("few", "many", "without", "any", "static", "decorated", "own")
 
 
 @pytest.fixture
@@ -70,7 +94,7 @@ def good(install):
         "demanding": "made_up:Demanding",
         "unfinished": "made_up:Unfinished",
         "seven": "made_up:something",
-        **{name: f"made_up:{name.title()}" for name in ("few", "many", "without", "any")},
+        **{name: f"made_up:{name.title()}" for name in OTHERS},
         "gone": "made_up:Gone",
         "lost": "made_up_lost:Lost",
     }
@@ -232,8 +256,9 @@ def test_methods_that_cannot_be_called_like_those_of_their_slot_are_refused(good
     assert "from made-up 1.0" in error.where and "made_up.py:" in error.where
 
 
-def test_methods_that_take_more_are_none_of_them(good):
-    assert registry.build("groupings", "any", {})
+@pytest.mark.parametrize("name", ["any", "static", "decorated", "own"])
+def test_methods_that_can_be_called_are_none_of_them(good, name):
+    assert registry.build("groupings", name, {})
 
 
 @pytest.mark.parametrize("slot", GROUPS)

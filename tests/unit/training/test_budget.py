@@ -105,11 +105,34 @@ def test_edits_that_a_run_never_reaches_cost_nothing(affordable, steps):
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
 def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
     schedule = _without_edits(Schedule.for_run(12_000, mode))
-    steps = range(1, 12_001)
+    steps = [*range(1, 12_001), budget._FULL_SIZE + 1, budget._FULL_SIZE + budget.PROBE_STEPS]
     assert all(schedule.collects(step) for step in steps)
     assert not any(schedule.densifies(step) or schedule.resets(step) for step in steps)
     assert schedule.sh_degree(3) == 3
     assert schedule.coarse_until == 0 == schedule.densify_from
+
+
+@pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
+@pytest.mark.parametrize("name", ["full", "octaves", "interlaced"])
+def test_probed_steps_gather_statistics_and_have_all_bands(monkeypatch, name, views):
+    settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
+    run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
+    resolution = GROWING.get(name, run.selection.resolution)
+    run = replace(run, selection=replace(run.selection, resolution=resolution))
+    taken = []
+
+    def step(setup, state):
+        state.step += 1
+        state.clock.train += 0.01
+        assert setup.schedule.collects(state.step)
+        assert setup.schedule.sh_degree(state.step) == 3
+        assert not setup.schedule.densifies(state.step)
+        taken.append(state.step)
+
+    monkeypatch.setattr(budget, "timed_step", step)
+    steps_for(run, 10.0)
+    # Samplers that take turns have all of them.
+    assert {each % 2 for each in taken} == {0, 1}
 
 
 def along_the_curve(steps, start):

@@ -86,8 +86,29 @@ def test_what_a_backbone_creates_are_tensors(answer):
 def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
     assert "Wrong.create makes other tensors than its blocks name" in error.what
-    assert error.expected.startswith("means, scales")
+    assert error.expected == "means"
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
+
+
+def test_what_a_backbone_has_prepared_is_all_that_its_blocks_name():
+    backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
+    error = refused(setup_of({"backbone": backbone}))
+    assert "Wrong.prepare makes other tensors" in error.what
+    assert error.expected.startswith("means, scales, quats")
+
+
+def test_what_a_backbone_prepares_it_need_not_create():
+    class Late(type(build("backbones", "vanilla", {}))):
+        def create(self, scene, rng):
+            made = super().create(scene, rng)
+            return {name: tensor for name, tensor in made.items() if name != "f_rest"}
+
+        def prepare(self, parameters, scene, phase):
+            rest = torch.zeros(len(parameters["means"]), 15, 3, requires_grad=True)
+            return {"f_rest": rest, **parameters}
+
+    setup = setup_of({"backbone": Late()})
+    assert "f_rest" in first_state(setup).parameters
 
 
 @pytest.mark.parametrize("answer", [3, ()])
