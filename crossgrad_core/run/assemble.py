@@ -143,7 +143,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         *_linear_note(setup),
         *idle_note(setup),
         *at_the_end(config),
-        *of_rates(config, setup.schedule, len(scene.train_views)),
+        *of_rates(setup),
         *timed,
     )
     return replace(setup, notes=(*setup.notes, *added))

@@ -71,15 +71,13 @@ def factor_of(config: RunConfig, schedule: Schedule, photos: int) -> float:
     return min(max(1.0, float((REFERENCE / _length(schedule)) ** power)), most)
 
 
-def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float, float]:
-    """The decay of Adam's moments in a run; arguments as of `in_a_hurry`.
-
-    Under the batch rule those for one view per step.
-    """
-    first, second = _first_beta(config, schedule), BETAS[1]
+def betas_of(setup: Setup) -> tuple[float, float]:
+    """The decay of Adam's moments in a run; under the batch rule those for one view per step."""
+    config, schedule = setup.config, setup.schedule
+    first, second = _first_beta(setup), BETAS[1]
     if config.beta2 is not None:
         return first, config.beta2
-    if not in_a_hurry(config, schedule, photos):
+    if not in_a_hurry(config, schedule, len(setup.train_views)):
         return first, second
     steps, memory = _planned(config, schedule), _memory(config, schedule)
     if config.batch_rule == "sqrt":
@@ -88,15 +86,27 @@ def betas_of(config: RunConfig, schedule: Schedule, photos: int) -> tuple[float,
     return first, min(second, 1.0 - 1.0 / memory)
 
 
-def _first_beta(config: RunConfig, schedule: Schedule) -> float:
+def _first_beta(setup: Setup) -> float:
     """The decay of Adam's first moment."""
+    config, schedule = setup.config, setup.schedule
     if config.beta1 is not None:
         return config.beta1
-    if config.preset == "inria" or config.batch_rule == "sqrt":
+    if not _forgets(setup):
         return BETAS[0]
     views = max(1, schedule.pace.views(_planned(config, schedule)))
     short = log(REFERENCE / views) / log(REFERENCE / SHORT)
     return BETAS[0] - (BETAS[0] - SHORT_BETA1) * min(1.0, max(0.0, short))
+
+
+def _forgets(setup: Setup) -> bool:
+    """Whether the first moment of a short run may average over fewer steps than as published.
+
+    Not where the batch rule says over how many, and not with anchors, whose networks all views
+    share.
+    """
+    config = setup.config
+    usual = config.preset != "inria" and config.batch_rule == "none"
+    return usual and config.beta1 is None and bool(setup.backbone.axes)
 
 
 def _length(schedule: Schedule) -> int:
@@ -114,17 +124,18 @@ def _memory(config: RunConfig, schedule: Schedule) -> float:
     return max(LEAST_MEMORY, MEMORY * _planned(config, schedule))
 
 
-def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, ...]:
+def notes_on(setup: Setup) -> tuple[str, ...]:
     """How rates and Adam differ from what is published, where the run asked for nothing."""
+    config, schedule, photos = setup.config, setup.schedule, len(setup.train_views)
     if config.preset == "inria":
         return ()
     # The length of a run within a budget is not known yet.
     if config.seconds is not None and schedule.mode != "absolute":
-        return tuple(_rules(config, photos))
+        return tuple(_rules(setup))
     notes, factor = [], factor_of(config, schedule, photos)
     if config.rate_factor is None and factor != 1.0:
         notes.append(f"{_RATES} {factor:.3g}")
-    first, published = _first_beta(config, schedule), BETAS[0]
+    first, published = _first_beta(setup), BETAS[0]
     if config.beta1 is None and first != published:
         notes.append(f"Adam's first moment: beta1 {first:.3g} (--set beta1={published}: published)")
     if in_a_hurry(config, schedule, photos):
@@ -132,17 +143,18 @@ def notes_on(config: RunConfig, schedule: Schedule, photos: int) -> tuple[str, .
     return tuple(notes)
 
 
-def _rules(config: RunConfig, photos: int) -> Iterator[str]:
+def _rules(setup: Setup) -> Iterator[str]:
     """How they are going to differ, by the length that a budget allows."""
+    config = setup.config
     ratio = f"({REFERENCE:,} / steps)"
     if config.rate_factor is None:
         yield f"{_RATES} {ratio}^{SHORTNESS}, at most {MOST}"
-    if config.beta1 is None and config.batch_rule == "none":
+    if _forgets(setup):
         yield (
             f"Adam's first moment: beta1 {SHORT_BETA1} where the steps draw up to {SHORT:,} "
             f"views, {BETAS[0]} as published from {REFERENCE:,} on"
         )
-    if config.beta2 is None and photos:
+    if config.beta2 is None and setup.train_views:
         rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
         memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
         yield (
@@ -241,7 +253,7 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
 
 def rule_at(setup: Setup, step: int) -> AdamRule:
     """How Adam averages in a step."""
-    betas = betas_of(setup.config, setup.schedule, len(setup.train_views))
+    betas = betas_of(setup)
     if setup.config.batch_rule == "none":
         return AdamRule(betas)
     pace = setup.schedule.pace

@@ -1,4 +1,4 @@
-"""What the views of a step are compared with: cameras, photos, weights of pixels, backgrounds."""
+"""Targets of the views of a step: cameras, photos, weights of pixels, backgrounds."""
 
 from dataclasses import dataclass
 from functools import partial, reduce

@@ -107,4 +107,4 @@ def test_a_full_disk_is_found_at_once(scene, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["run", str(scene), "--out", str(place), "-q"])
     message = capsys.readouterr().err
-    assert "not enough disk space" in message and "choose another disk with --out" in message
+    assert "not enough disk space" in message and "choose another disk" in message
