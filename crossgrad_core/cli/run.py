@@ -10,7 +10,6 @@ import typer
 from crossgrad_core.cli.resuming import refuse_beside_resume
 from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCENE
 from crossgrad_core.defaults import PREPARING_READER
-from crossgrad_core.errors import UserError
 from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.startup import announce
 
@@ -145,14 +144,6 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     if given["prepare"]:
         settings["reader"] = settings["reader"] or PREPARING_READER
     wanted = merged(given["config"], settings, given["assignments"] or [])
-    if given["prepare"] and wanted.get("scene") is None:
-        raise UserError(
-            "there are no photos to prepare",
-            where="--prepare",
-            expected="a folder of photos",
-            found="no SCENE; the bundled scene is ready to train on",
-            todo="crossgrad run PHOTOS --prepare",
-        )
 
     from crossgrad_core.run import app
 

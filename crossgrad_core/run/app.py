@@ -11,6 +11,7 @@ from time import perf_counter
 from typing import Any, cast
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.budget_clock import check_clock
@@ -206,6 +207,14 @@ def with_defaults(config: RunConfig) -> RunConfig:
             where="--steps, --max-views, --seconds",
             found=listed(f"{length:g} {unit}" for unit, length in given.items()),
             todo="leave --steps out, or all but it",
+        )
+    if config.scene is None and config.reader.name == PREPARING_READER:
+        raise UserError(
+            "there are no photos to prepare",
+            where="--prepare",
+            expected="a folder of photos",
+            found="no SCENE; the bundled scene is ready to train on",
+            todo="crossgrad run PHOTOS --prepare",
         )
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})

@@ -52,17 +52,18 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     """
     _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
-    state, pace, measured = first_state(unwatched(setup)), setup.schedule.pace, setup
+    state, pace, share = first_state(unwatched(setup)), setup.schedule.pace, setup.pixel_share
     state.step = _FULL_SIZE
     steps, each = _probed(probed, state, seconds)
     note = f"{steps} probed steps took {each * pace.at(_FULL_SIZE) * 1000:.1f} ms each"
     crowd = Crowd.of(setup, state)
 
-    def fitting() -> int:
+    def fitting(share: float) -> int:
+        measured = replace(setup, pixel_share=share)
         return _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
 
     # How many pixels the first steps draw may depend on the length.
-    fits = fitting()
+    fits = fitting(share)
     first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
     pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
@@ -71,14 +72,13 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
         note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"
         share = min(1.0, max(0.0, (1.0 - small / each) / (1.0 - pixels)))
-        measured = replace(setup, pixel_share=share)
-        fits = fitting()
+        fits = fitting(share)
     total = min(fits, most_steps(setup))
     if total < fits:
         note += f", of which {fits} fit into that time; the bound on views allows {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
-    return total, f"{text}the length follows the clock as the run goes", measured.pixel_share
+    return total, f"{text}the length follows the clock as the run goes", share
 
 
 def most_steps(setup: Setup) -> int:

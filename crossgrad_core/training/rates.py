@@ -30,9 +30,9 @@ HURRIED_MOST: Final = 6.3
 #: All measured by us (docs/schedules.md).
 MEMORY, LEAST_MEMORY = 1 / 50, 50
 
-#: The first moment averages over 3 steps, not 10, in runs of up to so many views; from there its
-#: decay rises with the logarithm of the length, to the published one at the published length. Views
-#: differ: what the last ten asked for is of other places, and steps that are large by then. Ours.
+#: The decay of the first moment, which then averages over 3 steps, not 10, in runs of up to so many
+#: views; from there it rises with the logarithm of the length, to the published one in runs as long
+#: as published. Measured by us (docs/schedules.md).
 SHORT_BETA1: Final = 0.7
 SHORT: Final = 3_000
 
@@ -101,8 +101,7 @@ def _first_beta(setup: Setup) -> float:
 def _forgets(setup: Setup) -> bool:
     """Whether the first moment of a short run may average over fewer steps than as published.
 
-    Not where the batch rule says over how many, and not with anchors, whose networks all views
-    share.
+    Not where the batch rule says over how many, nor with anchors, of which short runs ended lower.
     """
     config = setup.config
     usual = config.preset != "inria" and config.batch_rule == "none"

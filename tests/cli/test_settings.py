@@ -85,13 +85,14 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     path.write_text("steps: 40\nrevisions: [[10, 60]]\nplanned_seconds: 3.0\nseed: 1\n")
     # A file with revisions and without `events` was written when schedules counted steps, one
     # without `rate_factor` when rates did not follow the length, one without `final_decay` when
-    # they did not fade, without `beta2` when it was the same for all lengths, without `growth`,
-    # `start`, `dropout` and `floaters` when nothing led growth, filled the start, was left out or
-    # removed, without `resolution` when all pixels were drawn, and one without `metrics` by 0.1.
+    # they did not fade, without `beta1` and `beta2` when they were the same for all lengths,
+    # without `growth`, `start`, `dropout` and `floaters` when nothing led growth, filled the start,
+    # was left out or removed, without `resolution` when all pixels were drawn, and one without
+    # `metrics` by 0.1.
     metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
-    then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0, "beta2": 0.999}
-    then |= {"beta1": 0.9}
+    then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0}
+    then |= {"beta1": 0.9, "beta2": 0.999}
     then |= {"floaters": "keep", "position_steps": "extent", "resolution": {"name": "full"}}
     expected = {"seconds": 5.0, "seed": 1, **then}
     assert merged(path, options, assignments) == expected

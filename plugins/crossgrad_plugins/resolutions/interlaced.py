@@ -74,9 +74,9 @@ class Interlaced(CoarseToFine):
         told = [f"of each {n} x {n} to step {end}" for end, n in ends]
         if not told:
             return (
-                "resolution: all pixels from the start, as asked for or as photos have fewer than "
-                f"{4 * self.least:,} or a side shorter than {2 * self.smallest} "
-                "(--set resolution.least=N, resolution.coarsest=N)",
+                "resolution: all pixels from the start, as resolution.coarsest is 1: the most for "
+                f"photos of fewer than {4 * self.least:,} pixels or with a side of fewer than "
+                f"{2 * self.smallest}",
             )
         if not window:
             why = "this share of the run is 0" if self.until == 0 else "the run is a long one"

@@ -426,9 +426,10 @@ def test_photos_at_the_root_ask_for_a_place(capsys):
     assert "reader.scene=FOLDER" in capsys.readouterr().err
 
 
-def test_without_photos_there_is_nothing_to_prepare(capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("given", [("--prepare",), ("--reader", "photos-alone")])
+def test_without_photos_there_is_nothing_to_prepare(given, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert ended("run", "--prepare") == 2
+    assert ended("run", *given) == 2
     assert "there are no photos to prepare" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -165,9 +165,8 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
     assert found == [scale for count, scale in scales for _ in range(count)]
     (remark,) = resolution.remarks(schedule)
     if note is None:
-        assert (
-            "all pixels from the start, as asked for or as photos have fewer than 240,000" in remark
-        )
+        assert "all pixels from the start, as resolution.coarsest is 1" in remark
+        assert "fewer than 240,000 pixels or with a side of fewer than 192" in remark
     else:
         assert f"one pixel of each {note}, in each step another one; then all" in remark
     pixels = sum(count * scale**2 for count, scale in scales)
