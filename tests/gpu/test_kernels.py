@@ -21,6 +21,7 @@ from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.dropout import STREAM, dropped
 from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import rows_without_floaters
+from crossgrad_core.training.interlaced import as_in_full, camera_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
@@ -113,6 +114,19 @@ def test_antialiased_gaussians_are_those_of_the_rules(gsplat, sh_degree):
     expected, wanted, _ = drawn(REFERENCES["gsplat"], leaves(scene, "cpu", torch.float64), camera)
     assert (image - expected).abs().max() <= 3 * EDGE
     same_gradients(gradients, wanted, 5e-3)
+
+
+@pytest.mark.parametrize(("stride", "corner"), [(2, (0, 0)), (2, (1, 0)), (3, (2, 1)), (8, (5, 7))])
+def test_interlaced_views_have_the_pixels_of_the_full_image(gsplat, stride, corner):
+    camera, behind = CAMERAS["middle"], torch.zeros(3, device="cuda")
+    # Nobody stands beyond the border, where positions are clamped by the size of the image.
+    scene = leaves(random_gaussians(400, camera, border=0.0), "cuda", torch.float32)
+    whole = gsplat.render(scene, camera, behind).image
+    small = camera_of(camera, stride, corner)
+    image = gsplat.render(as_in_full(scene, gsplat, stride), small, behind).image
+    error = (image - whole[corner[1] :: stride, corner[0] :: stride]).abs()
+    assert error.max() <= 3 * EDGE
+    assert error.mean() <= 2e-5
 
 
 def extremes():
