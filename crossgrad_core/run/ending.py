@@ -82,7 +82,8 @@ class Course:
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
-        if self.state.step > 0:
+        # What a step left half done, and nothing could put back, is no state to go on from.
+        if self.state.step > 0 and not self.state.touched:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
         self._summarise()

@@ -18,6 +18,7 @@ from crossgrad_core.run.assemble import assemble, check_names, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import load_latest
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
 from crossgrad_core.run.persist import check_settings, from_checkpoint
+from crossgrad_core.run.rasterizers import drawn_elsewhere
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.results.lock import writer_of
@@ -210,8 +211,9 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     stored["sh_from"] = stored.get("sh_from") or 0
     stored["sh_every"] = stored.get("sh_every") or 1
     config = parsed({**stored, **settings})
-    if "device" not in settings:
-        _check_device(config.device, folder)
+    if "device" in settings:
+        return drawn_elsewhere(config)
+    _check_device(config.device, folder)
     return config
 
 

@@ -1,13 +1,16 @@
-"""Which rasterizer draws where the user names none."""
+"""Which rasterizer draws where the user names none, or where that of a run has no device."""
 
+import logging
 from dataclasses import dataclass
 
-from crossgrad_core.config import AUTO
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries, load
 from crossgrad_core.wording import in_one_line, listed
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,27 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
     others = [each for each in speeds if each != chosen]
     why = f"the fastest of {len(speeds)} here" if others else "the only one here that runs"
     return chosen, (*notes, f"rasterizer {chosen}: {why} on {wanted.device}")
+
+
+def drawn_elsewhere(config: RunConfig) -> RunConfig:
+    """A run's configuration for another device, with a rasterizer that runs there.
+
+    It keeps the options that every one which might be chosen has.
+
+    Raises:
+        UserError: The run's own rasterizer is not installed.
+    """
+    name, device = config.rasterizer.name, config.device.partition(":")[0]
+    if name == AUTO or device in load(Rasterizer, name).devices:
+        return config
+    others, _ = _speeds(Wanted(device, "plain"))
+    if not others:
+        return config
+    shared = set.intersection(*(set(load(Rasterizer, each).model_fields) for each in others))
+    kept = {key: value for key, value in config.rasterizer.options.items() if key in shared}
+    _LOG.warning("rasterizer %s does not run on %s: another one draws", name, device)
+    choice = ComponentChoice.model_validate({"name": AUTO, **kept})
+    return config.model_copy(update={"rasterizer": choice})
 
 
 def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -58,11 +58,22 @@ class Keeper:
         self.settle(state)
 
     def restore(self, state: TrainState) -> None:
-        """Puts `state` back to the last complete step, or further back to the copy."""
+        """Puts `state` back to the last complete step, or further back to the copy.
+
+        It is for the end of training: there may be no copy afterwards.
+        """
         for tensor in state.tensors.values():
             tensor.grad = None
-        if not state.touched and are_parameters_finite(state):
+        if not state.touched and _is_whole(state):
             self._mark.restore(state)
         else:
-            self._snapshot.put_back(state)
+            self._snapshot.hand_over(state)
             state.touched = False
+
+
+def _is_whole(state: TrainState) -> bool:
+    """Whether all parameters are finite, as far as the machine lets it be seen."""
+    try:
+        return are_parameters_finite(state)
+    except RuntimeError:  # Torch has no memory for it, or the GPU has failed.
+        return False

@@ -41,7 +41,9 @@ def peak_mebibytes(device: torch.device) -> float | None:
 def available_bytes(device: torch.device) -> int | None:
     """Memory that can still be allocated; None where the system does not say."""
     if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
+        # What torch holds on to for its next tensors is there for them, and not free.
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + kept
     figures = [
         figure for figure in (_system_available(), _cgroup_available()) if figure is not None
     ]

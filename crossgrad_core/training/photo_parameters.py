@@ -145,6 +145,8 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
+    # A checkpoint has brought it to the GPU, which would be waited for in each step.
+    tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():
         _check_gradients(setup, state, row, gradients)

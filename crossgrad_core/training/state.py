@@ -228,25 +228,31 @@ class Snapshot:
 
     def restore(self, state: TrainState, seed: int) -> None:
         """Puts `state` back, with fresh random streams so that the same draw does not recur."""
-        self._restore_tensors(state)
+        state.late = Late()
+        state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
+        state.moments = copied_moments(self.adam)
         state.states = dict(self.mark.states)
         state.step = self.mark.step
         state.last = self.mark.last
         state.rewinds += 1
         state.rngs = make_streams(seed, state.rewinds)
 
-    def put_back(self, state: TrainState) -> None:
-        """Puts `state` back as it was, so that it goes on as if nothing had happened since."""
-        self._restore_tensors(state)
+    def hand_over(self, state: TrainState) -> None:
+        """Puts `state` back as it was, so that it goes on as if nothing had happened since.
+
+        The copy itself becomes its tensors, as memory may be what has run out: nothing is left to
+        go back to.
+        """
+        state.late = Late()
+        state.tensors = self._tensors(state, self.parameters)
+        state.moments = self.adam
         self.mark.restore(state)
 
-    def _restore_tensors(self, state: TrainState) -> None:
-        state.late = Late()
-        state.tensors = {
-            name: t.clone().requires_grad_(state.tensors[name].requires_grad)
-            for name, t in self.parameters.items()
-        }
-        state.moments = copied_moments(self.adam)
+    @staticmethod
+    def _tensors(state: TrainState, copies: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Copies as the state has them: those that learn ask for gradients."""
+        learns = {name: tensor.requires_grad for name, tensor in state.tensors.items()}
+        return {name: each.requires_grad_(learns[name]) for name, each in copies.items()}
 
 
 def copied_moments(adam: AdamState) -> AdamState:

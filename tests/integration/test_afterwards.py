@@ -165,9 +165,11 @@ def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(fin
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")
-def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path, capsys):
+def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path, caplog):
     path = finished / "config.yaml"
-    stored = {**yaml.safe_load(path.read_text()), "device": "cuda", "rasterizer": {"name": "torch"}}
+    # Of the options the rasterizers of a CPU have two.
+    drawn = {"name": "gsplat", "near": 0.01, "dilation": 0.3, "max_alpha": 0.999}
+    stored = {**yaml.safe_load(path.read_text()), "device": "cuda", "rasterizer": drawn}
     path.write_text(yaml.safe_dump(stored))
     looks = (
         lambda how: export(finished, out=tmp_path / "a.ply", how=how),
@@ -180,6 +182,7 @@ def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path,
         look(How(device="cpu", threads=1))
     assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
+    assert "rasterizer gsplat does not run on cpu: another one draws" in caplog.text
 
 
 def test_the_command_line_has_these_options():

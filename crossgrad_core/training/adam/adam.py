@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from math import nan
 from typing import TypeAlias
 
 import numpy as np
@@ -120,8 +121,13 @@ def _update_fused(updates: Sequence[Update]) -> None:
 def update_on_gpu(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """The same step by torch's fused Adam, which leaves what is subnormal as it is."""
-    grad = (grad if step.scale == 1.0 else grad * step.scale).clamp(-LARGEST, LARGEST)
+    """The same step by torch's fused Adam, which leaves what is subnormal as it is.
+
+    An infinite gradient, which is looked for in no step of a GPU, makes the parameter NaN: that is
+    found.
+    """
+    grad = grad if step.scale == 1.0 else grad * step.scale
+    grad = grad.nan_to_num(nan, nan, nan).clamp(-LARGEST, LARGEST)
     adam(
         [param],
         [grad],

@@ -22,7 +22,11 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.rasterizers.gpu.blended import counter
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
-from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
+from crossgrad_plugins.rasterizers.gpu.missing import (
+    bring_ninja,
+    compiler_missing,
+    package_missing,
+)
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
@@ -98,7 +102,11 @@ class GsplatRasterizer(Rasterizer):
         """K views of one size, with N Gaussians each, in one call of gsplat."""
         gaussians, camera = views[0]
         if not len(gaussians):
-            return [nothing_drawn(camera, background, outputs) for background in backgrounds]
+            return [
+                nothing_drawn(each, own, behind, outputs)
+                for (each, own), behind in zip(views, backgrounds, strict=True)
+            ]
+        bring_ninja()
         screens = [
             Screen(torch.zeros(len(each), dtype=torch.int32, device=each.means.device))
             for each, _ in views

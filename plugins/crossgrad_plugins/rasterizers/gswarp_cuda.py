@@ -85,7 +85,7 @@ class GswarpRasterizer(Rasterizer):
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
         if not len(gaussians):
-            return nothing_drawn(camera, background, outputs)
+            return nothing_drawn(gaussians, camera, background, outputs)
         device = gaussians.means.device
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=device))
         enlarged = _NEAR / self.near

@@ -104,6 +104,14 @@ def test_the_update_of_a_gpu_agrees_with_the_reference(magnitude, scale):
         torch.testing.assert_close(mine, reference, rtol=1e-5, atol=rounding)
 
 
+@pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
+def test_a_gradient_that_is_not_finite_is_seen_in_the_parameters_of_a_gpu(bad):
+    """No step of a GPU looks for it, so that it must not become a large number."""
+    tensors = [torch.ones(3), torch.zeros(3), torch.zeros(3)]
+    update_on_gpu(tensors[0], torch.tensor([1.0, bad, 1.0]), *tensors[1:], coefficients(1.0))
+    assert tensors[0].isfinite().tolist() == [True, False, True]
+
+
 def test_no_gradient_leaves_everything_alone():
     params, state = tensors(5), AdamState()
     adam_step(params, tensors(6), state, RATES)

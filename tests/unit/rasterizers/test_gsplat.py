@@ -197,6 +197,9 @@ def test_no_gaussians_give_the_background(gsplat):
     assert not first.alpha.any() and not first.depth.any() and not len(first.screen.radii)
     assert not len(first.screen.count(torch.ones(28, 40, dtype=torch.bool)))
     assert second.alpha.any()
+    first.image.sum().backward()
+    assert all(tensor.grad.shape == tensor.shape for tensor in none.floats())
+    assert first.screen.mean_gradient.shape == first.screen.abs_gradient.shape == (0, 2)
 
 
 @pytest.mark.parametrize("taken_back", [False, True])

@@ -164,6 +164,8 @@ def test_no_gaussians_give_the_background(gswarp):
     assert render.image.shape == (28, 40, 3)
     assert not render.alpha.any()
     assert len(render.screen.radii) == 0
+    render.image.sum().backward()
+    assert scene.means.grad.shape == (*render.screen.mean_gradient.shape[:1], 3)
 
 
 def test_a_package_that_fails_to_start_ends_in_a_message(monkeypatch):

@@ -89,6 +89,31 @@ def test_gsplat_needs_a_compiler_for_the_host(machine, monkeypatch):
     assert "no C++ compiler" in objections(GsplatRasterizer())[0]
 
 
+def test_gsplat_needs_ninja_which_may_lie_beside_this_python(machine, monkeypatch, tmp_path):
+    machine("gsplat", nvcc="12.8")
+    monkeypatch.setattr(missing.shutil, "which", lambda name: None if name == "ninja" else name)
+    monkeypatch.setattr(missing.sys, "executable", str(tmp_path / "env" / "python"))
+    monkeypatch.setenv("PATH", "/usr/bin")
+    assert "finds no ninja: pip install ninja" in objections(GsplatRasterizer())[0]
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "ninja").touch()
+    assert objections(GsplatRasterizer()) == []
+    missing.bring_ninja.__wrapped__()
+    assert missing.os.environ["PATH"] == f"/usr/bin{missing.os.pathsep}{tmp_path / 'env'}"
+
+
+def test_torch_looks_for_nvcc_where_cuda_home_points_and_nowhere_else(monkeypatch, tmp_path):
+    monkeypatch.setattr(missing.shutil, "which", lambda name: str(tmp_path / name))
+    (tmp_path / "nvcc").touch()
+    for name in ("CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    assert missing.find_nvcc() == tmp_path / "nvcc"
+    monkeypatch.setenv("CUDA_PATH", str(tmp_path / "gone"))
+    assert missing.find_nvcc() is None
+    monkeypatch.setattr(missing, "find_spec", lambda _name: None)
+    assert f"no nvcc in {tmp_path / 'gone'}, where CUDA_HOME" in missing.compiler_missing("gsplat")
+
+
 def test_an_nvcc_that_says_nothing_is_not_held_against_anybody(machine, tmp_path):
     machine("gsplat", nvcc="12.8")
     (tmp_path / "bin" / "nvcc").write_text("#!/bin/sh\nexit 1\n")

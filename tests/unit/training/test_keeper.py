@@ -13,6 +13,7 @@ from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.persist import to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import keeper
 from crossgrad_core.training.loop import train
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
@@ -215,6 +216,38 @@ def test_a_state_with_a_value_that_is_not_finite_is_not_kept():
     with pytest.raises(BrokenError):
         train(setup, state, Results(), Stopper())
     assert_same(state, trained_until(10))
+
+
+def test_going_back_from_an_edit_that_ran_out_of_memory_asks_for_none(monkeypatch):
+    def no_room(*_args, **_kwargs):
+        raise torch.OutOfMemoryError("no room")
+
+    def run_out(self, context):
+        answer = yield
+        if context.step == FAILS_IN:
+            monkeypatch.setattr(torch.Tensor, "clone", no_room)
+        self.spring(context.step)
+        return answer
+
+    spill = hookimpl(wrapper=True)(run_out)
+    setup = assembled(trap("densify", spill, torch.OutOfMemoryError("no room for the edit")))
+    state = first_state(setup)
+    with pytest.raises(torch.OutOfMemoryError, match="for the edit"):
+        train(setup, state, Results(), Stopper())
+    monkeypatch.undo()
+    assert_same(state, trained_until(WHILE))
+
+
+def test_a_look_that_fails_does_not_keep_the_state_from_going_back(monkeypatch):
+    def lost(_state):
+        raise RuntimeError("CUDA error")
+
+    setup = assembled(trap("densify", before, BrokenError()))
+    state = first_state(setup)
+    monkeypatch.setattr(keeper, "are_parameters_finite", lost)
+    with pytest.raises(BrokenError):
+        train(setup, state, Results(), Stopper())
+    assert_same(state, trained_until(WHILE))
 
 
 def test_checkpoints_are_of_states_that_were_looked_at():

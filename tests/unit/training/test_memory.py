@@ -134,6 +134,16 @@ def test_no_module_of_ours_needs_one_that_only_some_systems_have():
     subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
 
 
+def test_what_torch_holds_on_to_of_a_gpu_is_there_for_its_next_tensors(monkeypatch):
+    for name, answer in {
+        "mem_get_info": (3000, 8000),
+        "memory_reserved": 4000,
+        "memory_allocated": 1500,
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, lambda _device, answer=answer: answer)
+    assert available_bytes(torch.device("cuda")) == 5500
+
+
 def test_this_machine_says_how_much_memory_is_left():
     available = available_bytes(CPU)
     assert available is None or available > 0

@@ -165,7 +165,7 @@ def test_a_snapshot_keeps_the_average_of_its_moment():
     before = {name: tensor.clone() for name, tensor in shown(state).items()}
     snapshot = Snapshot.of(state)
     trained(setup, steps=8, state=state)
-    snapshot.put_back(state)
+    snapshot.hand_over(state)
     assert state.step == 4 and same(shown(state), before)
 
 

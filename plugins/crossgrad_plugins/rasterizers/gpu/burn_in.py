@@ -5,6 +5,7 @@ Others have trained a first process on a fresh machine to 14 dB without any erro
 """
 
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 import torch
@@ -108,8 +109,9 @@ def difference(found: Look, expected: Look) -> str:
         return f"the loss is {found.loss:.6g}, not {expected.loss:.6g}"
     for name, gradient in expected.gradients.items():
         other = found.gradients.get(name, torch.zeros_like(gradient))
-        share = float((other - gradient).norm() / gradient.norm())
-        if not share < GRADIENT:
+        apart, length = float((other - gradient).norm()), float(gradient.norm())
+        if not apart <= GRADIENT * length:
+            share = apart / length if length else inf
             return f"the gradient of the {name} is {share:.2g} of its length off"
     return ""
 

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,11 +29,15 @@ def compiler_missing(package: str) -> str | None:
         return None
     nvcc, wanted = find_nvcc(), torch.version.cuda
     if nvcc is None:
+        home = _cuda_home()
         return (
             f"rasterizer {package} compiles its kernels when it is first used, and there is no "
-            f"nvcc: install the CUDA toolkit {wanted or ''} and set CUDA_HOME, or choose "
-            "--rasterizer gswarp, which needs a driver only"
+            f"nvcc{f' in {home}, where CUDA_HOME or CUDA_PATH points' if home else ''}: install "
+            f"the CUDA toolkit {wanted or ''} and set CUDA_HOME, or choose --rasterizer gswarp, "
+            "which needs a driver only"
         )
+    if shutil.which("ninja") is None and not _own_ninja().is_file():
+        return f"rasterizer {package} compiles its kernels and finds no ninja: pip install ninja"
     if shutil.which(os.environ.get("CXX", "c++")) is None:
         return f"rasterizer {package} compiles its kernels and finds no C++ compiler: install g++"
     found = nvcc_version(nvcc)
@@ -52,13 +57,31 @@ def is_compiled(package: str) -> bool:
     return any(path for place in places for path in Path(place).glob("csrc.*"))
 
 
+@cache
+def bring_ninja() -> None:
+    """Lets torch find the ninja that lies beside this Python, whose folder may not be on PATH."""
+    if shutil.which("ninja") is None:
+        folders = [os.environ.get("PATH", ""), str(_own_ninja().parent)]
+        os.environ["PATH"] = os.pathsep.join(filter(None, folders))
+
+
+def _own_ninja() -> Path:
+    """Where pip puts it in the environment of this Python."""
+    return Path(sys.executable).parent / "ninja"
+
+
 def find_nvcc() -> Path | None:
     """The CUDA compiler that torch would take."""
-    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH")]
-    given = [Path(home) / "bin" / "nvcc" for home in homes if home]
-    on_path = shutil.which("nvcc")
-    usual = [Path(on_path)] if on_path else [Path("/usr/local/cuda/bin/nvcc")]
-    return next((nvcc for nvcc in (*given, *usual) if nvcc.is_file()), None)
+    if home := _cuda_home():
+        nvcc = Path(home) / "bin" / "nvcc"
+    else:
+        nvcc = Path(shutil.which("nvcc") or "/usr/local/cuda/bin/nvcc")
+    return nvcc if nvcc.is_file() else None
+
+
+def _cuda_home() -> str:
+    """Where torch looks for the compiler and nowhere else; empty where that is not said."""
+    return os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH") or ""
 
 
 @cache
