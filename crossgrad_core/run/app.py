@@ -165,7 +165,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
             setup = _within(setup, config.seconds)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
-    setup = replace(setup, notes=(*setup.notes, *told_of_start(state)))
+    setup = replace(setup, notes=(*setup.notes, *told_of_start(setup, state)))
     state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))

@@ -20,8 +20,8 @@ from crossgrad_core.training.state import Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed
 
 #: Settings that say nothing about what was trained, or that a run which goes on may have changed:
-#: where things lie, what draws them on this machine, when there is a look at them, how many faults
-#: are borne, and a length that follows the clock.
+#: where things lie, when there is a look at them, how many faults are borne, and a length that
+#: follows the clock.
 _LOOSE: Final = frozenset(
     {
         "clock",
@@ -38,7 +38,6 @@ _LOOSE: Final = frozenset(
         "plan",
         "planned_seconds",
         "planned_views",
-        "rasterizer",
         "reading",
         "revisions",
         "save_every",
@@ -48,20 +47,28 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
+#: The component that another machine may not have.
+_DRAWN: Final = "rasterizer"
+#: Whether the length follows a clock.
+_TIMED: Final = "follows the clock"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
     """What trains a run, flat (`loss.ssim_weight`), and the version that does."""
-    data = config.model_dump(mode="json", exclude=set(_LOOSE))
-    if config.planned_seconds is not None:
-        del data["steps"]  # The clock may have changed them.
+    loose = set(_LOOSE)
+    if config.planned_seconds is None:
+        loose -= {"revisions"}
+    else:
+        loose |= {"steps"}  # The clock may have changed them.
+    data = config.model_dump(mode="json", exclude=loose)
+    del data[_DRAWN]["name"]  # What draws on this machine; how it does is another matter.
     # What `opening` reads where a run that began with the usual ones has written none.
     data |= {"sh_from": config.sh_from or 0, "sh_every": config.sh_every or 1}
     flat: dict[str, Json] = {"crossgrad": VERSION}
     for key, value in data.items():
         inner = value.items() if isinstance(value, dict) else ()
         flat |= {f"{key}.{name}": each for name, each in inner} or {key: value}
-    return flat
+    return {**flat, _TIMED: config.planned_seconds is not None}
 
 
 def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpoint:
@@ -120,7 +127,10 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     ours = settings_of(config)
     # A setting that came later is none that was changed; an option of a component may be.
     known = {key.partition(".")[0] for key in stored}
-    both = (key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known)
+    both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
+    # Another rasterizer has other options, and a length that follows the clock is none of these.
+    either = {_DRAWN, "steps", "revisions"}
+    both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
     if changed:
         raise UserError(

@@ -138,11 +138,17 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
     return scene.with_points(np.sort(np.concatenate([np.flatnonzero(added), own])))
 
 
-def told_of_start(state: TrainState) -> tuple[str, ...]:
-    """What to say of a start with fewer primitives than the points would have made."""
-    kept = state.states.get(THINNED)
+def told_of_start(setup: Setup, state: TrainState) -> tuple[str, ...]:
+    """What to say of a start with fewer primitives than there were, or with more than asked for."""
+    kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:
-        return ()
+        present = state.primitives(setup)
+        if not isinstance(most, int) or present <= most:
+            return ()
+        return (
+            f"start: {present:,} primitives, more than --max-gaussians {most:,}: a PLY is taken "
+            "as it is, and none is added",
+        )
     start, crowd = kept.values["start"], kept.values["of"]
     return (
         f"start: {start:,} primitives instead of {crowd:,}, from points drawn at random: "

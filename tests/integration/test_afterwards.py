@@ -167,10 +167,10 @@ def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(fin
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")
 def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path, caplog):
     path = finished / "config.yaml"
-    # Of the options the rasterizers of a CPU have two.
-    drawn = {"name": "gsplat", "near": 0.01, "dilation": 0.3, "max_alpha": 0.999}
-    stored = {**yaml.safe_load(path.read_text()), "device": "cuda", "rasterizer": drawn}
-    path.write_text(yaml.safe_dump(stored))
+    stored = yaml.safe_load(path.read_text())
+    options = {name: stored["rasterizer"][name] for name in ("near", "dilation", "max_alpha")}
+    drawn = {"device": "cuda", "rasterizer": {"name": "gsplat", **options}}
+    path.write_text(yaml.safe_dump({**stored, **drawn}))
     looks = (
         lambda how: export(finished, out=tmp_path / "a.ply", how=how),
         lambda how: figures.evaluate(finished, how),

@@ -82,6 +82,30 @@ def test_settings_that_were_changed_are_still_refused(run, capsys):
     assert "config.yaml was changed since this run began" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("dilation: 0.3", "dilation: 1.5", "rasterizer.dilation"),
+        ("max_alpha: 0.99", "max_alpha: 0.5", "rasterizer.max_alpha"),
+        ("near: ", "near: 1", "rasterizer.near"),
+        ("revisions: []", "revisions: [[1, 2]]", "revisions"),
+        ("planned_seconds: null", "planned_seconds: 5.0", "follows the clock"),
+    ],
+)
+def test_how_a_run_is_drawn_and_what_its_length_follows_stay_as_they_were(
+    run, capsys, old, new, named
+):
+    text = (run / "config.yaml").read_text()
+    assert text.count(old) == 1
+    (run / "config.yaml").write_text(text.replace(old, new))
+    before = (run / "per_view.csv").read_text()
+    assert ended("eval", run) == 2
+    told = capsys.readouterr().err
+    assert "config.yaml was changed since this run began" in told
+    assert f"settings {named}; step" in told
+    assert (run / "per_view.csv").read_text() == before
+
+
 def test_a_figure_that_cannot_be_measured_now_stays(run, capsys):
     lines = (run / "per_view.csv").read_text().splitlines()
     at = lines[0].split(",").index("lpips")

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config
@@ -47,12 +48,25 @@ class RunResults:
 
     @cached_property
     def scene_marks(self) -> Mapping[str, Any] | None:
-        """What the scene is known by: views with split, camera and photo; None of an older run."""
+        """What the scene is known by: views with split, camera and photo; None of an older run.
+
+        Raises:
+            UserError: The file is damaged.
+        """
         try:
             marks = read_json(self.folder / SCENE)
-        except (FileNotFoundError, ValueError):
+        except FileNotFoundError:
             return None
-        return marks if isinstance(marks, dict) else None
+        except ValueError:
+            marks = None
+        if isinstance(marks, dict) and isinstance(marks.get("views"), dict):
+            return marks
+        raise UserError(
+            "unreadable scene.json",
+            where=self.folder / SCENE,
+            expected="the views of the scene, with what their photos are known by",
+            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+        )
 
     def figure(self, name: str, regime: str | None = None) -> float | None:
         """A figure of the last evaluation, overall or of one regime; None where there is none."""

@@ -143,7 +143,7 @@ def _sort_in(found: Found, name: str, results: "RunResults", label: str | None) 
         found.left_out[name] = f"failed: {' '.join(str(run.summary.get('error')).split())}"
     elif run.status != "finished":
         found.left_out[name] = "was stopped before its end"
-    elif not results.rows:
+    elif not results.rows and not (run.summary.get("overall") or {}).get("views"):
         found.left_out[name] = "was never evaluated: metrics.csv has no row"
     else:
         _check_whole(results)
@@ -151,19 +151,21 @@ def _sort_in(found: Found, name: str, results: "RunResults", label: str | None) 
 
 
 def _check_whole(results: "RunResults") -> None:
-    """Refuses a finished run of which a table is cut off or gone: readings would be of elsewhere.
+    """Refuses a finished run of which a file is cut off or gone: readings would be of elsewhere.
 
     Raises:
-        UserError: metrics.csv ends before the run did, or held-out views have no figures.
+        UserError: metrics.csv ends before the run did, held-out views have no figures, or the marks
+            of the scene cannot be read.
     """
-    summary = results.summary or {}
-    last, steps = results.rows[-1].get("step"), summary.get("step")
+    summary, _ = results.summary or {}, results.scene_marks
+    last = results.rows[-1].get("step") if results.rows else None
+    steps = summary.get("step")
     if last != steps:
         raise UserError(
             "metrics.csv does not go to the end of the run",
             where=results.folder / "metrics.csv",
             expected=f"a last row of step {steps}, which summary.json is of",
-            found=f"step {last:.0f}" if last is not None else "no step",
+            found=f"step {last:.0f}" if last is not None else "no row with a step",
             todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
         )
     if (summary.get("overall") or {}).get("views") and not results.views:

@@ -59,6 +59,36 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
+@pytest.mark.parametrize("content", ['{"format": 1, "views": {"a/1.j', "{}", "[]", '{"views": 1}'])
+def test_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
+    """Without it nobody would see that photos differ."""
+    RunFolder().write(tmp_path / "1")
+    other = RunFolder(views_per_step=2).write(tmp_path / "2")
+    (other / "scene.json").write_text(content)
+    with pytest.raises(UserError, match=r"unreadable scene.json(.|\n)*--skip-broken"):
+        read_runs([tmp_path], skip_broken=False)
+    found = read_runs([tmp_path], skip_broken=True)
+    assert len(found.runs) == 1 and list(found.left_out) == ["2"]
+
+
+def test_a_missing_scene_file_is_told(tmp_path):
+    for number in (1, 2):
+        folder = RunFolder(views_per_step=number).write(tmp_path / str(number))
+    assert not any("scene.json" in note for note in comparison(tmp_path).notes)
+    (folder / "scene.json").unlink()
+    (told,) = (note for note in comparison(tmp_path).notes if "scene.json" in note)
+    assert told.endswith("which photos they had: 2")
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_finished_run_without_its_metrics_is_refused(tmp_path, rows):
+    folder = RunFolder().write(tmp_path / "1")
+    lines = (folder / "metrics.csv").read_text().splitlines(keepends=True)
+    (folder / "metrics.csv").write_text("".join(lines[:1])[: None if rows else 20])
+    with pytest.raises(UserError, match=r"does not go to the end of the run"):
+        read_runs([tmp_path], skip_broken=False)
+
+
 def test_another_training_split_is_refused(tmp_path):
     first, second = RunFolder().write(tmp_path / "1"), RunFolder(seed=1).write(tmp_path / "2")
     scene = (first / "scene.json").read_text().replace('"trained": true', '"trained": false', 1)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Final
 
-from crossgrad_core.commands import UserError
+from crossgrad_core.commands import UserError, listed
 from crossgrad_plugins.compare.run import Run
 
 #: The note on the photos' sizes that every run writes.
@@ -16,7 +16,8 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     """Refuses runs of one scene that differ in split, photos, sizes or resize filter.
 
     Returns:
-        Notes: of which scenes the regimes differ, so that only overall figures are compared.
+        Notes: of which runs that cannot be told in full, and of which scenes the regimes differ, so
+        that only overall figures are compared.
 
     Raises:
         UserError: Figures of these runs do not compare, with the reason.
@@ -25,7 +26,12 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
         own = [run for run in runs if run.scene == scene]
         for question in (_check_held_out, _check_photos, _check_sizes, _check_trained):
             question(scene, own)
-    return [
+    unknown = [run.name for run in runs if run.results.scene_marks is None]
+    notes = []
+    if unknown and len(runs) > 1:
+        shown = listed([*unknown[:_MOST_SHOWN], *["..."][: len(unknown) > _MOST_SHOWN]])
+        notes.append(f"no scene.json, so that nobody can tell which photos they had: {shown}")
+    return notes + [
         f"regimes are not compared on {scene}: its runs label the held-out views differently"
         for scene in differing_regimes(runs)
     ]
