@@ -11,6 +11,8 @@ that the last code held out, which the first one has to hold out, too. Runs have
 as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of
 a pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
 black: drawn by `crossgrad eval --ply` and, where `--max-size` is not 0, by `viewer.py`.
+`table OUT --figure NAME` compares another figure of the held-out views, such as `ssim`, as
+summary.json has it.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \
         --code long=VENV/bin/crossgrad --code new=VENV/bin/crossgrad --max-size 0 --seconds 600:60
@@ -160,6 +162,7 @@ def table(given: argparse.Namespace) -> None:
     by_case: dict[tuple[str, str], dict[str, dict[int, Row]]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
+        row["compared"] = row["ply"] if given.figure is None else _told(path.parent, given.figure)
         by_case[row["scene"], row["lengths"]].setdefault(row["code"], {})[row["seed"]] = row
     cases = sorted(by_case.items(), key=lambda case: (case[0][0], _first(case[0][1])))
     titles = "scene | code | commit | training s | seeds | PLY, dB | viewer.py, dB | steps"
@@ -176,39 +179,52 @@ def table(given: argparse.Namespace) -> None:
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])
             old.setdefault((scene, alone), codes["old"])
     for code in sorted({code for _, codes in cases for code in codes} - {"old"}):
-        _print_gains(code, cases, old)
+        _print_gains(code, cases, old, given.figure)
+
+
+def _told(folder: Path, figure: str) -> float:
+    """A figure of a run, over all held-out views."""
+    return float(json.loads((folder / "summary.json").read_text())["overall"][figure])
 
 
 def _print_gains(
     code: str,
     cases: Sequence[tuple[tuple[str, str], dict[str, dict[int, Row]]]],
     old: Mapping[tuple[str, str], dict[int, Row]],
+    figure: str | None,
 ) -> None:
     """Prints what a code gains over `old`: by scene, and over the scenes of the same lengths."""
     gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
+    margin, digits = (0.005, 4) if figure == "ssim" else (0.1, 2)
     for (scene, lengths), codes in cases:
         before, now = old.get((scene, lengths), {}), codes.get(code, {})
         if seeds := sorted(before.keys() & now.keys()):
-            gains[lengths][scene] = [now[seed]["ply"] - before[seed]["ply"] for seed in seeds]
+            gains[lengths][scene] = [
+                now[seed]["compared"] - before[seed]["compared"] for seed in seeds
+            ]
     found = [
-        (scene, lengths, estimate(own, [scene] * len(own), 0.1))
+        (scene, lengths, estimate(own, [scene] * len(own), margin))
         for lengths, by_scene in gains.items()
         for scene, own in by_scene.items()
     ]
-    titles = f"scene | length | {code} - old, dB | 95 % | 90 % | pairs | verdict"
+    shown = figure or "dB"
+    titles = f"scene | length | {code} - old, {shown} | 95 % | 90 % | pairs | verdict"
     print(f"\n| {titles} |\n{'|---' * 7}|")
     for (*what, each), verdict in zip(found, verdicts([e for *_, e in found]), strict=True):
-        print(f"| {' | '.join([*what, *_gain(each), verdict.value])} |")
+        print(f"| {' | '.join([*what, *_gain(each, digits), verdict.value])} |")
     for lengths, by_scene in gains.items():
         if len(by_scene) > 1:
             own = [gain for each in by_scene.values() for gain in each]
             scenes = [scene for scene, each in by_scene.items() for _ in each]
-            print(f"| all | {lengths} | {' | '.join(_gain(estimate(own, scenes, 0.1)))} | |")
+            (verdict,) = verdicts([whole := estimate(own, scenes, margin)])
+            print(f"| all | {lengths} | {' | '.join(_gain(whole, digits))} | {verdict.value} |")
 
 
-def _gain(each: Estimate) -> Iterator[str]:
-    yield f"{each.center:+.2f}"
-    yield from (f"[{low:+.2f}, {high:+.2f}]" for low, high in (each.wide, each.narrow))
+def _gain(each: Estimate, digits: int) -> Iterator[str]:
+    yield f"{each.center:+.{digits}f}"
+    yield from (
+        f"[{low:+.{digits}f}, {high:+.{digits}f}]" for low, high in (each.wide, each.narrow)
+    )
     yield str(each.pairs)
 
 
@@ -267,6 +283,7 @@ def main() -> None:
     tables = commands.add_parser("table", help="print what there is")
     tables.set_defaults(do=table)
     tables.add_argument("out", type=Path)
+    tables.add_argument("--figure", metavar="NAME")
     shares = commands.add_parser("share", help="print what short runs have of long ones")
     shares.set_defaults(do=share)
     shares.add_argument("out", type=Path)

@@ -174,6 +174,12 @@ class Scene:
         return tuple(self.views[i] for i in self.train)
 
     @cached_property
+    def train_pixels(self) -> float:
+        """Pixels of a training photo, mean; 0 without any."""
+        pixels = [view.camera.width * view.camera.height for view in self.train_views]
+        return sum(pixels) / max(1, len(pixels))
+
+    @cached_property
     def test_views(self) -> tuple[View, ...]:
         """The held-out views."""
         return tuple(self.views[i] for i in self.test)

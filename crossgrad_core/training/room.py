@@ -22,6 +22,9 @@ SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
 #: Where a run begins with few primitives, so many times as many are enough, though not fewer than
 #: that: a short run has no time to place more. Measured by us (docs/schedules.md).
 GROWN, LEAST_BUDGET = 2, 10_000
+#: Pixels of the photos with which that was measured (400 x 300), and the power of larger ones with
+#: which more pay: they show more. Measured by us (docs/schedules.md).
+PIXELS, FINER = 120_000, 0.4
 
 
 def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
@@ -60,7 +63,10 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
         start: Primitives at the start.
     """
     given = bound_of(setup)
-    budget = usual_budget(start, schedule.length) if given == AUTO else given or sys.maxsize
+    if given == AUTO:
+        budget = usual_budget(start, schedule.length, setup.scene.train_pixels)
+    else:
+        budget = given or sys.maxsize
     if growth_of(setup) == "free" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
@@ -73,15 +79,22 @@ def bound_of(setup: Setup) -> int | Literal["auto"] | None:
     return AUTO if given is None and growth_of(setup) == "curve" else given
 
 
-def usual_budget(start: int, length: int) -> int:
+def usual_budget(start: int, length: int, pixels: float = PIXELS) -> int:
     """The budget of a run that began with `start` primitives and has `length` views.
 
     It has no bound any more at the published length, whose rules know none.
+
+    Args:
+        start: Primitives at the start.
+        length: Views.
+        pixels: Of a training photo, mean.
     """
     if length >= REFERENCE:
         return sys.maxsize
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
     enough = min(SHORT_BUDGET, max(LEAST_BUDGET, GROWN * start))
+    if enough == SHORT_BUDGET:
+        stretch *= exp(FINER * log(max(1.0, pixels / PIXELS)))
     return round(max(enough, start) * stretch / (1.0 - length / REFERENCE))
 
 

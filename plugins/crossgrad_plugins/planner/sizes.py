@@ -71,17 +71,20 @@ def count(evidence: Evidence) -> Decision:
         "as suits the length",
         "default",
         "",
-        "30,000 or the start's, more in longer runs; no bound from 30,000 views on",
+        "30,000 or the start's, more in longer runs and of larger photos; no bound from 30,000 "
+        "views on",
         "docs/schedules.md (Taming 3DGS, metal-gauss)",
         "--max-gaussians N",
     )
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
     views = views_of_steps(evidence).paced(steps).views(steps)
-    budget = usual_budget(points, views)
+    pixels = evidence.scene.train_pixels
+    budget = usual_budget(points, views, pixels)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
-        f"{points:,} points, {views:,} views: {shown}", figures={"points": points, "views": views}
+        f"{points:,} points, {views:,} views, photos of {pixels / 1e6:.2f} MP: {shown}",
+        figures={"points": points, "views": views, "pixels": pixels},
     )
 
 

@@ -254,6 +254,11 @@ def test_budgets_by_length():
     assert usual_budget(90_000, 1_000) == 93_103
     assert usual_budget(90_000, 10_000) == 450_000
     assert usual_budget(5_000, 29_999) > 10**9
+    # Photos of up to 400 x 300 pixels have the same; a scene with few points has no time for more.
+    assert usual_budget(90_000, 1_000, 119_000) == usual_budget(90_000, 1_000, 120_000) == 93_103
+    assert usual_budget(90_000, 1_000, 480_000) == pytest.approx(90_000 * 30 / 29 * 4**0.4, abs=1)
+    assert usual_budget(20_000, 1_000, 480_000) == pytest.approx(30_000 * 30 / 29 * 4**0.4, abs=1)
+    assert usual_budget(14_000, 1_000, 480_000) == usual_budget(14_000, 1_000)
     lengths = range(1_000, 30_001, 500)
     budgets = [usual_budget(0, length) for length in lengths]
     assert budgets == sorted(set(budgets))
