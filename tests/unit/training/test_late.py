@@ -22,6 +22,7 @@ from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Snapshot, TrainState
 from crossgrad_operators.graddrop import GradDrop
@@ -384,14 +385,20 @@ def test_who_reads_a_tensor_gets_all_steps(read):
     assert torch.equal(found[[0, 2]], raw[[0, 2]]) and (found[1] < raw[1]).all()
 
 
-def test_going_back_forgets_what_was_late():
+@pytest.mark.parametrize(
+    "go_back",
+    [Snapshot.hand_over, lambda snapshot, state: snapshot.restore(state, seed=1)],
+    ids=["hand over", "rewind"],
+)
+def test_going_back_forgets_what_was_late(go_back):
     state = behind()
+    state.rngs = make_streams(0)
     snapshot = Snapshot.of(state)
     kept = state.tensors["x"].clone()
     gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
     coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
     state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
-    snapshot._restore_tensors(state)
+    go_back(snapshot, state)
     assert not state.late.names and torch.equal(state.parameters["x"], kept)
 
 
