@@ -71,7 +71,13 @@ from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Photo, Pinhole, Scene, View, centers_of
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.contract.schedule import REFERENCE, SHORTEST_ANCHOR_INTERVAL, Phase, Schedule
+from crossgrad_core.contract.schedule import (
+    REFERENCE,
+    SHORTEST_ANCHOR_INTERVAL,
+    Phase,
+    Schedule,
+    shortness,
+)
 from crossgrad_core.contract.selection import HasIdleOptions, Selection
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.start import MorePoints, Start
@@ -220,6 +226,7 @@ __all__ = [
     "read_rows",
     "screen_statistics",
     "set_for_nothing",
+    "shortness",
     "shows_bar",
     "size_text",
     "transformed",

@@ -1,6 +1,7 @@
 """When things happen: counted in the views that the steps have drawn, or in the steps."""
 
 from dataclasses import dataclass, replace
+from math import log
 from typing import Literal
 
 from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewPlan
@@ -11,6 +12,8 @@ Unit = Literal["views", "steps"]
 
 #: The length that every published figure is written for (3DGS), which has one view per step.
 REFERENCE = 30_000
+#: Views up to which what suits short runs is measured, and holds in full.
+SHORT = 3_000
 #: Learning rates of colour, scale and opacity are not stretched with the run, so the first
 #: transient always takes some hundred steps. Gradients are large everywhere during it, and growing
 #: then copies Gaussians that only had to settle.
@@ -345,3 +348,12 @@ class Phase:
     def count(self) -> int:
         """The schedule's count after the step."""
         return self.schedule.counted(self.step)
+
+
+def shortness(views: float) -> float:
+    """1 for runs of up to `SHORT` views, 0 for those as long as published, between them by the log.
+
+    What is right for short runs only fades with it.
+    """
+    short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
+    return min(1.0, max(0.0, short))

@@ -1,13 +1,13 @@
 """The learning rates of a step and how Adam averages in it."""
 
 from collections.abc import Iterator
-from math import log, sqrt
+from math import sqrt
 from typing import Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import BETAS, AdamRule
 from crossgrad_core.contract.blocks import LearningRate, Parameters
-from crossgrad_core.contract.schedule import REFERENCE, Schedule
+from crossgrad_core.contract.schedule import REFERENCE, SHORT, Schedule, shortness
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import faded
@@ -30,11 +30,9 @@ HURRIED_MOST: Final = 6.3
 #: All measured by us (docs/schedules.md).
 MEMORY, LEAST_MEMORY = 1 / 50, 50
 
-#: The decay of the first moment, which then averages over 3 steps, not 10, in runs of up to so many
-#: views; from there it rises with the logarithm of the length, to the published one in runs as long
-#: as published. Measured by us (docs/schedules.md).
+#: The decay of the first moment in short runs, which then averages over 3 steps, not 10.
+#: Measured by us (docs/schedules.md).
 SHORT_BETA1: Final = 0.7
-SHORT: Final = 3_000
 
 _RATES: Final = f"learning rates: those for {REFERENCE:,} steps (--rate-factor 1) times"
 
@@ -93,9 +91,8 @@ def _first_beta(setup: Setup) -> float:
         return config.beta1
     if not _forgets(setup):
         return BETAS[0]
-    views = max(1, schedule.pace.views(_planned(config, schedule)))
-    short = log(REFERENCE / views) / log(REFERENCE / SHORT)
-    return BETAS[0] - (BETAS[0] - SHORT_BETA1) * min(1.0, max(0.0, short))
+    views = schedule.pace.views(_planned(config, schedule))
+    return BETAS[0] - (BETAS[0] - SHORT_BETA1) * shortness(views)
 
 
 def _forgets(setup: Setup) -> bool:

@@ -5,7 +5,7 @@ from math import exp, log
 from typing import Literal, cast
 
 from crossgrad_core.config import AUTO
-from crossgrad_core.contract.schedule import REFERENCE, Schedule
+from crossgrad_core.contract.schedule import REFERENCE, Schedule, shortness
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.schedules import growth_of
@@ -23,7 +23,7 @@ SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
 #: that: a short run has no time to place more. Measured by us (docs/schedules.md).
 GROWN, LEAST_BUDGET = 2, 10_000
 #: Pixels of the photos with which that was measured (400 x 300), and the power of larger ones with
-#: which more pay: they show more. Measured by us (docs/schedules.md).
+#: which more pay in short runs: they show more. Measured by us (docs/schedules.md).
 PIXELS, FINER = 120_000, 0.4
 
 
@@ -94,7 +94,7 @@ def usual_budget(start: int, length: int, pixels: float = PIXELS) -> int:
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
     enough = min(SHORT_BUDGET, max(LEAST_BUDGET, GROWN * start))
     if enough == SHORT_BUDGET:
-        stretch *= exp(FINER * log(max(1.0, pixels / PIXELS)))
+        stretch *= exp(FINER * shortness(length) * log(max(1.0, pixels / PIXELS)))
     return round(max(enough, start) * stretch / (1.0 - length / REFERENCE))
 
 

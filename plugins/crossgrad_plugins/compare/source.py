@@ -157,7 +157,8 @@ def _check_whole(results: "RunResults") -> None:
         UserError: metrics.csv ends before the run did, held-out views have no figures, or the marks
             of the scene cannot be read.
     """
-    summary, _ = results.summary or {}, results.scene_marks
+    _ = results.scene_marks  # Refuses damaged ones.
+    summary = results.summary or {}
     last = results.rows[-1].get("step") if results.rows else None
     steps = summary.get("step")
     if last != steps:

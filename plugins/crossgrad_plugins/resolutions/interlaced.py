@@ -1,19 +1,18 @@
 """Some of the pixels of a photo for most of the run, all of them at its end."""
 
 from collections.abc import Mapping
-from math import ceil, isqrt, log
+from math import ceil, isqrt
 from statistics import median
 from typing import ClassVar, Literal
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import REFERENCE, Camera, Field, Scene, Schedule, listed
+from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed, shortness
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
 from crossgrad_plugins.resolutions.course import Course
 
-#: Share of a short run up to which one pixel of each 2 x 2 is drawn; it falls with the logarithm of
-#: the length from this count on, to 0 at the published length.
-_SHARE, _SHORT = 0.8, 3_000
+#: Share of a short run up to which one pixel of each 2 x 2 is drawn; of longer ones less.
+_SHARE = 0.8
 #: Shares of that up to which it is one of each 8 x 8, and of each 4 x 4.
 _EIGHTH, _QUARTER = 0.3, 0.6
 
@@ -57,8 +56,7 @@ class Interlaced(CoarseToFine):
         whole = schedule.counted(schedule.total)
         if self.until is not None:
             return self.until * whole
-        left = log(REFERENCE / whole) / log(REFERENCE / _SHORT)
-        return _SHARE * min(1.0, max(0.0, left)) * whole
+        return _SHARE * shortness(whole) * whole
 
     @override
     def parts(self) -> Mapping[str, Part]:

@@ -77,7 +77,7 @@ def test_a_missing_scene_file_is_told(tmp_path):
     assert not any("scene.json" in note for note in comparison(tmp_path).notes)
     (folder / "scene.json").unlink()
     (told,) = (note for note in comparison(tmp_path).notes if "scene.json" in note)
-    assert told.endswith("which photos they had: 2")
+    assert told.startswith("1 without") and told.endswith("which photos they had: 2")
 
 
 @pytest.mark.parametrize("rows", [0, 1])

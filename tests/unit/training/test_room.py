@@ -259,6 +259,9 @@ def test_budgets_by_length():
     assert usual_budget(90_000, 1_000, 480_000) == pytest.approx(90_000 * 30 / 29 * 4**0.4, abs=1)
     assert usual_budget(20_000, 1_000, 480_000) == pytest.approx(30_000 * 30 / 29 * 4**0.4, abs=1)
     assert usual_budget(14_000, 1_000, 480_000) == usual_budget(14_000, 1_000)
+    # In longer runs less, by the logarithm of the length.
+    finer = [usual_budget(90_000, n, 480_000) / usual_budget(90_000, n) for n in (9_487, 29_999)]
+    assert finer == [pytest.approx(4**0.2, rel=1e-4), pytest.approx(1.0, rel=1e-4)]
     lengths = range(1_000, 30_001, 500)
     budgets = [usual_budget(0, length) for length in lengths]
     assert budgets == sorted(set(budgets))

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Final
 
-from crossgrad_core.commands import UserError, listed
+from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import Run
 
 #: The note on the photos' sizes that every run writes.
@@ -16,7 +16,7 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     """Refuses runs of one scene that differ in split, photos, sizes or resize filter.
 
     Returns:
-        Notes: of which runs that cannot be told in full, and of which scenes the regimes differ, so
+        Notes: of which runs photos cannot be compared, and of which scenes the regimes differ, so
         that only overall figures are compared.
 
     Raises:
@@ -29,8 +29,11 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     unknown = [run.name for run in runs if run.results.scene_marks is None]
     notes = []
     if unknown and len(runs) > 1:
-        shown = listed([*unknown[:_MOST_SHOWN], *["..."][: len(unknown) > _MOST_SHOWN]])
-        notes.append(f"no scene.json, so that nobody can tell which photos they had: {shown}")
+        shown = ", ".join(unknown[:_MOST_SHOWN])
+        notes.append(
+            f"{len(unknown)} without scene.json, so that nobody can tell which photos they had: "
+            f"{shown}"
+        )
     return notes + [
         f"regimes are not compared on {scene}: its runs label the held-out views differently"
         for scene in differing_regimes(runs)
