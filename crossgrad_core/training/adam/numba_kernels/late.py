@@ -310,11 +310,19 @@ def update_all(
             a, b, begin = first * width, stop * width, place
             while place < rows.size and rows[place] < stop:
                 place += 1
-            if place - begin == stop - first:
+            drawn = place - begin
+            if drawn == stop - first:
                 own = grad[begin * width : place * width]
                 update(param[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 continue
             pulls[: b - a] = _ZERO
+            if width < WIDE:
+                # To look for runs of short rows takes longer than to copy each.
+                for k in range(begin, place):
+                    at, to = k * width, (np.intp(rows[k]) - first) * width
+                    for i in range(width):
+                        pulls[to + i] = grad[at + i]
+                begin = place
             k = begin
             while k < place:
                 # Rows that follow one another are copied in one go.
@@ -324,12 +332,8 @@ def update_all(
                 at, to, size = k * width, (np.intp(rows[k]) - first) * width, run * width
                 for i in range(0, size - WIDE + 1, WIDE):
                     store(pulls, to + i, load_wide(grad, at + i))
-                if size >= WIDE:
-                    store(pulls, to + size - WIDE, load_wide(grad, at + size - WIDE))
-                else:
-                    for i in range(size):
-                        pulls[to + i] = grad[at + i]
+                store(pulls, to + size - WIDE, load_wide(grad, at + size - WIDE))
                 k += run
-            if place > begin or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
+            if drawn or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
         task = take(jobs, tasks)

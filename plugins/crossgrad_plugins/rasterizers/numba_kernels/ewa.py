@@ -115,7 +115,6 @@ def jacobian_rows(
     camera: KernelCamera, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
 ) -> tuple[Triple, Triple]:
     """Returns both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
-    pose = camera.pose
     a, b = camera.fx * inverse_z, camera.fy * inverse_z
     return (
         (
