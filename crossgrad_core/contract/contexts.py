@@ -325,6 +325,7 @@ class DensifyContext(StepContext):
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
         may_grow: [P] bool, the primitives that may grow; None where all may.
+        led: Whether growth follows the curve to a budget, in a run shorter than the published ones.
         render: Renders a training view of the densifier's choice: on the training clock, and
             counted among the rendered views.
     """
@@ -338,6 +339,7 @@ class DensifyContext(StepContext):
     render: RenderOnRequest = field(default=no_renders, kw_only=True)
     share: float = field(default=1.0, kw_only=True)
     may_grow: Tensor | None = field(default=None, kw_only=True)
+    led: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

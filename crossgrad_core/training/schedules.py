@@ -53,6 +53,12 @@ def growth_by(config: RunConfig, *, budgeted: bool) -> Literal["free", "curve"]:
     return "curve" if led and not named else "free"
 
 
+def is_led(config: RunConfig, densifier: Densifier, schedule: Schedule) -> bool:
+    """Whether growth follows the curve, in a run shorter than the published ones."""
+    short = schedule.length < REFERENCE
+    return short and growth_by(config, budgeted=densifier.budgeted) == "curve"
+
+
 def unit_of(config: RunConfig) -> Unit:
     """What events are counted in: steps where published numbers are to hold, elsewhere views."""
     if config.events is not None:
@@ -66,8 +72,7 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of a run of `steps` steps: the densifier's times, then what the user set."""
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
-    led = growth_by(config, budgeted=densifier.budgeted) == "curve"
-    if led and schedule.length < REFERENCE:
+    if is_led(config, densifier, schedule):
         # They hold back growth, which the curve does, and with them goes what fills the far ground.
         schedule = replace(schedule, reset_every=None)
     edits = _given(config, _EDITS)
@@ -93,7 +98,7 @@ def _curve_note(setup: Setup) -> tuple[str, ...]:
     resets = "" if setup.schedule.reset_every else ", without resets of the opacities"
     return (
         "growth follows a curve to the number of primitives that suits the length (--max-gaussians "
-        f"auto){resets}; --growth free adds as many as density control asks for",
+        f"auto){resets}; --growth free adds as many as density control asks for, as published",
     )
 
 

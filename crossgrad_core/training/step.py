@@ -37,6 +37,7 @@ from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.regularize import TensorGradients, add_regularization, joined
 from crossgrad_core.training.room import room_of
+from crossgrad_core.training.schedules import is_led
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import follow, restart
@@ -216,6 +217,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         share=len(rendered.observed) / len(rendered.records),
         means_lr=means_rate_at(setup, state.step),
         room=room_of(setup, state, rendered),
+        led=is_led(setup.config, setup.densifier, setup.schedule),
         render=OnRequest(setup, state, counted=True),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, Densified)

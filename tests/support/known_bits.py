@@ -47,7 +47,13 @@ USUAL: Mapping[str, Any] = {
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.
 CASES: Mapping[str, Mapping[str, Any]] = {
-    "bundled": {"max_size": 80, "reset_every": 30, "growth": "curve", "max_gaussians": 24_000},
+    "bundled": {
+        "max_size": 80,
+        "reset_every": 30,
+        "growth": "curve",
+        "max_gaussians": 24_000,
+        "densifier": {"name": "adc", "division": "drawn"},
+    },
     "bundled filled": {"max_size": 80, "start": "filled"},
     **{each: {"backbone": each, "operator": "symmetric"} for each in BACKBONES},
     "exposure": {"exposure": "affine", "views": 3},

@@ -9,7 +9,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, Selection, screen_statistics
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
+from crossgrad_plugins.densifiers.axis_split import AxisSplit
+from crossgrad_plugins.densifiers.clone_split import Growth
 
 #: Criterion -> the thresholds that it compares with.
 _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
@@ -19,7 +20,7 @@ _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
 }
 
 
-class AbsGradDensityControl(CloneSplit):
+class AbsGradDensityControl(AxisSplit):
     """Adaptive density control that pixels pulling in opposite directions cannot hide from.
 
     Beside the norm g of the projected mean's gradient, the pixels' absolute gradients are summed,
@@ -38,11 +39,17 @@ class AbsGradDensityControl(CloneSplit):
     abs_threshold: float = Field(4e-4, gt=0, description="of ga: abs (splits)")
     gsplat_threshold: float = Field(8e-4, gt=0, description="of ga: gsplat (clones and splits)")
 
+    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
         used = _THRESHOLDS[self.criterion]
         why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave it out"
-        return dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)
+        unused = dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)
+        return {**super().idle_options(selection), **unused}
+
+    @property
+    @override
+    def by_size(self) -> bool:
+        return self.criterion == "abs"
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:

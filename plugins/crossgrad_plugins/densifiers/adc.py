@@ -6,10 +6,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, screen_statistics
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
+from crossgrad_plugins.densifiers.axis_split import AxisSplit
+from crossgrad_plugins.densifiers.clone_split import Growth
 
 
-class AdaptiveDensityControl(CloneSplit):
+class AdaptiveDensityControl(AxisSplit):
     """Clones small and splits large Gaussians whose projected mean moves; prunes faint ones.
 
     The statistic of a Gaussian is the mean over the renders in which it was visible of the norm of

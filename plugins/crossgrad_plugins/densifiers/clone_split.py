@@ -110,6 +110,10 @@ class CloneSplit(Densifier):
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
         """What grows, given the statistics and which primitives are small [P] (to be cloned)."""
 
+    def divided(self, context: DensifyContext, growth: Growth) -> Growth:
+        """What of it is cloned, and what split; by default as `growth` has it."""
+        return growth
+
     def grown_values(
         self, context: DensifyContext, state: PluginState, plan: Plan
     ) -> dict[str, Rows]:
@@ -142,7 +146,7 @@ class CloneSplit(Densifier):
         largest = torch.exp(context.parameters["scales"].detach()).amax(dim=1)
         small = largest <= self.split_scale
         growth = self.growth(context, state, small).among(context.may_grow)
-        growth, held_back = growth.limited(context.room)
+        growth, held_back = self.divided(context, growth).limited(context.room)
         plan = Plan.of(growth)
         values = self.grown_values(context, state, plan) if bool(plan.fresh.any()) else {}
         keep = ~self.pruned(context, state, plan, values)

@@ -23,7 +23,8 @@ from crossgrad_core.plugin import (
     screen_statistics,
 )
 from crossgrad_plugins.densifiers.absgrad import gradient_sums
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan, edited_parameters
+from crossgrad_plugins.densifiers.axis_split import AxisSplit
+from crossgrad_plugins.densifiers.clone_split import Growth, Plan, edited_parameters
 from crossgrad_plugins.densifiers.marked_counts import CountsMarkedPixels
 
 #: Shortest interval of edits, in views (the published one of the larger variant).
@@ -32,7 +33,7 @@ SHORTEST_INTERVAL = 100
 LATE = "late"
 
 
-class MultiViewDensityControl(CountsMarkedPixels, CloneSplit):
+class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     """Clones and splits only what several views ask for; prunes by what they say, early and late.
 
     A Gaussian grows where it is blended in more than `importance` erroneous pixels of a view on
@@ -58,12 +59,17 @@ class MultiViewDensityControl(CountsMarkedPixels, CloneSplit):
     late_opacity: float = Field(0.1, ge=0, lt=1, description="late prunings remove below")
     late_score: float = Field(0.9, gt=0, le=1, description="... and above this share in the error")
 
+    @override
     def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
         late = len(self.late_prunings) > 0
         why = "there are no late_prunings; leave it out"
         unused = {} if late else {"late_opacity": why, "late_score": why}
-        return {**self.idle_counting(renders=late), **unused}
+        return {**super().idle_options(selection), **self.idle_counting(renders=late), **unused}
+
+    @property
+    @override
+    def by_size(self) -> bool:
+        return True
 
     @override
     def window(self, schedule: Schedule) -> Schedule:

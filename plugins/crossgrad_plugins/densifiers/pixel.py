@@ -6,10 +6,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, ViewRecord, screen_statistics
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth
+from crossgrad_plugins.densifiers.axis_split import AxisSplit
+from crossgrad_plugins.densifiers.clone_split import Growth
 
 
-class PixelDensityControl(CloneSplit):
+class PixelDensityControl(AxisSplit):
     """Adaptive density control whose statistic is weighted by pixels and scaled by depth.
 
     A render in which a Gaussian fills many pixels counts for more: the statistic is

@@ -1,0 +1,92 @@
+"""Growth along the longest axis: whatever grows becomes two Gaussians, side by side on it."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import log, sqrt
+from typing import Final, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.numerics.elementwise import logsigmoid
+from crossgrad_core.numerics.rotations import rotation_matrices
+from crossgrad_core.plugin import DensifyContext, PluginState, Rows, Selection
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
+
+#: Length of a child on the axis, in parents. Two of these, so far to either side that they have the
+#: variance of the parent together, and so much fainter that they cover as much.
+_KEPT: Final = 0.6
+_APART: Final = sqrt(1.0 - _KEPT**2)
+_FAINTER: Final = 1.0 / (2.0 * _KEPT)
+
+
+class AxisSplit(CloneSplit):
+    """Clones and splits as 3DGS does, or splits all that grows, side by side on its longest axis.
+
+    A clone lies where its parent does and has its gradients: both move as one until noise parts
+    them, and are more opaque together than the parent was. Children drawn at random leave holes.
+    Those side by side show what the parent showed, and differ from the first step on.
+    """
+
+    division: Literal["drawn", "axis"] | None = Field(
+        None,
+        description="what grows becomes: drawn, a clone if it is small, else two drawn from it, as "
+        "published; axis, two side by side on its longest axis; none: axis where growth follows "
+        "the curve in a run shorter than the published ones",
+    )
+
+    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasIdleOptions`."""
+        if self.division != "axis" or self.by_size:
+            return {}
+        return {"split_scale": "with division axis nothing depends on the size; leave it out"}
+
+    @property
+    def by_size(self) -> bool:
+        """Whether `split_scale` says more than what is cloned: by which statistic what grows."""
+        return False
+
+    def _sides(self, context: DensifyContext) -> bool:
+        """Whether children lie side by side."""
+        return context.led if self.division is None else self.division == "axis"
+
+    @override
+    def divided(self, context: DensifyContext, growth: Growth) -> Growth:
+        if not self._sides(context):
+            return growth
+        grown = growth.clone | growth.split
+        return replace(growth, clone=torch.zeros_like(grown), split=grown)
+
+    @override
+    def grown_values(
+        self, context: DensifyContext, state: PluginState, plan: Plan
+    ) -> dict[str, Rows]:
+        if not self._sides(context):
+            return super().grown_values(context, state, plan)
+        rows = plan.child.nonzero().squeeze(1)
+        # The first children of all parents come before the second ones.
+        parents = plan.source[rows[: len(rows) // 2]]
+        left, right = side_by_side(context, parents)
+        return {name: Rows(torch.cat([left[name], right[name]]), rows) for name in left}
+
+
+def side_by_side(
+    context: DensifyContext, parents: Tensor
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """New values of two children of each parent [S], left and right of its middle.
+
+    Source: the fixed places on the longest axis are those of Deng et al. 2024 (arXiv 2411.10133),
+    the numbers ours.
+    """
+    edited = ("means", "scales", "quats", "opacities")
+    old = {name: context.parameters[name].detach()[parents] for name in edited}
+    longest = old["scales"].argmax(dim=1, keepdim=True)
+    axis = rotation_matrices(old["quats"]).gather(2, longest[:, None].expand(-1, 3, 1)).squeeze(2)
+    offset = axis * (_APART * torch.exp(old["scales"].gather(1, longest)))
+    along = torch.zeros_like(old["scales"], dtype=torch.bool).scatter(1, longest, value=True)
+    scales = torch.where(along, old["scales"] + log(_KEPT), old["scales"])
+    opacity = logsigmoid(old["opacities"]) + log(_FAINTER)
+    both = {"scales": scales, "opacities": opacity - torch.log(-torch.expm1(opacity))}
+    return {"means": old["means"] - offset, **both}, {"means": old["means"] + offset, **both}
