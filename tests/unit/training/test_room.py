@@ -17,6 +17,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.schedule import Counting, Schedule
 from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
@@ -31,7 +32,12 @@ from crossgrad_core.training.start import first_state, thinned, told_of_start
 
 #: Densifiers that want more than any curve gives them, and their backbones.
 GREEDY = {
-    "adc": {"grad_threshold": 1e-12, "prune_opacity": 0, "split_scale": 100},
+    "adc": {
+        "grad_threshold": 1e-12,
+        "prune_opacity": 0,
+        "split_scale": 100,
+        "division": "drawn",
+    },
     "absgrad": {"grad_threshold": 1e-12, "abs_threshold": 1e-12, "prune_opacity": 0},
     "pixel": {"grad_threshold": 1e-12, "prune_opacity": 0},
     "dc4gs": {"split_threshold": 1e-12, "grad_threshold": 1e-12, "prune_opacity": 0},
@@ -102,6 +108,32 @@ def test_the_strongest_come_first():
     some, many = found["curve"], found["free"]
     assert 0 < len(some) < len(many)
     assert {tuple(row) for row in some.tolist()} <= {tuple(row) for row in many.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("settings", "led"),
+    [
+        ({}, True),
+        ({"growth": "free"}, False),
+        ({"max_gaussians": 60}, False),
+        ({"growth": "curve", "max_gaussians": 60}, True),
+        ({"preset": "inria"}, False),
+        ({"steps": 30_000, "growth": "curve"}, False),
+        ({"densifier": {"name": "mcmc"}}, False),
+    ],
+)
+def test_densifiers_hear_whether_a_short_run_leads_growth(settings, led, monkeypatch):
+    config = RunConfig.model_validate({"steps": 2_000, **settings})
+    setup = assemble(config, sample_scene(), "none")
+    heard = []
+
+    def densify(_, context, state):
+        heard.append(context.led)
+        return NO_EDIT, state
+
+    monkeypatch.setattr(type(setup.densifier), "densify", densify)
+    timed_step(setup, first_state(setup))
+    assert heard == [led]
 
 
 def test_what_was_pruned_may_be_added_again():
