@@ -68,25 +68,42 @@ class AxisSplit(CloneSplit):
         rows = plan.child.nonzero().squeeze(1)
         # The first children of all parents come before the second ones.
         parents = plan.source[rows[: len(rows) // 2]]
-        left, right = side_by_side(context, parents)
+        left, right = (
+            child_on_axis(context, parents, place, log(_KEPT), log(_FAINTER))
+            for place in (-_APART, _APART)
+        )
         return {name: Rows(torch.cat([left[name], right[name]]), rows) for name in left}
 
 
-def side_by_side(
-    context: DensifyContext, parents: Tensor
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """New values of two children of each parent [S], left and right of its middle.
+def child_on_axis(
+    context: DensifyContext,
+    parents: Tensor,
+    place: Tensor | float,
+    length: Tensor | float,
+    opacity: Tensor | float,
+) -> dict[str, Tensor]:
+    """New values of a child of each parent [S] on its longest axis.
 
-    Source: the fixed places on the longest axis are those of Deng et al. 2024 (arXiv 2411.10133),
-    the numbers ours.
+    Args:
+        context: The step.
+        parents: Rows of the parents.
+        place: [S] of the child's middle from the parent's, standard deviations on the axis.
+        length: [S] logarithm of its length there over the parent's.
+        opacity: [S] logarithm of its opacity over the parent's.
+
+    Source: fixed places on the longest axis as in Deng et al. 2024 (arXiv 2411.10133).
     """
     edited = ("means", "scales", "quats", "opacities")
     old = {name: context.parameters[name].detach()[parents] for name in edited}
-    longest = old["scales"].argmax(dim=1, keepdim=True)
-    axis = rotation_matrices(old["quats"]).gather(2, longest[:, None].expand(-1, 3, 1)).squeeze(2)
-    offset = axis * (_APART * torch.exp(old["scales"].gather(1, longest)))
-    along = torch.zeros_like(old["scales"], dtype=torch.bool).scatter(1, longest, value=True)
-    scales = torch.where(along, old["scales"] + log(_KEPT), old["scales"])
-    opacity = logsigmoid(old["opacities"]) + log(_FAINTER)
-    both = {"scales": scales, "opacities": opacity - torch.log(-torch.expm1(opacity))}
-    return {"means": old["means"] - offset, **both}, {"means": old["means"] + offset, **both}
+    longest = old["scales"].argmax(dim=1)
+    each = torch.arange(len(parents), device=parents.device)
+    axis = rotation_matrices(old["quats"])[each, :, longest]
+    width = torch.exp(old["scales"][each, longest])
+    scales = old["scales"].clone()
+    scales[each, longest] += length
+    logarithm = logsigmoid(old["opacities"]) + opacity
+    return {
+        "means": old["means"] + axis * (place * width)[:, None],
+        "scales": scales,
+        "opacities": logarithm - torch.log(-torch.expm1(logarithm)),
+    }

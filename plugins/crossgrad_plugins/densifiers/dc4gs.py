@@ -5,9 +5,8 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.numerics.elementwise import logsigmoid
-from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
+from crossgrad_plugins.densifiers.axis_split import child_on_axis
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,
@@ -82,19 +81,6 @@ def _child(
     The longest axis is six standard deviations long. The left child has the first share p of it,
     and that share of the opacity: its middle is 3 (1 - p) deviations left of the parent's.
     """
-    edited = ("means", "scales", "quats", "opacities")
-    old = {name: context.parameters[name].detach()[parents] for name in edited}
     share = 1.0 - position if right else position
     place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)
-    longest = old["scales"].argmax(dim=1)
-    each = torch.arange(len(parents), device=parents.device)
-    axis = rotation_matrices(old["quats"])[each, :, longest]
-    width = torch.exp(old["scales"][each, longest])
-    scales = old["scales"].clone()
-    scales[each, longest] += torch.log(share)
-    opacity = logsigmoid(old["opacities"]) + torch.log(share)
-    return {
-        "means": old["means"] + axis * (place * width)[:, None],
-        "scales": scales,
-        "opacities": opacity - torch.log(-torch.expm1(opacity)),
-    }
+    return child_on_axis(context, parents, place, torch.log(share), torch.log(share))
