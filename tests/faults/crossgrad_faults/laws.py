@@ -21,7 +21,11 @@ def parses(folder: Path) -> None:
     """Every file that has its final name is whole."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not is_scratch(path.relative_to(folder)):
-            READERS.get(path.suffix, Path.read_bytes)(path)
+            try:
+                READERS.get(path.suffix, Path.read_bytes)(path)
+            except Exception as error:
+                error.add_note(f"{path}, {path.stat().st_size} bytes")
+                raise
 
 
 def is_scratch(path: Path) -> bool:
