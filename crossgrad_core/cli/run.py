@@ -10,6 +10,7 @@ import typer
 from crossgrad_core.cli.resuming import refuse_beside_resume
 from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCENE
 from crossgrad_core.defaults import PREPARING_READER
+from crossgrad_core.errors import UserError
 from crossgrad_core.run.options import OPTIONS, Option
 from crossgrad_core.system.startup import announce
 
@@ -138,21 +139,27 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
     announce(quiet=given["quiet"])
     if given["resume"] is not None:
         refuse_beside_resume(given["resume"], given)
-    from crossgrad_core.run.settings import merged
+    from crossgrad_core.run.settings import merged, name_file
 
     settings = {option.name: given[option.name] for option in OPTIONS}
     if given["prepare"]:
         settings["reader"] = settings["reader"] or PREPARING_READER
-    wanted = merged(given["config"], settings, given["assignments"] or [])
+    config, assignments = given["config"], given["assignments"] or []
+    wanted = merged(config, settings, assignments)
 
     from crossgrad_core.run import app
 
-    code = app.run(
-        wanted,
-        resume=given["resume"],
-        dry_run=given["dry_run"],
-        verbosity=-1 if given["quiet"] else int(given["verbose"]),
-        accept_scene=given["accept_scene"],
-        check=given["check"],
-    )
+    try:
+        code = app.run(
+            wanted,
+            resume=given["resume"],
+            dry_run=given["dry_run"],
+            verbosity=-1 if given["quiet"] else int(given["verbose"]),
+            accept_scene=given["accept_scene"],
+            check=given["check"],
+        )
+    except UserError as error:
+        if config is not None:
+            name_file(error, config, settings, assignments)
+        raise
     raise typer.Exit(code)

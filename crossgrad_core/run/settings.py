@@ -61,6 +61,24 @@ def merged(
     return _named_by_default(settings)
 
 
+def name_file(
+    error: UserError, config: Path, options: Mapping[str, object], assignments: Sequence[str]
+) -> None:
+    """Lets an error say which configuration file made the setting that it is about.
+
+    Args:
+        error: About the settings of `merged`.
+        config: The file, as given to `merged`; likewise the others.
+        options: Settings given beside the file, which are not the file's.
+        assignments: Likewise.
+    """
+    key = error.where.removeprefix("--").split(".")[0].replace("-", "_")
+    beside = {path[0] for path in [*_places(options), *(_parsed(each)[0] for each in assignments)]}
+    if key in _of_file(config) and key not in beside:
+        error.where = f"{error.where.removeprefix('--')} in {config}"
+        error.args = (error.message(),)
+
+
 def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
     """Settings of which the later ones win over the earlier ones, in their long form.
 

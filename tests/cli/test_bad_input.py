@@ -350,6 +350,29 @@ def test_bad_input_is_refused_with_one_message(make, scene, tmp_path, capfd, mon
     assert everything_below(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    ("text", "more", "where"),
+    [
+        ("steps: -3", [], "steps in run.yaml"),
+        ("stepz: 3", [], "stepz in run.yaml"),
+        ("device: gpu", [], "device in run.yaml"),
+        ("densifier: {name: adc, division: axes}", [], "densifier.division in run.yaml"),
+        ("steps: 3", ["--steps", "-3"], "steps"),
+        ("device: cpu", ["--device", "gpu"], "--device"),
+        ("densifier: adc", ["--set", "densifier.division=axes"], "densifier.division"),
+        ("seed: 3", ["--device", "gpu"], "--device"),
+    ],
+)
+def test_a_message_names_the_file_that_made_a_setting(text, more, where, scene, tmp_path, capfd):
+    path = tmp_path / "run.yaml"
+    path.write_text(text)
+    out = ["--out", str(tmp_path / "out")]
+    assert failing(["run", str(scene), "--config", str(path), *out, *more]) == 2
+    lines = capfd.readouterr().err.splitlines()
+    told = [line.split(":", 1)[1].strip() for line in lines if "where:" in line]
+    assert told == [where.replace("run.yaml", str(path))]
+
+
 def full_disk(*args: object, **kwargs: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
