@@ -34,7 +34,9 @@ def tidy(gradient: Tensor | None) -> Tensor | None:
     if gradient.sparse_dim() != 1:
         return gradient.to_dense()
     rows = rows_of(gradient)
-    return gradient if bool((rows[1:] > rows[:-1]).all()) else gradient.coalesce()
+    if not gradient.is_coalesced() and bool((rows[1:] > rows[:-1]).all()):
+        gradient._coalesced_(True)
+    return gradient.coalesce()
 
 
 def dense(gradient: Tensor | None) -> Tensor | None:

@@ -10,6 +10,9 @@ from torch import Tensor
 from crossgrad_core.gradients.by_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
+#: Elements that a thread looks at in one go; to wake others for a few such parts takes longer.
+_PART: Final = 2**15
+_FEW: Final = 8
 
 
 def largest(tensor: Tensor) -> Tensor:
@@ -36,6 +39,10 @@ def finite_and_present(tensor: Tensor | None) -> tuple[bool, bool]:
     if tensor.dtype != torch.float32 or not tensor.is_cpu or not tensor.is_contiguous():
         return bool(torch.isfinite(tensor).all()), bool(tensor.any())
     from crossgrad_core.gradients.numba_kernels.largest import largest_bits
+    from crossgrad_core.numerics.jobs import alone, share
 
-    bits = int(largest_bits(tensor.view(-1).numpy().view(np.uint32)))
+    found = np.empty(1 + tensor.numel() // _PART, np.uint32)
+    call = share if len(found) > _FEW else alone
+    call(largest_bits, tensor.view(-1).numpy().view(np.uint32), found)
+    bits = int(found.max())
     return bits < _INFINITY, bits > 0

@@ -22,8 +22,8 @@ What a job computes must not depend on who does it; then no bit depends on the t
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, partial
+from queue import SimpleQueue
 from typing import Any, Concatenate, ParamSpec, cast
 
 import numba
@@ -86,16 +86,55 @@ def _jobs(threads: int) -> list[Jobs]:
 def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
     own, *others = _jobs(numba.get_num_threads())
-    calls = [partial(kernel, jobs, *args, **kwargs) for jobs in others]
-    helpers = _helpers(os.getpid()).ask(calls) if calls else []
+    calls = [_Call(partial(kernel, jobs, *args, **kwargs)) for jobs in others]
+    if calls:
+        _helpers(os.getpid()).ask(calls)
     try:
         kernel(own, *args, **kwargs)
     finally:
         # Whatever happens, nobody works on the arrays any more when this returns.
-        at_work = [helper for helper in helpers if not helper.cancel()]
-        wait(at_work)
-    for helper in at_work:
-        helper.result()
+        for call in calls:
+            call.end()
+    for call in calls:
+        if call.error is not None:
+            raise call.error
+
+
+class _Call:
+    """A call that a helper makes, unless it is not needed any more by then.
+
+    It is two bare locks: a `Future` takes as long as a kernel of a hundred thousand operations.
+
+    Args:
+        call: What to call.
+
+    Attributes:
+        error: What the call raised.
+    """
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self.error: BaseException | None = None
+        self._call = call
+        # Who has it decides: the helper makes the call, or nobody does any more.
+        self._begun = threading.Lock()
+        self._under_way = threading.Lock()
+        self._under_way.acquire()
+
+    def make(self) -> None:
+        """Makes the call; by the helper."""
+        if not self._begun.acquire(blocking=False):
+            return
+        try:
+            self._call()
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._under_way.release()
+
+    def end(self) -> None:
+        """Returns when the call has been made, or never will be."""
+        if not self._begun.acquire(blocking=False):
+            self._under_way.acquire()
 
 
 class _Helpers:
@@ -109,21 +148,27 @@ class _Helpers:
         self._threads: list[int] = []
         self._core: int | None = None
         # One for each thread: the same jobs are to go to the same core.
-        self._pools: list[ThreadPoolExecutor] = []
+        self._queues: list[SimpleQueue[_Call]] = []
 
-    def ask(self, calls: Sequence[Callable[[], None]]) -> list[Future[None]]:
+    def ask(self, calls: Sequence[_Call]) -> None:
         """Asks as many helpers to make a call each."""
         core = current_core()
         if core != self._core:
             self._core = core
             keep_off(core, self._threads)
-        while len(self._pools) < len(calls):
-            self._pools.append(ThreadPoolExecutor(1, "crossgrad-kernels", self._begin))
-        return [pool.submit(call) for pool, call in zip(self._pools, calls, strict=False)]
+        while len(self._queues) < len(calls):
+            self._queues.append(SimpleQueue())
+            help_out = partial(self._help, self._queues[-1])
+            threading.Thread(target=help_out, name="crossgrad-kernels", daemon=True).start()
+        for queue, call in zip(self._queues, calls, strict=False):
+            queue.put(call)
 
-    def _begin(self) -> None:
+    def _help(self, queue: "SimpleQueue[_Call]") -> None:
+        """Makes calls as long as the process lives; nothing keeps their arrays in between."""
         self._threads.append(threading.get_native_id())
         keep_off(self._core, self._threads[-1:])
+        while True:
+            queue.get().make()
 
 
 @cache

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of
+from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy
 from crossgrad_core.gradients.finite import finite_and_present
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
@@ -53,6 +53,18 @@ def same(one, other):
         there = other[name]
         assert (gradient is None) == (there is None)
         assert gradient is None or torch.equal(dense(gradient), there)
+
+
+@pytest.mark.parametrize(
+    "rows", [[], [4], [0, 2, 7], [7, 2, 0], [1, 1, 3], [3, 1, 1]], ids=lambda rows: f"{rows}"
+)
+def test_rows_are_sorted_and_each_is_there_once(rows):
+    values = torch.arange(2.0 * len(rows)).view(len(rows), 2)
+    found = tidy(by_rows(torch.tensor(rows, dtype=torch.int64), values, (8, 2)))
+    expected = torch.zeros(8, 2).index_add(0, torch.tensor(rows, dtype=torch.int64), values)
+    assert rows_of(found).tolist() == sorted(set(rows))
+    assert torch.equal(dense(found), expected)
+    assert tidy(found) is found
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 5])

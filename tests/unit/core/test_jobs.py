@@ -3,6 +3,8 @@
 import os
 import sys
 import threading
+import time
+import weakref
 
 import numba
 import numpy as np
@@ -76,6 +78,38 @@ def test_an_error_of_a_helper_is_raised(threads):
 
     with pytest.raises(ValueError, match="of a helper"):
         jobs.share(fails)
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
+    busy, enough = threading.Event(), threading.Event()
+
+    def occupied():
+        busy.set()
+        assert enough.wait(timeout=30)
+
+    jobs._helpers(os.getpid()).ask([call := jobs._Call(occupied)])
+    assert busy.wait(timeout=30)
+    marks = np.zeros(1000, np.int64)
+    jobs.share(mark, marks)
+    enough.set()
+    call.end()
+    assert call.error is None
+    assert (marks == 1).all()
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_helpers_keep_nothing_of_what_they_were_given(threads):
+    marks = np.zeros(1000, np.int64)
+    left = weakref.ref(marks)
+    jobs.share(mark, marks)
+    del marks
+    # A call that was not needed is dropped as soon as its helper comes to it.
+    for _ in range(100):
+        if left() is None:
+            break
+        time.sleep(0.05)
+    assert left() is None
 
 
 linux = pytest.mark.skipif(
