@@ -19,6 +19,7 @@ What a job computes must not depend on who does it; then no bit depends on the t
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
+import atexit
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -148,7 +149,9 @@ class _Helpers:
         self._threads: list[int] = []
         self._core: int | None = None
         # One for each thread: the same jobs are to go to the same core.
-        self._queues: list[SimpleQueue[_Call]] = []
+        self._helpers: list[tuple[SimpleQueue[_Call | None], threading.Thread]] = []
+        # A thread that is in a library while the interpreter ends would end the process.
+        atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
         """Asks as many helpers to make a call each."""
@@ -156,19 +159,30 @@ class _Helpers:
         if core != self._core:
             self._core = core
             keep_off(core, self._threads)
-        while len(self._queues) < len(calls):
-            self._queues.append(SimpleQueue())
-            help_out = partial(self._help, self._queues[-1])
-            threading.Thread(target=help_out, name="crossgrad-kernels", daemon=True).start()
-        for queue, call in zip(self._queues, calls, strict=False):
+        while len(self._helpers) < len(calls):
+            queue: SimpleQueue[_Call | None] = SimpleQueue()
+            thread = threading.Thread(
+                target=self._help, args=[queue], name="crossgrad-kernels", daemon=True
+            )
+            thread.start()
+            self._helpers.append((queue, thread))
+        for (queue, _), call in zip(self._helpers, calls, strict=False):
             queue.put(call)
 
-    def _help(self, queue: "SimpleQueue[_Call]") -> None:
-        """Makes calls as long as the process lives; nothing keeps their arrays in between."""
+    def _help(self, queue: "SimpleQueue[_Call | None]") -> None:
+        """Makes calls until there is none."""
         self._threads.append(threading.get_native_id())
         keep_off(self._core, self._threads[-1:])
-        while True:
-            queue.get().make()
+        while (call := queue.get()) is not None:
+            call.make()
+            del call  # Its arrays are not kept until the next one comes.
+
+    def _dismiss(self) -> None:
+        """Ends the helpers."""
+        for queue, thread in self._helpers:
+            queue.put(None)
+            thread.join()
+        self._helpers = []
 
 
 @cache

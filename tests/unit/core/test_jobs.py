@@ -112,6 +112,23 @@ def test_helpers_keep_nothing_of_what_they_were_given(threads):
     assert left() is None
 
 
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_helpers_end_before_the_interpreter_and_others_take_their_place(threads, monkeypatch):
+    at_exit = []
+    monkeypatch.setattr(jobs.atexit, "register", at_exit.append)
+    jobs._helpers.cache_clear()
+    marks = np.zeros(1000, np.int64)
+    jobs.share(mark, marks)
+    (dismiss,) = at_exit
+    (thread,) = [thread for _, thread in jobs._helpers(os.getpid())._helpers]
+    assert thread.is_alive()
+    dismiss()
+    assert not thread.is_alive()
+    jobs.share(mark, marks)
+    assert (marks == 2).all()
+    dismiss()
+
+
 linux = pytest.mark.skipif(
     sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="needs two cores of Linux"
 )
