@@ -35,7 +35,7 @@ def tidy(gradient: Tensor | None) -> Tensor | None:
         return gradient.to_dense()
     rows = rows_of(gradient)
     if not gradient.is_coalesced() and bool((rows[1:] > rows[:-1]).all()):
-        gradient._coalesced_(True)
+        gradient._coalesced_(True)  # Torch's own mark, so that nobody looks again.
     return gradient.coalesce()
 
 

@@ -104,7 +104,7 @@ def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs:
 class _Call:
     """A call that a helper makes, unless it is not needed any more by then.
 
-    It is two bare locks: a `Future` takes as long as a kernel of a hundred thousand operations.
+    Two bare locks: a `Future` makes a condition, and whoever waits for it others, at each call.
 
     Args:
         call: What to call.
