@@ -104,7 +104,7 @@ def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs:
 class _Call:
     """A call that a helper makes, unless it is not needed any more by then.
 
-    Two bare locks: a `Future` makes a condition, and whoever waits for it others, at each call.
+    Two bare locks: a `Future` makes conditions anew for each call and for each wait.
 
     Args:
         call: What to call.
