@@ -31,7 +31,7 @@ def ndc_abs_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor
 
 def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None) -> Tensor:
     gradient = _present(statistic)
-    gradient = gradient if rows is None else gradient[rows]
+    gradient = gradient if rows is None else gradient.index_select(0, rows)
     return gradient * half_size(record, gradient)
 
 
@@ -69,7 +69,8 @@ def radii(record: RenderedView) -> Tensor:
 def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
     """[N] 1 where the Gaussian touched a pixel, else 0."""
     radii = record.screen.radii
-    return ((radii if rows is None else radii[rows]) > 0).to(record.gaussians.means)
+    radii = radii if rows is None else radii.index_select(0, rows)
+    return (radii > 0).to(record.gaussians.means)
 
 
 def seen(record: RenderedView) -> Tensor | None:
@@ -80,7 +81,9 @@ def seen(record: RenderedView) -> Tensor | None:
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:
         return None
-    return radii.nonzero()[:, 0] if rows is None else rows[radii[rows] > 0]
+    if rows is None:
+        return radii.nonzero()[:, 0]
+    return rows.masked_select(radii.index_select(0, rows) > 0)
 
 
 def _present(statistic: Tensor | None) -> Tensor:
@@ -97,15 +100,15 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
         name = next(b.tensors[0] for b in backbone.blocks() if b.per_primitive)
         tensor = context.parameters[name]
         like = torch.zeros(tensor.shape[0], device=tensor.device)
-    zeros = torch.zeros_like(like)
-    return {name: state.per_primitive.get(name, zeros).clone() for name in names}
+    known = state.per_primitive
+    return {n: known[n].clone() if n in known else torch.zeros_like(like) for n in names}
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
     """Adds a value of each Gaussian [N], or of those in `rows`, to its primitive's sum [P]."""
     origin = record.gaussians.origin
     if origin is not None:
-        total.index_add_(0, origin if rows is None else origin[rows], values)
+        total.index_add_(0, origin if rows is None else origin.index_select(0, rows), values)
     elif rows is None:
         total += values
     else:

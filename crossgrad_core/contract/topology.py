@@ -144,7 +144,8 @@ def _edited(edit: Edit, name: str, old: Tensor) -> Tensor:
     overwrite = edit.values.get(name)
     if edit.source is None and overwrite is None:
         return old
-    tensor = old.detach()[edit.source] if edit.source is not None else old.detach().clone()
+    old_rows = old.detach()
+    tensor = old_rows.clone() if edit.source is None else old_rows.index_select(0, edit.source)
     if overwrite is not None:
         rows = slice(None) if overwrite.rows is None else overwrite.rows
         tensor[rows] = overwrite.values.to(tensor.dtype)

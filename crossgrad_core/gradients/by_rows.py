@@ -74,7 +74,8 @@ class Packed:
         """A result of the column as a gradient of the whole tensor."""
         if result is None or self.rows is None:
             return result
-        return by_rows(self.rows, result, self.shape)
+        # The rows are in order: torch's own mark, so that nobody looks again.
+        return by_rows(self.rows, result, self.shape)._coalesced_(True)
 
 
 def _union(rows: Sequence[Tensor], count: int) -> Tensor:
