@@ -83,7 +83,9 @@ def seen(record: RenderedView) -> Tensor | None:
         return None
     if rows is None:
         return radii.nonzero()[:, 0]
-    return rows.masked_select(radii.index_select(0, rows) > 0)
+    drawn = radii.index_select(0, rows) > 0
+    # As a rule all of them.
+    return rows if bool(drawn.all()) else rows.masked_select(drawn)
 
 
 def _present(statistic: Tensor | None) -> Tensor:

@@ -3,6 +3,10 @@
 from dataclasses import replace
 from math import isclose
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
@@ -48,7 +52,19 @@ def pixels_of(pair: Pair, stride: int, corner: Corner) -> Pair:
     image, mask = pair
     column, row = corner
     taken = (slice(row, None, stride), slice(column, None, stride))
-    return image[taken].contiguous(), None if mask is None else mask[taken].contiguous()
+    return _copied(image[taken]), None if mask is None else mask[taken].contiguous()
+
+
+def _copied(pixels: Tensor) -> Tensor:
+    """The pixels side by side in memory."""
+    if not pixels.is_cpu:
+        return pixels.contiguous()
+    # Torch would share this with a second thread and, where cores are busy, wait milliseconds for
+    # it. By channels, as NumPy is slow with runs of three.
+    copy = torch.empty(pixels.shape, dtype=pixels.dtype)
+    for channel in range(pixels.shape[2]):
+        np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])
+    return copy
 
 
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:

@@ -5,9 +5,7 @@ from dataclasses import replace
 from math import nan
 from typing import TypeAlias
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.adam import adam
 
@@ -103,15 +101,13 @@ def update_tensors(updates: Iterable[Update]) -> None:
 
 
 def _update_fused(updates: Sequence[Update]) -> None:
-    from crossgrad_core.training.adam.numba_kernels.fused import Arrays, update_arrays
+    from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    def flat(tensor: Tensor) -> NDArray[np.float32]:
-        array: NDArray[np.float32] = tensor.detach().contiguous().view(-1).numpy()
-        return array
-
-    update_arrays(
-        [Arrays(flat(p), flat(g), flat(m), flat(v), step) for p, g, m, v, step in updates]
-    )
+    # Held until the step is taken: a copy would be gone before.
+    laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
+    addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
+    sizes = [param.numel() for param, *_ in laid_out]
+    update_at(addresses, sizes, [step for *_, step in updates])
     # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
     for param, _, exp_avg, exp_avg_sq, _ in updates:
         for tensor in (param, exp_avg, exp_avg_sq):  # Older versions of torch take one at a time.

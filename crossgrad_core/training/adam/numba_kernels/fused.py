@@ -1,7 +1,6 @@
 """Adam's update of float32 tensors in a single pass over memory (Numba, CPU)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -109,23 +108,19 @@ def numbers_of(step: Coefficients) -> Numbers:
     )
 
 
-@dataclass(frozen=True)
-class Arrays:
-    """A tensor's values, its gradient, its moments, all flat and of one length, and its step."""
+def update_at(
+    addresses: Sequence[Sequence[int]], sizes: Sequence[int], steps: Sequence[Coefficients]
+) -> None:
+    """Applies a step to each of T tensors, in place.
 
-    param: NDArray[np.float32]
-    grad: NDArray[np.float32]
-    exp_avg: NDArray[np.float32]
-    exp_avg_sq: NDArray[np.float32]
-    step: Coefficients
-
-
-def update_arrays(updates: Sequence[Arrays]) -> None:
-    """Applies a step to each tensor, in place on `param`, `exp_avg` and `exp_avg_sq`."""
-    arrays = [(each.param, each.grad, each.exp_avg, each.exp_avg_sq) for each in updates]
-    addresses = np.array([[one.ctypes.data for one in four] for four in arrays], np.int64)
-    sizes = np.array([each.param.size for each in updates], np.int64)
-    numbers = np.array([numbers_of(each.step) for each in updates], np.float32)
+    Args:
+        addresses: [T, 4] of each tensor's values, its gradient and both moments, float32, without
+            gaps.
+        sizes: [T] elements.
+        steps: [T].
+    """
+    numbers = np.array([numbers_of(step) for step in steps], np.float32).reshape(-1, 9)
     # No more elements than a chunk has are not worth waking other threads for.
-    run = alone if sizes.sum() <= _CHUNK else share
-    run(_update_chunks, addresses.reshape(-1, 4), sizes, numbers.reshape(-1, 9))
+    run = alone if sum(sizes) <= _CHUNK else share
+    where = np.array(addresses, np.int64).reshape(-1, 4)
+    run(_update_chunks, where, np.array(sizes, np.int64), numbers)

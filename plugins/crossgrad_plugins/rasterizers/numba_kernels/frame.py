@@ -134,16 +134,16 @@ def backward(
     )
     count = gaussians.means.shape[0]
     gradients = GaussianGradients(
-        means=np.zeros((count, 3), np.float32),
-        quats=np.zeros((count, 4), np.float32),
-        scales=np.zeros((count, 3), np.float32),
-        opacities=np.zeros(count, np.float32),
+        means=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        scales=np.empty((count, 3), np.float32),
+        opacities=np.empty(count, np.float32),
         # On the way to harmonics nobody reads those of Gaussians that were not drawn.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,
-        centres=np.zeros((count, 2), np.float32),
-        absolute=np.zeros((count, 2), np.float32) if absolute else None,
+        centres=np.empty((count, 2), np.float32),
+        absolute=np.empty((count, 2), np.float32) if absolute else None,
         directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
     )
     share(

@@ -299,11 +299,11 @@ def unproject(
         shelves: [N, SHELF] from binning.
         written: [slots] from `differentiate`.
         partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
-        v_means: [N, 3] written for Gaussians with gradients, zero before; like all below.
+        v_means: [N, 3] written, zero for Gaussians without gradients; like all below.
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].
-        v_colors: [N, 3], of the RGB drawn; written for all drawn, and need not be zero before.
+        v_colors: [N, 3], of the RGB drawn; written for all drawn, others stay as they are.
         v_centres: [N, 2], of the projected mean, per pixel.
         v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
     """
@@ -311,10 +311,14 @@ def unproject(
     block = np.empty(_ROWS * BLOCK, np.float64)
     numbers = np.empty(BLOCK, np.int64)
     chunks = drawn.shape[0]
+    nothing = np.float32(0.0)
     chunk = take(jobs, chunks)
     while chunk < chunks:
         j = chunk * CHUNK
         end = j + drawn[chunk]
+        last = min(j + CHUNK, means.shape[0])
+        v_means[j:last] = v_quats[j:last] = v_scales[j:last] = nothing
+        v_opacities[j:last] = v_centres[j:last] = v_absolute[j:last] = nothing
         while j < end:
             j, size = _fill_block(
                 j,
