@@ -107,8 +107,9 @@ class Trainer:
     def _optimize(self) -> None:
         gradients = {name: tensor.grad for name, tensor in self.parameters.items()}
         by_rows = {name: gradients.pop(name) for name in self.backbone.passed_on.values()}
-        moved = torch.zeros_like(self.parameters["means"])
-        adam_step({**self.parameters, "means": moved}, gradients, self.state, self.rates)
+        moved = torch.empty_like(self.parameters["means"])
+        tensors = {**self.parameters, "means": moved}
+        adam_step(tensors, gradients, self.state, self.rates, from_zero={"means"})
         axes = [self.parameters[name] for name in self.backbone.axes]
         step_along_axes(self.parameters["means"], moved, *axes)
         for name, gradient in by_rows.items():

@@ -202,8 +202,9 @@ def _take_adam_step(
         adam_step(tensors, gradients, state.moments, rates, rule, scale.to_sum)
         return
     name, *axes = found
-    steps = torch.zeros_like(tensors[name])
-    adam_step({**tensors, name: steps}, gradients, state.moments, rates, rule, scale.to_sum)
+    steps = torch.empty_like(tensors[name])
+    moved = {**tensors, name: steps}
+    adam_step(moved, gradients, state.moments, rates, rule, scale.to_sum, from_zero={name})
     step_along_axes(tensors[name], steps, *(tensors[each] for each in axes))
 
 

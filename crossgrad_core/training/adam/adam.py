@@ -1,6 +1,6 @@
 """Adam on named tensors, in place, without building an optimizer object."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import nan
 from typing import TypeAlias
@@ -22,13 +22,15 @@ Update: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Coefficients]
 
 
 @torch.no_grad()
-def adam_step(
+def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object that holds its options
     params: Mapping[str, Tensor],
     grads: Mapping[str, Tensor | None],
     state: AdamState,
     lrs: Mapping[str, float],
     rule: AdamRule = AdamRule(),  # noqa: B008 - a frozen value
     scales: Mapping[str, float] | None = None,
+    *,
+    from_zero: Collection[str] = (),
 ) -> None:
     """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
 
@@ -44,6 +46,7 @@ def adam_step(
         lrs: Learning rate of every tensor that has a gradient.
         rule: Decay of the moments, and what is added to the root of the second.
         scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
+        from_zero: Names of tensors that hold nothing yet: they count as zero, and become the step.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not fit its tensor.
@@ -58,6 +61,7 @@ def adam_step(
     for name, grad in given.items():
         (lr, scale), param = numbers[name], params[name]
         step = counted(name, param, state, lr, rule, scale)
+        step = replace(step, from_zero=True) if name in from_zero else step
         updates.append((param, grad, state.exp_avg[name], state.exp_avg_sq[name], step))
     update_tensors(updates)
 
@@ -87,12 +91,15 @@ def update_tensors(updates: Iterable[Update]) -> None:
     """Applies one step to tensors and their moments: fused on the CPU in float32, else by torch."""
     fused = []
     for update in updates:
-        param, grad, exp_avg, exp_avg_sq, _ = update
+        param, grad, exp_avg, exp_avg_sq, step = update
         tensors = (param, exp_avg, exp_avg_sq)
         on_cpu = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, grad))
         if on_cpu and all(t.is_contiguous() for t in tensors):
             fused.append(update)
-        elif param.is_cuda:
+            continue
+        if step.from_zero:
+            param.zero_()
+        if param.is_cuda:
             update_on_gpu(*update)
         else:
             update_reference(*update)

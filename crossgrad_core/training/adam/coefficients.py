@@ -29,6 +29,7 @@ class Coefficients:
         age: t, steps so far as bias correction counts them, this one included.
         eps: Added to the root of the corrected second moment.
         scale: What the gradient is multiplied by.
+        from_zero: Whether the tensor holds nothing yet: it counts as zero, and becomes the step.
     """
 
     beta1: float
@@ -37,6 +38,7 @@ class Coefficients:
     age: float
     eps: float
     scale: float = 1.0
+    from_zero: bool = False
 
     @property
     def step_size(self) -> float:

@@ -112,6 +112,21 @@ def test_a_gradient_that_is_not_finite_is_seen_in_the_parameters_of_a_gpu(bad):
     assert tensors[0].isfinite().tolist() == [True, False, True]
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_a_tensor_held_that_counts_as_zero_is_not_read(dtype):
+    """Also where no gradient has moved anything, as in the second half."""
+    grad = torch.cat([tensors(6)["means"].flatten(), torch.zeros(70_000)]).to(dtype)
+    found = []
+    for first, names in ((0.0, ()), (torch.nan, {"x"})):
+        params, state = {"x": torch.full_like(grad, first)}, AdamState()
+        for _ in range(2):
+            params["x"].fill_(first)
+            adam_step(params, {"x": grad}, state, {"x": 0.1}, from_zero=names)
+        found.append(params["x"])
+    assert found[0].any()
+    assert torch.equal(*found)
+
+
 def test_no_gradient_leaves_everything_alone():
     params, state = tensors(5), AdamState()
     adam_step(params, tensors(6), state, RATES)

@@ -29,6 +29,26 @@ def test_the_bits_do_not_depend_on_the_threads(name):
         assert torch.equal(*found)
 
 
+def test_neither_do_those_of_gradients():
+    generator = torch.Generator().manual_seed(0)
+    values, upstream = torch.randn(2, 126_003, generator=generator)
+    found = []
+    for threads in (1, 2):
+        configure_threads(threads)
+        leaf = values.clone().requires_grad_()
+        sigmoid(leaf).backward(upstream)
+        found.append(leaf.grad)
+    assert torch.equal(*found)
+
+
+def test_gradients_of_gradients_pass_through_every_block():
+    values = torch.linspace(-5.0, 5.0, BLOCK + 1, dtype=torch.float64).requires_grad_()
+    (first,) = torch.autograd.grad(sigmoid(values).sum(), values, create_graph=True)
+    (second,) = torch.autograd.grad(first.sum(), values)
+    known = torch.sigmoid(values.detach())
+    assert torch.allclose(second, known * (1 - known) * (1 - 2 * known), rtol=1e-12, atol=1e-15)
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("shape", [(), (0,), (7, 3), (BLOCK + 1, 3)])
 def test_they_are_what_torch_computes(name, shape):

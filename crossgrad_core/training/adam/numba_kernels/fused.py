@@ -60,7 +60,11 @@ def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
 
 @kernel
 def _update_chunks(
-    jobs: Jobs, addresses: NDArray[np.int64], sizes: NDArray[np.int64], numbers: _Floats
+    jobs: Jobs,
+    addresses: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    numbers: _Floats,
+    from_zero: NDArray[np.bool_],
 ) -> None:
     """Updates tensors, chunk by chunk through all of them.
 
@@ -69,6 +73,7 @@ def _update_chunks(
         addresses: [T, 4] of each tensor's values, gradient and moments.
         sizes: [T] elements.
         numbers: [T, 9] of each tensor's step.
+        from_zero: [T] whether a tensor holds nothing yet: zeros are written to it first.
     """
     chunks = 0
     for size in sizes:
@@ -88,6 +93,8 @@ def _update_chunks(
         of_step = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
         for a in range(chunk * _CHUNK, min(size, (chunk + 1) * _CHUNK), _RUN):
             b = min(size, a + _RUN)
+            if from_zero[tensor]:
+                param[a:b] = _ZERO
             if moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], of_step)
         job = take(jobs, chunks)
@@ -123,4 +130,5 @@ def update_at(
     # No more elements than a chunk has are not worth waking other threads for.
     run = alone if sum(sizes) <= _CHUNK else share
     where = np.array(addresses, np.int64).reshape(-1, 4)
-    run(_update_chunks, where, np.array(sizes, np.int64), numbers)
+    from_zero = np.array([step.from_zero for step in steps], np.bool_)
+    run(_update_chunks, where, np.array(sizes, np.int64), numbers, from_zero)
