@@ -501,14 +501,17 @@ def test_very_many_gaussians_in_one_pixel():
     )
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 5000])
-def test_order_by_depth_is_stable_and_sorted(count):
+@pytest.mark.parametrize("count", [0, 1, 2, 1023, 1025, 5000])
+@pytest.mark.parametrize("magnitudes", [1e-6, 0.1, 3, 20, 700])
+def test_order_by_depth_is_stable_and_sorted(count, magnitudes):
     rng = np.random.default_rng(count)
-    depths = np.exp(rng.uniform(-20, 20, count))
+    depths = np.exp(rng.uniform(-magnitudes, magnitudes, count))
     depths[rng.uniform(size=count) < 0.5] = 1.0
     order = order_by_depth(depths, np.arange(count, dtype=np.int32))
-    np.testing.assert_array_equal(order, np.argsort(depths, kind="stable"))
-    assert all(depths[a] < depths[b] or a < b for a, b in pairwise(order))
+    # Depths that agree to 2e-10 count as equal.
+    known = (depths.view(np.int64) >> 20).astype(np.float64)
+    np.testing.assert_array_equal(order, np.argsort(known, kind="stable"))
+    assert all(known[a] < known[b] or a < b for a, b in pairwise(order))
 
 
 def test_too_many_pairs_of_gaussian_and_tile_are_refused():

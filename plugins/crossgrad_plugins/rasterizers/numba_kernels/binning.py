@@ -15,6 +15,7 @@ from crossgrad_core.numerics.simd import (
     fma,
     fnma,
     larger,
+    load,
     prefetch,
     ramp,
     round_down,
@@ -50,6 +51,9 @@ PARTS = 16
 #: Records whose spans are computed before the first of their tiles is written: loops of unknown
 #: length would make the processor wait for the roots of each record.
 _GROUP = 32
+
+#: Where the numbers of the ellipses of a group begin.
+_OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_LEAN = range(0, 6 * _GROUP, _GROUP)
 
 #: Records ahead for which memory is asked: first the slot numbers, then the slots.
 _FAR, _NEAR = 32, 16
@@ -99,15 +103,43 @@ def _tile(position: Lanes, size: int) -> Lanes:
 
 
 @device
+def _ellipses(
+    first: int, last: int, records: NDArray[np.float32], ellipses: NDArray[np.float32]
+) -> None:
+    """Writes the form of the ellipses of a group of records, of which each row of tiles asks.
+
+    Roots and quotients are taken of eight records at once.
+    """
+    for j in range(first, last):
+        k, at = j - first, j * RECORD
+        ellipses[_OF_SLOPE + k] = records[at + SLOPE]
+        ellipses[_OF_DECAY + k] = records[at + ROW_DECAY]
+        ellipses[_OF_WIDTH + k] = records[at + WIDTH]
+        ellipses[_OF_BUDGET + k] = records[at + LOG_OPACITY] + np.float32(SPARE - TOUCH)
+    for k in range(0, last - first, LANES):
+        slope, row_decay = load(ellipses, _OF_SLOPE + k), load(ellipses, _OF_DECAY + k)
+        width, budget = load(ellipses, _OF_WIDTH + k), load(ellipses, _OF_BUDGET + k)
+        # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
+        extent_y = square_root(budget / row_decay)
+        lean = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
+        store(ellipses, _OF_EXTENT + k, extent_y)
+        store(ellipses, _OF_LEAN + k, lean)
+
+
+@device
 def _spans(
     at: int,
+    k: int,
     first_row: int,
     records: NDArray[np.float32],
+    ellipses: NDArray[np.float32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
     place: int,
 ) -> None:
     """Writes the first and last tile reached in eight rows of tiles (first > last: none).
+
+    The record at `at` is that of ellipse k of the group.
 
     The ends of an ellipse's rows form concave curves. Between two rows of pixels their extremes
     lie at the ellipse's leftmost and rightmost point or in the row nearest to it.
@@ -117,13 +149,12 @@ def _spans(
     # Pixel centres are at whole numbers here.
     u = broadcast(records, at + U_WHOLE) + (broadcast(records, at + U_PART) - half)
     v = broadcast(records, at + V_WHOLE) + (broadcast(records, at + V_PART) - half)
-    slope = broadcast(records, at + SLOPE)
-    row_decay = broadcast(records, at + ROW_DECAY)
-    width = broadcast(records, at + WIDTH)
-    budget = broadcast(records, at + LOG_OPACITY) + splat(np.float32(SPARE - TOUCH))
-    # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
-    extent_y = square_root(budget / row_decay)
-    lean = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
+    slope = broadcast(ellipses, _OF_SLOPE + k)
+    row_decay = broadcast(ellipses, _OF_DECAY + k)
+    width = broadcast(ellipses, _OF_WIDTH + k)
+    budget = broadcast(ellipses, _OF_BUDGET + k)
+    extent_y = broadcast(ellipses, _OF_EXTENT + k)
+    lean = broadcast(ellipses, _OF_LEAN + k)
     row = ramp() + splat(np.float32(first_row))
     top = row * splat(np.float32(TILE_HEIGHT))
     bottom = smaller(top + splat(np.float32(TILE_HEIGHT - 1)), round_down(v + extent_y)) - v
@@ -148,22 +179,27 @@ def _find(
     first_slot: int,
     tile_of_slot: NDArray[np.int32],
     counts: NDArray[np.int32],
+    ellipses: NDArray[np.float32],
     begins: NDArray[np.float32],
     ends: NDArray[np.float32],
-    place: int,
+    k: int,
     boxed: bool,
 ) -> int:
-    """Writes the tiles that record j reaches to its slots and counts them; returns their number.
+    """Writes the tiles that record j, k of its group, reaches to its slots; counts them.
 
-    The spans of the first eight rows of tiles are at `place`, unless all of the box is taken.
+    The spans of its first eight rows of tiles are there, unless all of the box is taken.
+
+    Returns:
+        Their number.
     """
+    place = k * LANES
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
     slot = first_slot
     for block in range(boxes[j, 2], boxes[j, 3], LANES):
         if boxed:
             begins[place : place + LANES], ends[place : place + LANES] = left, right
         elif block > boxes[j, 2]:
-            _spans(j * RECORD, block, records, begins, ends, place)
+            _spans(j * RECORD, k, block, records, ellipses, begins, ends, place)
         for row in range(min(LANES, boxes[j, 3] - block)):
             begin = np.intp(max(left, begins[place + row]))
             end = np.intp(min(right, ends[place + row]))
@@ -214,6 +250,7 @@ def find_tiles(
         order: [M] the records drawn; ordered by depth.
     """
     chunks = drawn.shape[0]
+    ellipses = np.zeros(6 * _GROUP, np.float32)
     begins = np.empty(_GROUP * LANES, np.float32)
     ends = np.empty(_GROUP * LANES, np.float32)
     job = take(jobs, PARTS + 1)
@@ -229,9 +266,10 @@ def find_tiles(
             for first in range(chunk * CHUNK, last, _GROUP):
                 group = range(first, min(first + _GROUP, last))
                 if not boxed:
+                    _ellipses(first, group.stop, records, ellipses)
                     for j in group:
-                        place = (j - first) * LANES
-                        _spans(j * RECORD, boxes[j, 2], records, begins, ends, place)
+                        k, row = j - first, boxes[j, 2]
+                        _spans(j * RECORD, k, row, records, ellipses, begins, ends, k * LANES)
                 for j in group:
                     shelves[j, SLOTS] = _find(
                         j,
@@ -241,9 +279,10 @@ def find_tiles(
                         np.intp(shelves[j, FIRST_SLOT]),
                         tile_of_slot,
                         counts[part],
+                        ellipses,
                         begins,
                         ends,
-                        (j - first) * LANES,
+                        j - first,
                         boxed,
                     )
                     shelves[j, FIRST_ROW] = boxes[j, 2]

@@ -3,13 +3,21 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.rasterizers.numba_kernels.jit import kernel
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 
-_DIGIT = 11  # bits
-_BINS = 1 << _DIGIT
-_PASSES = 4
-# Dropped low bits of the float64: depths that agree to 2e-10 count as equal.
-_DROPPED = 64 - _DIGIT * _PASSES
+#: Bits of a digit, at most: more would not leave the first-level cache to what is sorted.
+_DIGIT = 11
+#: Low bits of the float64 that are dropped: depths that agree to 2e-10 count as equal.
+_DROPPED = 20
+
+
+@device
+def _width(number: int) -> int:
+    """Returns the bits of a number that is not negative."""
+    width = 0
+    while number >> width:
+        width += 1
+    return width
 
 
 @kernel
@@ -21,31 +29,44 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
         items: [M] whatever is to be ordered.
     """
     count = items.shape[0]
-    # Positive floating-point numbers order like their bit patterns.
-    keys = depths.view(np.uint64) >> np.uint64(_DROPPED)
-    spare_keys = np.empty_like(keys)
-    result = items.copy()
-    spare = np.empty_like(result)
-    bins = np.zeros((_PASSES, _BINS), np.int32)
-    last_bin = np.uint64(_BINS - 1)
+    if count == 0:
+        return items.copy()
+    # Positive floating-point numbers order like their bit patterns. Counted from the least one they
+    # are short, so that the place of an item fits beside its key and a digit or two less is sorted.
+    bits = depths.view(np.int64)
+    least, most = bits[0] >> _DROPPED, bits[0] >> _DROPPED
     for i in range(count):
-        for digit in range(_PASSES):
-            bins[digit, np.intp((keys[i] >> np.uint64(digit * _DIGIT)) & last_bin)] += 1
-    for digit in range(_PASSES):
-        shift = np.uint64(digit * _DIGIT)
-        if count == 0 or bins[digit, np.intp((keys[0] >> shift) & last_bin)] == count:
-            continue  # this digit is the same everywhere
-        position = 0
-        for k in range(_BINS):
-            here = bins[digit, k]
-            bins[digit, k] = position
-            position += here
+        least, most = min(least, bits[i] >> _DROPPED), max(most, bits[i] >> _DROPPED)
+    of_key, of_place = _width(most - least), _width(count - 1)
+    # Of a million items whose depths have all orders of magnitude that there are.
+    coarser = max(0, of_key + of_place - 63)
+    of_key -= coarser
+    passes = (of_key + _DIGIT - 1) // _DIGIT
+    of_digit = (of_key + passes - 1) // max(passes, 1)
+    last_bin = (1 << of_digit) - 1
+    # Indices that cannot be negative are not looked at.
+    bins = np.zeros((passes, last_bin + 1), np.uint32)
+    packed, spare = np.empty(count, np.int64), np.empty(count, np.int64)
+    for i in range(count):
+        key = ((bits[i] >> _DROPPED) - least) >> coarser
+        packed[i] = (key << of_place) | i
+        for digit in range(passes):
+            bins[digit, (key >> (digit * of_digit)) & last_bin] += np.uint32(1)
+    for digit in range(passes):
+        own, shift = bins[digit], of_place + digit * of_digit
+        position = np.uint32(0)
+        for k in range(own.shape[0]):
+            here = own[k]
+            own[k] = position
+            position = np.uint32(position + here)
         for i in range(count):
-            k = np.intp((keys[i] >> shift) & last_bin)
-            target = bins[digit, k]
-            bins[digit, k] = target + 1
-            spare_keys[target] = keys[i]
-            spare[target] = result[i]
-        keys, spare_keys = spare_keys, keys
-        result, spare = spare, result
+            each = packed[i]
+            k = (each >> shift) & last_bin
+            target = own[k]
+            own[k] = np.uint32(target + np.uint32(1))
+            spare[target] = each
+        packed, spare = spare, packed
+    result = np.empty_like(items)
+    for i in range(count):
+        result[i] = items[packed[i] & ((1 << of_place) - 1)]
     return result
