@@ -34,9 +34,17 @@ def tidy(gradient: Tensor | None) -> Tensor | None:
     if gradient.sparse_dim() != 1:
         return gradient.to_dense()
     rows = rows_of(gradient)
-    if not gradient.is_coalesced() and bool((rows[1:] > rows[:-1]).all()):
+    if not gradient.is_coalesced() and _rises(rows):
         gradient._coalesced_(True)  # Torch's own mark, so that nobody looks again.
     return gradient.coalesce()
+
+
+def _rises(rows: Tensor) -> bool:
+    """Whether each number is larger than the one before."""
+    if rows.is_cpu:  # NumPy takes a tenth of the time to begin.
+        numbers = rows.numpy()
+        return bool((numbers[1:] > numbers[:-1]).all())
+    return bool((rows[1:] > rows[:-1]).all())
 
 
 def dense(gradient: Tensor | None) -> Tensor | None:

@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.gradients.finite import finite_and_present
+from crossgrad_core.gradients.finite import all_finite_and_present
 from crossgrad_core.gradients.plain import plain_sums
 
 
@@ -122,7 +122,10 @@ class SummedGradients(Gradients):
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """[B] whether each block's gradient is finite, and [B] whether it is also not zero."""
-        looks = [[finite_and_present(view.get(name)) for name in b.tensors] for b in self._blocks]
+        names = [name for block in self._blocks for name in block.tensors]
+        known = all_finite_and_present([view.get(name) for name in names])
+        each = dict(zip(names, known, strict=True))
+        looks = [[each[name] for name in block.tensors] for block in self._blocks]
         finite = np.array([all(each for each, _ in block) for block in looks], np.bool_)
         present = np.array([any(each for _, each in block) for block in looks], np.bool_)
         return finite, finite & present

@@ -1,27 +1,44 @@
-"""The largest magnitude in an array, as its bits (Numba, CPU, float32)."""
+"""The largest magnitudes in arrays, as their bits (Numba, CPU, float32)."""
 
 import numpy as np
+from numba import carray
 from numpy.typing import NDArray
 
+from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, take
 
+#: Elements that a thread looks at in one go.
+PART = 2**15
 _ALL_BUT_SIGN = np.uint32(0x7FFFFFFF)
 
 
 @kernel
-def largest_bits(jobs: Jobs, bits: NDArray[np.uint32], found: NDArray[np.uint32]) -> None:
+def largest_bits(
+    jobs: Jobs,
+    addresses: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    found: NDArray[np.uint32],
+) -> None:
     """Of numbers of one sign the larger has the larger bits; infinity and NaN come last.
 
     Args:
         jobs: From `share`.
-        bits: [N] of the numbers.
-        found: [parts] written: the largest in each of as many parts.
+        addresses: [T] of arrays of float32.
+        sizes: [T] their elements.
+        starts: [T + 1] first part of each, of `PART` elements, the last one of what is left.
+        found: [parts] written: the largest in each part.
     """
     parts = len(found)
     part = take(jobs, parts)
     while part < parts:
-        own = bits[part * len(bits) // parts : (part + 1) * len(bits) // parts]
+        tensor = 0
+        while part >= starts[tensor + 1]:
+            tensor += 1
+        size, first = sizes[tensor], (part - starts[tensor]) * PART
+        bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
+        own = bits[first : min(size, first + PART)]
         # Four runs at a time: memory is waited for less than with one.
         quarter = len(own) // 4
         p, q = own[:quarter], own[quarter : 2 * quarter]

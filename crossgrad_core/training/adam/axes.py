@@ -5,9 +5,10 @@ camera stands before jumps over its neighbours while one of the ground below a d
 Scenes that are photographed from very different distances have both (docs/schedules.md).
 """
 
-from math import log
+from math import log, nan
 from typing import Final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,11 +58,17 @@ def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
     return torch.einsum("nij,nj->ni", rotations, factors * along)
 
 
-def _usual(scales: Tensor) -> Tensor:
+def _usual(scales: Tensor) -> Tensor | float:
     """The median, of Gaussians evenly spread over memory, of the middle one of their axes.
 
-    What is not finite is left out, so that it spoils no other Gaussian.
+    Gaussians that are not finite are left out, so that they spoil no other.
     """
-    a, b, c = scales[:: -(-len(scales) // _SAMPLE)].unbind(dim=1)
-    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c))
-    return torch.where(middle.isfinite(), middle, torch.nan).nanmedian()
+    some = scales[:: -(-len(scales) // _SAMPLE)]
+    if some.is_cpu:  # NumPy takes a tenth of the time to begin.
+        a, b, c = some.numpy().T
+        lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+        lengths = lengths[np.isfinite(a + b + c)]
+        place = (len(lengths) - 1) // 2
+        return float(np.partition(lengths, place)[place]) if len(lengths) else nan
+    middle = some.sort(dim=1).values[:, 1]
+    return torch.where(some.sum(dim=1).isfinite(), middle, torch.nan).nanmedian()

@@ -96,13 +96,13 @@ class Late:
         from crossgrad_core.training.adam.numba_kernels.late import update_all, update_rows
 
         count = adam.steps[name]
-        rows = rows_of(grad).to(torch.int32)
+        rows = rows_of(grad).numpy().astype(np.int32)
         most = len(rows) >= MOST_ROWS * param.shape[0]
-        self.catch_up(name, param, adam, None if most else rows)
+        self.catch_up(name, param, adam, None if most else torch.from_numpy(rows))
         flat, numbers, width = _flat(name, param, adam), numbers_of(step), _width(param)
         values = values_of(grad).contiguous().view(-1).numpy()
         update = update_all if most else update_rows
-        share(update, rows.numpy(), width, flat[0], values, flat[1], flat[2], numbers)
+        share(update, rows, width, flat[0], values, flat[1], flat[2], numbers)
         _changed(name, param, adam)
         if most:
             return
@@ -110,7 +110,7 @@ class Late:
             done = np.full(param.shape[0], count - 1, np.int32)
             self._behind[name] = _Behind(done, count - 1)
         behind = self._behind[name]
-        behind.done[rows.numpy()] = count
+        behind.done[rows] = count
         beta1, _, beta2, _, step_size, root_scale, eps, _, _ = map(float, numbers)
         behind.add(beta1, beta2, step_size, root_scale, eps)
         if behind.count == LONGEST:

@@ -164,7 +164,7 @@ class _Draw(torch.autograd.Function):
         call.frame = frame
         call.screen.radii = torch.from_numpy(frame.projected.radii)
         if frame.projected.rows is not None:
-            call.screen.rows = torch.from_numpy(frame.projected.rows).long()
+            call.screen.rows = torch.from_numpy(frame.projected.rows.astype(np.int64))
         call.screen.pixels = None if frame.pixels is None else torch.from_numpy(frame.pixels)
         if call.counts:
             call.screen.count = _counter(frame)
