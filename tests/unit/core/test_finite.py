@@ -6,7 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossgrad_core.gradients.finite import finite_and_present, is_finite
+from crossgrad_core.gradients.finite import (
+    all_finite_and_present,
+    finite_and_present,
+    is_finite,
+)
 
 #: Bits of float32: zeros of both signs, subnormal, largest, infinite and NaN ones among them.
 BITS = st.one_of(
@@ -39,3 +43,26 @@ def test_one_bad_element_among_many_is_found(place, value, rows):
 def test_what_is_missing_is_finite_and_absent():
     assert finite_and_present(None) == (True, False)
     assert finite_and_present(torch.zeros(0, 3, requires_grad=True)) == (True, False)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_many_tensors_are_judged_as_each_by_itself(seed):
+    """Of all kinds, sizes about those of the parts in which they are looked at, in any order."""
+    rng = np.random.default_rng(seed)
+    tensors = []
+    for _ in range(rng.integers(0, 9)):
+        size = int(rng.choice([0, 1, 3, 2**15 - 1, 2**15, 2**15 + 1, 300_000]))
+        values = torch.zeros(size)
+        if size and rng.random() < 0.7:
+            values[int(rng.integers(size))] = float(rng.choice([1e-45, -1.0, np.inf, np.nan]))
+        if rng.random() < 0.2:
+            values = values.double()
+        if rng.random() < 0.2:
+            values = values.to_sparse()
+        if size % 3 == 0 and not values.is_sparse and rng.random() < 0.3:
+            values = values.view(-1, 3).T
+        tensors.append(None if rng.random() < 0.1 else values)
+    found = all_finite_and_present(tensors)
+    for tensor, judged in zip(tensors, found, strict=True):
+        dense = torch.zeros(0) if tensor is None else tensor.to_dense()
+        assert judged == (bool(dense.isfinite().all()), bool((dense != 0).any()))
