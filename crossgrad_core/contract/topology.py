@@ -144,8 +144,10 @@ def _edited(edit: Edit, name: str, old: Tensor) -> Tensor:
     overwrite = edit.values.get(name)
     if edit.source is None and overwrite is None:
         return old
-    old_rows = old.detach()
-    tensor = old_rows.clone() if edit.source is None else old_rows.index_select(0, edit.source)
+    if edit.source is None:
+        tensor = old.detach().clone()
+    else:  # A plugin may list rows elsewhere than the parameters are.
+        tensor = old.detach().index_select(0, edit.source.to(old.device))
     if overwrite is not None:
         rows = slice(None) if overwrite.rows is None else overwrite.rows
         tensor[rows] = overwrite.values.to(tensor.dtype)

@@ -69,6 +69,7 @@ class Packed:
         given = [g for g in column if g is not None]
         self.column: Column = column
         self.rows: Tensor | None = None
+        self._tidy = all(g.is_sparse and g.is_coalesced() for g in given)
         self.shape = given[0].shape if given else torch.Size()
         if not any(g.is_sparse for g in given):
             return
@@ -82,8 +83,8 @@ class Packed:
         """A result of the column as a gradient of the whole tensor."""
         if result is None or self.rows is None:
             return result
-        # The rows are in order: torch's own mark, so that nobody looks again.
-        return by_rows(self.rows, result, self.shape)._coalesced_(True)
+        # Torch's own mark, so that nobody looks again.
+        return by_rows(self.rows, result, self.shape)._coalesced_(self._tidy)
 
 
 def _union(rows: Sequence[Tensor], count: int) -> Tensor:

@@ -19,7 +19,7 @@ BLOCK = 2**14
 
 
 def sigmoid(values: Tensor) -> Tensor:
-    """1 / (1 + exp(-x)) of a tensor of any shape."""
+    """1 / (1 + exp(-x)) of a floating-point tensor of any shape."""
     if _is_whole(values):
         return torch.sigmoid(values)
     found: Tensor = _Sigmoid.apply(values)  # type: ignore[no-untyped-call]

@@ -46,7 +46,8 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
         lrs: Learning rate of every tensor that has a gradient.
         rule: Decay of the moments, and what is added to the root of the second.
         scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
-        from_zero: Names of tensors that hold nothing yet: they count as zero, and become the step.
+        from_zero: Names of tensors with a gradient that hold nothing yet: they count as zero, and
+            become the step.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not fit its tensor.

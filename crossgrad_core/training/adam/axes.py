@@ -5,7 +5,7 @@ camera stands before jumps over its neighbours while one of the ground below a d
 Scenes that are photographed from very different distances have both (docs/schedules.md).
 """
 
-from math import log, nan
+from math import inf, log, nan
 from typing import Final
 
 import numpy as np
@@ -61,14 +61,16 @@ def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
 def _usual(scales: Tensor) -> Tensor | float:
     """The median, of Gaussians evenly spread over memory, of the middle one of their axes.
 
-    Gaussians that are not finite are left out, so that they spoil no other.
+    What is not finite is left out, so that it spoils no other Gaussian.
     """
     some = scales[:: -(-len(scales) // _SAMPLE)]
-    if some.is_cpu:  # NumPy takes a tenth of the time to begin.
-        a, b, c = some.numpy().T
+    if some.is_cpu and some.dtype == torch.float32:  # NumPy takes a tenth of the time to begin.
+        rows = some.numpy()
+        # NaN comes last, as it does where torch sorts.
+        a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
-        lengths = lengths[np.isfinite(a + b + c)]
+        lengths = lengths[np.isfinite(lengths)]
         place = (len(lengths) - 1) // 2
         return float(np.partition(lengths, place)[place]) if len(lengths) else nan
     middle = some.sort(dim=1).values[:, 1]
-    return torch.where(some.sum(dim=1).isfinite(), middle, torch.nan).nanmedian()
+    return torch.where(middle.isfinite(), middle, torch.nan).nanmedian()

@@ -278,6 +278,25 @@ def test_optional_outputs_change_no_other_gradient():
         np.testing.assert_array_equal(getattr(found, name), getattr(plain, name), name)
 
 
+@pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
+@pytest.mark.parametrize("count", [1, 40, 5000])
+def test_memory_that_held_something_changes_no_gradient(monkeypatch, count, response):
+    """Of Gaussians that are drawn and of those beside the image."""
+    size, view = (40, 24), camera(40, 24)
+    gaussians = cloud(count, size)
+    gaussians.means[::2, 0] += 1000.0
+    frame = forward(gaussians, view, BLACK, DrawOptions(response=response))
+    v_image, v_alpha, _ = weights(size)
+    found = [backward(frame, v_image, v_alpha, absolute=True)]
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "empty", lambda shape, kind: np.full(shape, np.nan, kind))
+        found.append(backward(frame, v_image, v_alpha, absolute=True))
+    for name in ("means", "quats", "scales", "opacities", "colors", "centres", "absolute"):
+        first, second = (getattr(each, name) for each in found)
+        np.testing.assert_array_equal(first, second)
+        assert np.isfinite(first).all()
+
+
 def harmonics(count, degree, seed=0):
     rng = np.random.default_rng(seed)
     dc = rng.normal(size=(count, 1, 3)).astype(np.float32)
@@ -499,6 +518,12 @@ def test_very_many_gaussians_in_one_pixel():
         np.count_nonzero(backward(frame, np.ones((1, 1, 3), np.float32)).colors[:, 0])
         <= blended + 1
     )
+
+
+@pytest.mark.parametrize("count", [1, 2, 5000])
+def test_items_of_one_depth_keep_their_order(count):
+    items = np.arange(count, dtype=np.int32)[::-1].copy()
+    np.testing.assert_array_equal(order_by_depth(np.full(count, 2.5), items), items)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1023, 1025, 5000])

@@ -21,7 +21,7 @@ from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.persist import check_settings, settings_of
 from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.adam.axes import LIMIT, step_along_axes
+from crossgrad_core.training.adam.axes import LIMIT, _usual, step_along_axes
 from crossgrad_core.training.rates import axes_of
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
@@ -127,6 +127,21 @@ def test_a_gaussian_that_is_not_finite_spoils_no_other():
         step_along_axes(found, steps, broken, quats)
         # The median of eight and that of nine differ; all others are moved by it alike.
         assert found[[*range(4), *range(5, 9)]].isfinite().all()
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_usual_is_that_of_the_middle_axes_that_are_finite(seed, kind):
+    """NaN counts as longer than all."""
+    rng = np.random.default_rng(seed)
+    scales = rng.normal(size=(rng.integers(1, 40), 3))
+    odd = rng.random(scales.shape) < rng.choice([0.1, 0.6])
+    scales[odd] = rng.choice([np.nan, np.inf, -np.inf], odd.sum())
+    middle = np.sort(scales, axis=1)[:, 1]
+    middle = np.sort(middle[np.isfinite(middle)])
+    found = float(_usual(torch.from_numpy(scales).to(kind)))
+    want = middle[(len(middle) - 1) // 2] if len(middle) else np.nan
+    assert found == pytest.approx(want, rel=1e-6, nan_ok=True)
 
 
 def test_a_rotation_without_digits_is_none():

@@ -41,8 +41,9 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
     # Of a million items whose depths have all orders of magnitude that there are.
     coarser = max(0, of_key + of_place - 63)
     of_key -= coarser
-    passes = (of_key + _DIGIT - 1) // _DIGIT
-    of_digit = (of_key + passes - 1) // max(passes, 1)
+    # One at least: a number of bits must not be negative.
+    passes = max(1, (of_key + _DIGIT - 1) // _DIGIT)
+    of_digit = (of_key + passes - 1) // passes
     last_bin = (1 << of_digit) - 1
     # Indices that cannot be negative are not looked at.
     bins = np.zeros((passes, last_bin + 1), np.uint32)
