@@ -86,9 +86,11 @@ def work(checkout: Path, case: Path, threads: int) -> None:
     configure_threads(threads)
     with np.load(case) as file:
         arrays = dict(file)
-    trainer = steps.Trainer(arrays, 0.999) if hasattr(steps, "Trainer") else Plain(steps, arrays)
-    turned = (30.0,) if hasattr(steps, "Trainer") else ()
-    views = steps.camera_of(arrays, *turned), steps.camera_of(arrays, *(0.0 for _ in turned))
+    if hasattr(steps, "Trainer"):
+        trainer = steps.Trainer(arrays, 0.999)
+        views = [steps.camera_of(arrays, degrees) for degrees in (30.0, 0.0)]
+    else:
+        trainer, views = Plain(steps, arrays), [steps.camera_of(arrays)] * 2
     shape = (views[0].height, views[0].width, 3)
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
     for _ in sys.stdin:

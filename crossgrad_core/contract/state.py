@@ -61,7 +61,7 @@ def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
     """Rows of `old` at `source` [M], with the rows marked in `fresh` [M] set to zero."""
     # A plugin may keep its numbers elsewhere than the run does.
     source, fresh = source.to(old.device), fresh.to(old.device)
-    # Whole rows are copied: to index with a tensor, element by element, takes four times as long.
+    # Copies whole rows; to index with a tensor goes element by element.
     new = old.index_select(0, source)
     # On a GPU the number of the marked rows would be waited for.
     marked = fresh.nonzero()[:, 0] if fresh.is_cpu else fresh

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.gradients.by_rows import values_of
+from crossgrad_core.gradients.columns import is_native
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
 #: Parts for so few of which no other thread is woken.
@@ -58,7 +59,7 @@ def _elements(tensor: Tensor) -> Tensor:
 
 
 def _is_native(tensor: Tensor) -> bool:
-    return tensor.dtype == torch.float32 and tensor.is_cpu and tensor.is_contiguous()
+    return is_native([tensor]) and tensor.is_contiguous()
 
 
 def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:

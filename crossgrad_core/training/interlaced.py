@@ -59,8 +59,8 @@ def _copied(pixels: Tensor) -> Tensor:
     """The pixels side by side in memory."""
     if not pixels.is_cpu:
         return pixels.contiguous()
-    # Torch would share this with a second thread and, where cores are busy, wait milliseconds for
-    # it. By channels, as NumPy is slow with runs of three.
+    # Torch would share this with a second thread and wait for it where cores are busy. By channels,
+    # as NumPy is slow with runs of three.
     copy = torch.empty(pixels.shape, dtype=pixels.dtype)
     for channel in range(pixels.shape[2]):
         np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])

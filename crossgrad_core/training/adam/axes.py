@@ -64,7 +64,7 @@ def _usual(scales: Tensor) -> Tensor | float:
     What is not finite is left out, so that it spoils no other Gaussian.
     """
     some = scales[:: -(-len(scales) // _SAMPLE)]
-    if some.is_cpu and some.dtype == torch.float32:  # NumPy takes a tenth of the time to begin.
+    if is_native([some]):  # NumPy begins sooner than torch.
         rows = some.numpy()
         # NaN comes last, as it does where torch sorts.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
