@@ -19,7 +19,7 @@ PAPER ?=
 
 .PHONY: demo install test bits slow matrix exposures compat faults fuzz lint bench paper clean
 
-demo: install  ## Train the bundled real scene for two minutes and print the results
+demo: install  ## Train the bundled real scene for two minutes at most and print the results
 	$(BIN)/crossgrad run
 
 install: $(VENV)/.installed  ## Environment with an editable install

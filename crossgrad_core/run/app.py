@@ -15,7 +15,7 @@ from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin
 from crossgrad_core.run.budget_clock import check_clock
-from crossgrad_core.run.bundled import BUNDLED_SECONDS, bundled_scene
+from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
 from crossgrad_core.run.forecast import Forecast
 from crossgrad_core.run.opening import continued, parsed, set_up
@@ -219,7 +219,10 @@ def with_defaults(config: RunConfig) -> RunConfig:
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
         if not given:
-            config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
+            # A plan bounds the views of a photo by itself, and says so.
+            views = None if config.plan == "auto" else BUNDLED_VIEWS
+            length = {"seconds": BUNDLED_SECONDS, "max_views": views}
+            config = config.model_copy(update=length)
     return config
 
 

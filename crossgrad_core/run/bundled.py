@@ -4,8 +4,11 @@ from pathlib import Path
 
 from crossgrad_core.errors import UserError
 
-#: Training seconds of a run on the bundled scene that asks for no length.
+#: The length of a run on the bundled scene that asks for none, whichever is over first: training
+#: seconds, and 100 views of each of its training photos, which more teach by heart
+#: (docs/few-photos.md).
 BUNDLED_SECONDS = 120.0
+BUNDLED_VIEWS = 2_400
 
 
 def bundled_scene() -> Path:

@@ -12,6 +12,7 @@ from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.opening import parsed
 from crossgrad_core.run.resolve import resolved
@@ -161,6 +162,20 @@ def test_views_within_seconds_are_at_least_a_step():
 def test_a_run_has_one_length(lengths):
     with pytest.raises(UserError, match="one length"):
         app.with_defaults(RunConfig(**lengths))
+
+
+@pytest.mark.parametrize(
+    ("asked", "seconds", "views"),
+    [
+        ({}, BUNDLED_SECONDS, BUNDLED_VIEWS),
+        ({"plan": "auto"}, BUNDLED_SECONDS, None),
+        ({"seconds": 5.0}, 5.0, None),
+        ({"max_views": 7}, None, 7),
+    ],
+)
+def test_the_bundled_scene_has_a_length_of_its_own_where_none_is_asked_for(asked, seconds, views):
+    config = app.with_defaults(RunConfig(**asked))
+    assert (config.seconds, config.max_views, config.steps) == (seconds, views, None)
 
 
 def test_the_dry_run_of_a_budget_is_a_configuration_of_it(scene, tmp_path, capsys):

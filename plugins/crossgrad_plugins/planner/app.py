@@ -46,7 +46,7 @@ def plan(
     if write is not None:
         _check_free(write)
     settings = merged(file, options, assignments)
-    config = configured(settings)
+    config = configured({**settings, "plan": "auto"})
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:

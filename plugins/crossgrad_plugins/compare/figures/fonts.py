@@ -5,9 +5,11 @@ anew: of the full one that took a sixth of the time of a comparison.
 """
 
 from functools import cache
+from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
+
+from crossgrad_core.commands import UserError, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,13 +19,31 @@ SMALL: Final = "crossgrad DejaVu Sans"
 FULL: Final = "DejaVu Sans"
 #: Latin letters; dashes and quotation marks; arrows and signs of mathematics.
 _SIGNS: Final = (range(0x20, 0x250), range(0x2000, 0x2070), range(0x2190, 0x2300))
+#: Changes with what is left out of the font: files of other forms stay unused.
+_FORM: Final = 1
 #: The records of a font's name that tell its family.
 _FAMILY: Final = (1, 4, 16)
 
 
+@cache
 def family() -> str:
-    """The family that figures are drawn in; its font is made at the first call."""
-    _folder()
+    """The family that figures are drawn in: the small one, or where it cannot be kept the full one.
+
+    It is kept where matplotlib keeps its list of fonts, from which later processes read it:
+    matplotlib opens the file as often as it draws, and forked ones would leave files of their own.
+    """
+    import matplotlib
+    from matplotlib.font_manager import fontManager
+
+    try:
+        for weight in ("normal", "bold"):
+            name = f"crossgrad-{matplotlib.__version__}-{_FORM}-{weight}.ttf"
+            path = Path(matplotlib.get_cachedir()) / name
+            if not path.is_file():
+                write_atomically(path, _small(weight))
+            fontManager.addfont(path)
+    except (UserError, OSError, RuntimeError):  # The last one: a file that is no font.
+        return FULL
     return SMALL
 
 
@@ -40,20 +60,7 @@ def fall_back(figure: "Figure") -> None:
             text.set_fontfamily([SMALL, FULL])
 
 
-@cache
-def _folder() -> TemporaryDirectory[str]:
-    """Where the small font is until the process ends; matplotlib opens it as often as it draws."""
-    from matplotlib.font_manager import fontManager
-
-    folder = TemporaryDirectory(prefix="crossgrad-fonts-")
-    for weight in ("normal", "bold"):
-        path = Path(folder.name) / f"{weight}.ttf"
-        _write_small(weight, path)
-        fontManager.addfont(path)
-    return folder
-
-
-def _write_small(weight: str, path: Path) -> None:
+def _small(weight: str) -> bytes:
     from fontTools import subset
     from matplotlib.font_manager import FontProperties, findfont
 
@@ -68,4 +75,6 @@ def _write_small(weight: str, path: Path) -> None:
         for record in font["name"].names:
             if record.nameID in _FAMILY:
                 record.string = SMALL
-        font.save(path)
+        file = BytesIO()
+        font.save(file)
+    return file.getvalue()
