@@ -7,7 +7,7 @@ from statistics import mean
 from typing import Any, TypeAlias
 
 from crossgrad_core.commands import UserError, listed
-from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, choices, scene_name
+from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, Settings, choices, scene_name
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.standing import Standing, figure
 
@@ -57,13 +57,16 @@ def best_grid(
             # Nothing varies in it: an arm that the others are held against.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
-            settings = {**arm.settings, **own[0].parameters}
-            arms.append({"name": arm.name, "settings": settings, "by_scene": arm.by_scene})
+            # As parameters, which may change what the settings say, not as settings beside them.
+            fixed = {name: {"values": [value]} for name, value in own[0].parameters.items()}
+            as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
+            arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})
             continue
         best = {}
-        for scene in map(scene_name, grid.scenes):
+        for place in grid.scenes:
+            scene = scene_name(place)
             chosen, without = _best(own, scene, ends, grid)
-            best[scene] = chosen.parameters
+            best[scene] = _with_parameters(chosen, grid.base, place)
             notes += [*without, *_at_the_end(chosen, scene, own)]
         arms += _twice(arm, best)
     content = {
@@ -79,13 +82,25 @@ def best_grid(
 
 
 def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The arm as it is, and with its best parameters; its own settings by scene win, as before."""
+    """The arm as it is, and with its best parameters by scene."""
     own = {"settings": arm.settings}
-    by_scene = {
-        scene: _below(values, arm.by_scene.get(scene, {})) for scene, values in best.items()
-    }
     yield {"name": arm.name, **own, "by_scene": arm.by_scene}
-    yield {"name": f"{arm.name}, best", **own, "by_scene": by_scene}
+    yield {"name": f"{arm.name}, best", **own, "by_scene": best}
+
+
+def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[str, Any]:
+    """Settings by scene with which an arm has the parameters that were chosen.
+
+    Its own settings by scene win, as before. Where one layer cannot say that, they are all that the
+    best runs were started with.
+    """
+    arm, name = chosen.arm, scene_name(scene)
+    wanted = chosen.settings(base, scene)
+    short = _below(chosen.parameters, arm.by_scene.get(name, {}))
+    again = Choice(arm=arm.model_copy(update={"by_scene": {name: short}}), parameters={})
+    if again.settings(base, scene) == wanted:
+        return short
+    return {key: value for key, value in wanted.items() if key != "scene"}
 
 
 def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -154,14 +154,34 @@ CHOICES = """
 - {name: a, parameters: {steps: {values: [10, 20]}}, by_scene: {town: {max_views: 12}}}
 ---
 - {name: a, parameters: {steps: {values: [10, 20]}}, by_scene: {town: {operator.c: 0.9}}}
+---
+- name: a
+  settings: {operator: cagrad}
+  parameters: {operator.c: {values: [0.2, 0.3]}}
+  by_scene: {town: {operator: cagrad, rate_factor: 2}}
+---
+- name: a
+  parameters: {backbone.sh_degree: {values: [0, 1]}}
+  by_scene: {town: {backbone: vanilla}}
+---
+- name: a
+  parameters: {operator.c: {values: [0.2, 0.3]}, operator.name: {value: cagrad}}
+  by_scene: {town: {operator: {c: 0.9}}}
 """
+PLAIN = (
+    "{views: 2}, parameters: {operator.c: {value: 0.3}}",
+    "{steps: 4}, parameters: {seconds: {value: 1}}",
+    "{backbone.sh_degree: 1}, parameters: {backbone: {values: [{sh_degree: 2}]}}",
+    "{views: 2}",
+)
 
 
 @pytest.mark.parametrize("arms", CHOICES.split("---"))
 @pytest.mark.parametrize("base", ["{backbone: mip}", "{operator: {name: cagrad, c: 0.7}}"])
-def test_the_best_arm_is_the_configuration_that_was_best(tmp_path, base, arms):
+@pytest.mark.parametrize("fixed", PLAIN)
+def test_the_best_arm_is_the_configuration_that_was_best(tmp_path, fixed, base, arms):
     path, again = tmp_path / "grid.yaml", tmp_path / "best.yaml"
-    plain = "- {name: plain, settings: {views: 2}, parameters: {operator.c: {value: 0.3}}}"
+    plain = f"- {{name: plain, settings: {fixed}}}"
     path.write_text(f"base: {base}\nscenes: [town]\narms:\n{arms.strip()}\n{plain}\n")
     grid = read_grid(path)
     cells = [Job(str(i), each.label, "town", 0, {}) for i, each in enumerate(choices(grid))]
