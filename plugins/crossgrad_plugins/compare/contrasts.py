@@ -69,10 +69,12 @@ class Contrast:
     @property
     def is_small(self) -> bool:
         """Whether the 90 % interval lies within the margin, whatever else it says."""
-        if self.estimate is None:
-            return False
-        low, high = self.estimate.narrow
-        return -self.quantity.margin < low and high < self.quantity.margin
+        return self.estimate is not None and self.estimate.is_small
+
+    @property
+    def differs(self) -> bool:
+        """Whether the 95 % interval excludes zero, whatever else is compared."""
+        return self.estimate is not None and self.estimate.differs
 
     @property
     def opposed(self) -> tuple[SceneEstimate, ...]:

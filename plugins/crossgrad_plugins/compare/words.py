@@ -102,6 +102,8 @@ def needed_text(contrast: Contrast) -> str:
     if found.needed is None:
         return f"the noise is far above the margin of {margin}"
     if found.needed <= found.pairs:
+        if contrast.is_small or contrast.differs:
+            return "sure by itself, but not beside the other comparisons of its table"
         return f"the difference is too close to the margin of {margin} for {found.pairs} pairs"
     return f"n \u2265 {found.needed} pairs needed to tell {margin} at this noise"
 
@@ -211,7 +213,11 @@ def _why(contrasts: Sequence[Contrast]) -> str:
     pairs = max(c.estimate.pairs for c in contrasts if c.estimate)
     if pairs == 1:
         return _ONE_PAIR
-    if not needed or max(needed) <= pairs:
+    if not needed:
+        return f"the noise is far above the margin of {_margin(first)}"
+    if max(needed) <= pairs:
+        if all(each.is_small or each.differs for each in contrasts):
+            return "sure by themselves, but not beside each other"
         return f"differences too close to the margin of {_margin(first)} for {pairs} pairs"
     return f"n \u2265 {max(needed)} pairs needed to tell {_margin(first)}, there are {pairs}"
 

@@ -119,13 +119,39 @@ def test_pairs_that_are_needed_are_those_of_the_table():
     assert pairs_needed(100.0, 0.1) is None
 
 
-def test_pairs_are_asked_for_by_the_noise_of_the_interval():
+@pytest.mark.parametrize("spread", [0.01, 0.05, 0.1, 0.2, 0.4])
+@pytest.mark.parametrize("scenes", [1, 4, 6])
+def test_more_pairs_are_needed_where_and_only_where_the_interval_is_too_wide(spread, scenes):
+    for seed in range(20):
+        values = np.random.default_rng(seed).normal(0.0, spread, 12)
+        found = estimate(values, [str(number % scenes) for number in range(12)], 0.1)
+        half = (found.narrow[1] - found.narrow[0]) / 2.0
+        assert (found.needed > 12) == (half > 0.1)
+
+
+def test_the_verdict_on_few_comparisons_is_what_the_intervals_say():
+    # The border of the 95 % interval lies between two draws here, and zero does, too.
+    values = [-0.01908, -0.018, 0.13949, 0.02263, 0.13912, -0.03991, 0.1013, 0.15068]
+    values += [0.2282, 0.23885, -0.02011, -0.08109, 0.15728, 0.11603]
+    found = estimate(values, "s0 s2 s0 s0 s2 s2 s0 s1 s0 s3 s0 s0 s0 s3".split(), 0.1)
+    assert 0.0 < found.wide[0] < 0.002
+    assert found.p_different > 0.05
+    assert verdicts([found]) == [Verdict.DIFFERENT]
+    assert verdicts([found] * 6) == [Verdict.INCONCLUSIVE] * 6
+
+
+def test_noise_far_above_the_margin_asks_for_no_number():
+    values = np.random.default_rng(0).normal(0.0, 10.0, 12)
+    assert estimate(values, ["a"] * 12, 0.1).needed is None
+
+
+def test_differences_between_scenes_ask_for_no_pairs_where_the_interval_leaves_them_out():
     scenes = [name for name in "abcd" for _ in range(3)]
     noise = 0.1 * np.tile([-1.0, 0.0, 1.0], 4)
     levels = np.repeat([-2.0, -1.0, 1.0, 2.0], 3)
     found = estimate(levels + noise, scenes, 0.1)
     assert found.method == IQM
-    assert found.needed == pairs_needed(0.1, 0.1) == estimate(noise, scenes, 0.1).needed
+    assert found.needed < pairs_needed(found.deviation, 0.1)
     # Student's interval is about all scenes at once.
     few = estimate((levels + noise)[:9], scenes[:9], 0.1)
     assert few.needed == pairs_needed(few.deviation, 0.1)

@@ -40,12 +40,10 @@ class Bootstrap:
     Attributes:
         draws: [DRAWS] estimates, sorted.
         freedom: Degrees of freedom of the variance within scenes.
-        noise: Standard deviation of a pair within its scene.
     """
 
     draws: NDArray[np.float64]
     freedom: int
-    noise: float
 
     @classmethod
     def of(cls, values: NDArray[np.float64], scenes: Sequence[str]) -> "Bootstrap":
@@ -56,7 +54,7 @@ class Bootstrap:
             scenes: The scene of each.
         """
         rng = np.random.default_rng(_SEED)
-        strata, squares = _strata(scenes), 0.0
+        strata = _strata(scenes)
         stretched, resampled = np.empty(len(values)), np.empty((DRAWS, len(values)))
         of_two = [each for each in strata if len(each) == _TWO]
         pool = _deviations(values, of_two)
@@ -64,13 +62,12 @@ class Bootstrap:
             own, count = values[stratum], len(stratum)
             stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
             stretched[stratum] = own.mean() + stretch * (own - own.mean())
-            squares += float(np.sum((own - own.mean()) ** 2))
             source = own.mean() + pool if count == _TWO else stretched[stratum]
             drawn = rng.integers(0, len(source), (DRAWS, count))
             resampled[:, stratum] = source[drawn]
         draws = iqm(resampled) + (iqm(values) - iqm(stretched))
         freedom = max(1, len(values) - len(strata))
-        return cls(np.sort(draws), freedom, sqrt(squares / freedom))
+        return cls(np.sort(draws), freedom)
 
     def interval(self, level: float) -> tuple[float, float]:
         """The two-sided interval of a level such as 0.95."""

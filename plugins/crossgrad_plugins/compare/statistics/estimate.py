@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, nan
+from math import ceil, inf, nan
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -20,7 +20,7 @@ MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 
 Interval: TypeAlias = tuple[float, float]
-_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float, float]
+_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float, int | None]
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Estimate:
     Attributes:
         pairs: Number of pairs.
         scenes: Number of scenes that they come from.
+        margin: What counts as no difference in practice.
         center: The estimate: the mean below 10 pairs, the interquartile mean from there on.
         method: Which of the two, and where the interval comes from.
         wide: The 95 % interval; it shows a difference where it excludes zero.
@@ -53,14 +54,15 @@ class Estimate:
         p_different: Two-sided p-value of no difference.
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
         p_above: p-value of a difference of at least the margin upwards (a one-sided test).
-        needed: Pairs after which the 90 % interval is as narrow as the margin; None where that
-            cannot be told. The bootstrap's interval knows no differences between scenes.
+        needed: Pairs after which the 90 % interval is as narrow as the margin, if it gets narrower
+            as usual; None where that cannot be told. More than there are where it is not so yet.
         by_scene: The scenes by themselves; empty where all pairs are of one. The interquartile
             mean leaves out a scene that is unlike the others.
     """
 
     pairs: int
     scenes: int
+    margin: float
     center: float
     method: str
     wide: Interval
@@ -71,6 +73,16 @@ class Estimate:
     p_above: float
     needed: int | None
     by_scene: tuple[SceneEstimate, ...] = ()
+
+    @property
+    def differs(self) -> bool:
+        """Whether the 95 % interval excludes zero."""
+        return self.wide[0] > 0.0 or self.wide[1] < 0.0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the 90 % interval lies within the margin."""
+        return -self.margin < self.narrow[0] and self.narrow[1] < self.margin
 
 
 def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
@@ -84,10 +96,11 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
     values = np.asarray(differences, dtype=np.float64)
     enough = len(values) >= BOOTSTRAP_FROM
     found = _by_bootstrap(values, scenes, margin) if enough else _by_student(values, margin)
-    center, wide, narrow, different, equivalent, above, noise = found
+    center, wide, narrow, different, equivalent, above, needed = found
     return Estimate(
         pairs=len(values),
         scenes=len(set(scenes)),
+        margin=margin,
         center=center,
         method=IQM if enough else MEAN,
         wide=wide,
@@ -96,7 +109,7 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
         p_different=different,
         p_equivalent=equivalent,
         p_above=above,
-        needed=student.pairs_needed(noise, margin) if isfinite(noise) else None,
+        needed=needed,
         by_scene=_by_scene(values, scenes),
     )
 
@@ -119,12 +132,13 @@ def _deviation(values: NDArray[np.float64]) -> float:
 def _by_student(values: NDArray[np.float64], margin: float) -> _Found:
     center, noise = float(values.mean()), _deviation(values)
     if len(values) == 1:
-        return center, _UNKNOWN, _UNKNOWN, nan, nan, nan, noise
+        return center, _UNKNOWN, _UNKNOWN, nan, nan, nan, None
     law = student.Law.of(values)
     above = law.upper_tail(margin)
     equivalent = max(above, law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, above, noise
+    needed = student.pairs_needed(noise, margin)
+    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, above, needed
 
 
 def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: float) -> _Found:
@@ -133,4 +147,8 @@ def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: fl
     equivalent = max(above, law.lower_tail(-margin))
     different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
     wide, narrow = law.interval(WIDE), law.interval(NARROW)
-    return float(iqm(values)), wide, narrow, different, equivalent, above, law.noise
+    # The interquartile mean has an interval of another width than the mean, and fewer degrees of
+    # freedom: its own one tells how many pairs make it narrow enough.
+    pairs = len(values) * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
+    needed = max(2, ceil(pairs)) if pairs <= student.MOST_PAIRS else None
+    return float(iqm(values)), wide, narrow, different, equivalent, above, needed

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
-from math import isnan
 from typing import Final
 
 from crossgrad_plugins.compare.statistics.estimate import NARROW, WIDE, Estimate, SceneEstimate
@@ -24,12 +23,17 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
     """The verdict on each of the comparisons that are shown together.
 
     Different where the 95 % interval excludes zero, else equivalent where the 90 % interval lies
-    within the margin. Of more than five comparisons the p-values of either test are corrected with
-    Holm's method first.
+    within the margin. Of more than five comparisons it takes the p-values of either test, corrected
+    with Holm's method, too.
     """
+    if len(family) <= UNCORRECTED:
+        return [_verdict(each.differs, each.is_small) for each in family]
     different = corrected([each.p_different for each in family])
     equivalent = corrected([each.p_equivalent for each in family])
-    return [_verdict(*each) for each in zip(different, equivalent, strict=True)]
+    return [
+        _verdict(each.differs and p < 1.0 - WIDE, each.is_small and q < (1.0 - NARROW) / 2.0)
+        for each, p, q in zip(family, different, equivalent, strict=True)
+    ]
 
 
 def corrected(values: Sequence[float]) -> list[float]:
@@ -56,9 +60,7 @@ def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEsti
     )
 
 
-def _verdict(p_different: float, p_equivalent: float) -> Verdict:
-    if isnan(p_different):  # A single pair.
-        return Verdict.INCONCLUSIVE
-    if p_different < 1.0 - WIDE:
+def _verdict(differs: bool, is_small: bool) -> Verdict:
+    if differs:
         return Verdict.DIFFERENT
-    return Verdict.EQUIVALENT if p_equivalent < (1.0 - NARROW) / 2.0 else Verdict.INCONCLUSIVE
+    return Verdict.EQUIVALENT if is_small else Verdict.INCONCLUSIVE
