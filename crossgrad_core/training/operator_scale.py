@@ -86,7 +86,7 @@ class OperatorScale:
 
 
 def neutral(context: AggregateContext) -> AggregateContext:
-    """The first step of K views whose gradients, losses and distances are equal."""
+    """The first step of K views, all at full size and alike in gradients, losses and distances."""
     views = len(context.losses)
     names = [name for block in context.blocks for name in block.tensors]
     unit = {name: torch.ones(1, dtype=torch.float64) for name in names}
@@ -98,4 +98,5 @@ def neutral(context: AggregateContext) -> AggregateContext:
         gradients=DenseGradients([unit] * views, context.blocks),
         losses=np.ones(views),
         distances=np.full(views, context.reference_distance),
+        scales=(1.0,) * views,
     )

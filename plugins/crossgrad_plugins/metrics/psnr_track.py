@@ -58,9 +58,11 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     wanted = of_photo.brightness[of_photo.usable]
     of_render = light_at(drawn, compared.mask, camera, compared.points)
     light = np.maximum(of_render.brightness[of_photo.usable], 0.0)
-    if not light.any():
+    lit = light > 0.0
+    if not lit.any():
         return 0.0
-    stops = float(np.log2(wanted.sum() / light.sum()))
+    # Of sums a single light far beyond white would be most.
+    stops = float(np.log2(np.median(wanted[lit] / light[lit])))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)
         distances = _distances(light * 2.0 ** tried[:, None], wanted)
@@ -69,6 +71,9 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
 
 
 def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean squares of what brightnesses [L, N] in linear light differ by from [N], as sRGB."""
-    some, others = (encoded(torch.from_numpy(each)) for each in (lights, wanted))
+    """Mean squares of what brightnesses [L, N] in linear light differ by from [N], as sRGB.
+
+    Beyond white they are white, as where the render is compared with the photo.
+    """
+    some, others = (encoded(torch.from_numpy(each)).clamp(max=1.0) for each in (lights, wanted))
     return (some - others).square().mean(dim=1).numpy()

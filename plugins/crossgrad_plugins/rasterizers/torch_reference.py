@@ -75,7 +75,7 @@ class TorchRasterizer(Rasterizer):
         drawing = Drawing(size, gaussians.response, self.max_alpha, probe.shape[1])
         table, lists = torch.cat([probe, table], -1), tile_lists(boxes, size)
         channels, touched, blended = composite_tiles(table, lists, drawing)
-        radii = shapes.radii.detach().ceil().clamp(min=1)
+        radii = shapes.radii.detach().ceil().clamp(min=1, max=_LARGEST_RADIUS)
         screen.radii[index] = torch.where(touched, radii, 0.0).int()
         if published is not None:
             screen.radii = published

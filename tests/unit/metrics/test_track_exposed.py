@@ -47,6 +47,16 @@ def test_light_beyond_white_comes_back():
     assert TrackExposedPSNR().measure(compared(drawn, photo)) > 45
 
 
+@pytest.mark.parametrize("value", [1.5, 3.0, 50.0])
+def test_single_lights_far_beyond_white_are_white(value):
+    photo = smooth()
+    drawn = with_gain(photo, torch.tensor(-0.5))
+    drawn[8:12, 8:12] = value
+    found = TrackExposedPSNR().measure(compared(drawn, photo))
+    white = torch.where(drawn == value, 1.0, photo)
+    assert found == pytest.approx(psnr(white, photo), abs=0.5)
+
+
 def test_only_the_observed_places_are_looked_at():
     drawn, photo = smooth(), with_gain(smooth(), torch.tensor(-1.0))
     mask = torch.ones(SIDE, SIDE, dtype=torch.bool)

@@ -379,5 +379,20 @@ def test_what_cannot_be_drawn_leaves_no_trace(name, response, tensor, value):
     assert screen.radii[3] == 0
 
 
+@pytest.mark.parametrize("size", [5e5, 1e6, 1e7])
+def test_radii_of_what_covers_the_world_are_the_largest(name, size):
+    camera = Camera(64, 48, 1000.0, 1000.0, 32.0, 24.0, torch.eye(4, dtype=torch.float64))
+    one = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 1.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), size),
+        opacities=torch.tensor([0.5]),
+        colors=torch.ones(1, 3),
+    )
+    for rasterizer in (name, "torch"):
+        screen = build("rasterizers", rasterizer, {}).render(one, camera, torch.zeros(3)).screen
+        assert screen.radii.tolist() == [2**30], rasterizer
+
+
 def test_the_default_rasterizer_is_among_those_compared():
     assert "numba" in FAST

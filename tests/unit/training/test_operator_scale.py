@@ -1,5 +1,6 @@
 """What regularisers and the optimizer follow: c(K), the weight of K equal gradients."""
 
+from dataclasses import replace
 from math import nan, sqrt
 from typing import ClassVar
 
@@ -129,8 +130,10 @@ def test_a_third_party_operator_is_asked_once_for_each_number_of_views():
 
 def test_nothing_but_labels_tells_the_views_apart():
     Fivefold.asked.clear()
-    scale_of(Fivefold(), 3)
+    context = aggregate_context(sample_gradients(3))
+    OperatorScale(Fivefold()).of(replace(context, scales=(1.0, 0.5, 0.25)))
     (seen,) = Fivefold.asked
+    assert seen.scales == (1.0, 1.0, 1.0)
     assert seen.present.all() and seen.step == 1
     assert len(set(seen.losses)) == 1
     assert set(seen.distances) == {seen.reference_distance}
