@@ -20,7 +20,7 @@ from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
-from crossgrad_core.system.files import disk_errors, is_leftover, write_atomically
+from crossgrad_core.system.files import disk_errors, disk_full, is_leftover, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
 from crossgrad_core.system.progress import Progress
@@ -101,6 +101,7 @@ __all__ = [
     "counting_of",
     "did_you_mean",
     "disk_errors",
+    "disk_full",
     "entries",
     "exit_code",
     "find_runs",
@@ -290,10 +291,12 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     """
     from crossgrad_core.run import assemble as assembling
     from crossgrad_core.run import settings_for_nothing as nothing
+    from crossgrad_core.training import step
 
     setup = assembling.assemble(config, scene, reader)
     nothing.refuse_labels_for_nothing(setup)
     nothing.refuse_settings_for_nothing(config, setup)
+    step.check_largest_draw(setup)
     return setup
 
 

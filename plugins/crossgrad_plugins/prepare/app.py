@@ -18,7 +18,7 @@ from crossgrad_core.commands import (
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.features import found_features
-from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_leftovers
+from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_damaged, clear_leftovers
 from crossgrad_plugins.prepare.photos import find_photos, has_photos
 from crossgrad_plugins.prepare.picture import draw
 from crossgrad_plugins.prepare.plan import Plan, Settings, agreed
@@ -70,6 +70,7 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
         layout.work.mkdir(parents=True, exist_ok=True)
     with locked(scene, "preparing"), way_on("the same command goes on where this one ended"):
         clear_leftovers(layout)
+        clear_damaged(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))
 
 

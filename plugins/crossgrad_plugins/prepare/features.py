@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.commands import UserError, available_memory, write_atomically
+from crossgrad_core.commands import UserError, available_memory, check_folder, write_atomically
 from crossgrad_plugins.prepare.earth import local_positions
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Photo, Plan
-from crossgrad_plugins.prepare.waiting import quiet, rows_of, waited
+from crossgrad_plugins.prepare.waiting import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap
@@ -27,6 +27,9 @@ _BYTES_PER_PIXEL, _BYTES_DECODED, _SHARE = 320, 4, 0.6
 #: Photos of fewer pixels have few features, and are asked for fainter ones, and for those along
 #: edges: SIFT's threshold on contrast, and on the ratio of curvatures (COLMAP: 0.0067 and 10).
 _SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
+#: Bytes of a feature in the database, and features of a photo for each one that is asked for: those
+#: with several orientations count as often.
+_BYTES_OF_FEATURE, _ORIENTATIONS = 152, 1.6
 #: Photos of a camera that are tried until one can be read.
 _TRIED: Final = 5
 
@@ -42,6 +45,7 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     if layout.features.is_file():
         return dict(json.loads(layout.features.read_bytes()))
 
+    check_folder(layout.work, _room(layout, plan))
     if not layout.database.is_file():
         waited("reading cameras", lambda _: _make_database(layout, plan), lambda: "")
     longest = min(plan.settings.max_size or LONGEST, LONGEST)
@@ -62,6 +66,13 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
         )
     write_atomically(layout.features, json.dumps(found, indent=1).encode())
     return found
+
+
+def _room(layout: Layout, plan: Plan) -> int:
+    """Bytes that the features that are missing take; SQLite ends the process on a full disk."""
+    done = rows_of(layout.database, "descriptors") if layout.database.is_file() else 0
+    each = int(_ORIENTATIONS * plan.settings.max_features) * _BYTES_OF_FEATURE
+    return max(0, len(plan.used) - done) * each + JOURNAL
 
 
 def _options(

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import UserError, check_folder, clear_half_written, disk_errors
+from crossgrad_core.commands import (
+    UserError,
+    check_folder,
+    clear_half_written,
+    disk_errors,
+    is_leftover,
+)
+from crossgrad_plugins.prepare.whole import is_whole
 
 #: The folder of what is needed on the way, and the file that says that `prepare` made it.
 WORK: Final = "prepare"
@@ -138,6 +145,7 @@ def check_ours(layout: Layout, photos: Path) -> None:
 
 
 def _check_whole(layout: Layout) -> None:
+    """Refuses a ready scene of which something is gone or cut short."""
     if not layout.is_whole:
         raise UserError(
             "the scene is ready, but nothing tells any more which photos it was made of",
@@ -147,6 +155,13 @@ def _check_whole(layout: Layout) -> None:
             todo=f"train on the scene as it is: crossgrad run {layout.scene}; or choose another "
             "folder to prepare the photos anew",
         )
+    for made in (layout.models, layout.placed, layout.model):
+        if not _is_sound(layout, made):
+            raise UserError(
+                "a model of the scene is cut short, as a full disk leaves it",
+                where=made,
+                todo=f"remove {layout.report} and run the same command again, which makes it anew",
+            )
 
 
 def _is_hidden(path: Path) -> bool:
@@ -174,8 +189,31 @@ def clear_leftovers(layout: Layout) -> None:
         _delete(scratch_of(made))
     for folder in (layout.work, layout.scene):
         clear_half_written(folder)
-    for path in layout.masks.rglob(".*.tmp.png"):
-        path.unlink()
+    for path in layout.masks.rglob(".*.tmp*"):
+        # Earlier versions ended the names of theirs with the form.
+        if is_leftover(path) or path.name.endswith(".tmp.png"):
+            path.unlink()
+
+
+def clear_damaged(layout: Layout) -> None:
+    """Deletes what earlier versions left cut short on a full disk, and what was made of it."""
+    damaged = False
+    for made in (layout.models, layout.placed, layout.model):
+        damaged = damaged or not _is_sound(layout, made)
+        if damaged:
+            _delete(made)
+
+
+def _is_sound(layout: Layout, made: Path) -> bool:
+    """Whether the models of a stage are whole, or not made yet."""
+    models = models_in(made) if made == layout.models else [made]
+    return not made.is_dir() or all(is_whole(model) for model in models)
+
+
+def models_in(folder: Path) -> list[Path]:
+    """The folders of the models that mapping found, in the order of their numbers."""
+    models = [path for path in folder.glob("*") if path.name.isdecimal()]
+    return sorted(models, key=lambda path: int(path.name))
 
 
 def _delete(path: Path) -> None:

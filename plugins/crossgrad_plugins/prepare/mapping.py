@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Final
 
 from crossgrad_core.commands import UserError, disk_errors, write_atomically
 from crossgrad_plugins.prepare.contradictions import contradicted
-from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
+from crossgrad_plugins.prepare.layout import Layout, emptied, models_in, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.second_look import looked_again
 from crossgrad_plugins.prepare.soundness import sound_models
 from crossgrad_plugins.prepare.waiting import quiet, waited
+from crossgrad_plugins.prepare.whole import write_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -40,7 +41,7 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
     """The models, that with most photos first.
 
     Raises:
-        UserError: No two photos could be brought together, or pycolmap failed.
+        UserError: No two photos could be brought together, the disk is full, or pycolmap failed.
     """
     if not layout.models.is_dir():
         scratch = emptied(scratch_of(layout.models))
@@ -55,13 +56,11 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
         models = _without_misplaced(layout, models, settled)
         if not models:
             raise _nothing(layout, plan)
-        ordered = sorted(models, key=lambda model: -model.num_reg_images())
-        with quiet():
-            for number, model in enumerate(ordered):
-                place = emptied(scratch / str(number))
-                model.write(place)
         for folder in (below, again):
             shutil.rmtree(folder)
+        ordered = sorted(models, key=lambda model: -model.num_reg_images())
+        for number, model in enumerate(ordered):
+            write_model(model, emptied(scratch / str(number)))
         scratch.replace(layout.models)
     return [model for _, model in read_models(layout.models)]
 
@@ -110,8 +109,7 @@ def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]
     """The models of a folder in the order of their numbers."""
     import pycolmap
 
-    models = [path for path in folder.iterdir() if path.name.isdecimal()]
-    for path in sorted(models, key=lambda path: int(path.name)):
+    for path in models_in(folder):
         with quiet():
             yield path, pycolmap.Reconstruction(path)
 
@@ -178,7 +176,7 @@ def _adjusted(
         pycolmap.Reconstruction(place), database, photos, anew, options=options,
         cancellation_token=token,
     )  # fmt: skip
-    model.write(anew)
+    write_model(model, anew)
     models = pycolmap.incremental_mapping(
         database, photos, found, options=options, input_path=anew, cancellation_token=token
     )

@@ -4,11 +4,11 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from crossgrad_core.commands import UserError, write_atomically
+from crossgrad_core.commands import UserError, check_folder, write_atomically
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.retrieval import index_of
-from crossgrad_plugins.prepare.waiting import quiet, rows_of, waited
+from crossgrad_plugins.prepare.waiting import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap
@@ -29,6 +29,8 @@ _LOOKED_UP: Final = 2000
 #: Geometries that are tried to explain the matches of a pair, at most. COLMAP tries five times as
 #: many of pairs that show nothing in common.
 _TRIALS: Final = 2000
+#: Bytes of a pair in the database for each feature of a photo that is asked for.
+_BYTES_OF_PAIR: Final = 2
 #: How photos to compare are chosen -> pycolmap's ways that this takes.
 _WAYS: Final = {
     "exhaustive": ("exhaustive",),
@@ -90,6 +92,7 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
     if layout.links.is_file():
         return tuple(Link(*row) for row in json.loads(layout.links.read_bytes()))
     way = way_of(plan)
+    check_folder(layout.work, _room(layout, plan, way))
     pairings = {each: _pairing(each, layout, way, threads) for each in _WAYS[way]}
     total = _pairs(layout, pairings)
     for each, pairing in pairings.items():
@@ -104,6 +107,14 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
     rows = [[link.first, link.second, link.matches] for link in links]
     write_atomically(layout.links, json.dumps(rows).encode())
     return links
+
+
+def _room(layout: Layout, plan: Plan, way: str) -> int:
+    """Bytes that the pairs that are missing take; SQLite ends the process on a full disk."""
+    photos = len(plan.used)
+    each = {"exhaustive": photos / 2, "sequential": _NEXT_ALONE}.get(way, _ALIKE + _NEXT)
+    missing = photos * min(each, photos / 2) - rows_of(layout.database, "two_view_geometries")
+    return int(max(0.0, missing) * _BYTES_OF_PAIR * plan.settings.max_features) + JOURNAL
 
 
 def _match(

@@ -14,7 +14,7 @@ from crossgrad_plugins.prepare.gravity import top_of
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.placing import Placement, centers_of, merged, placement_of
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.waiting import quiet
+from crossgrad_plugins.prepare.whole import write_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -95,8 +95,7 @@ def _place(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction
         "figures": _figures(whole),
     }
     scratch = emptied(scratch_of(layout.placed))
-    with quiet():
-        whole.write(scratch)
+    write_model(whole, scratch)
     write_atomically(scratch / _FILE, json.dumps(result).encode())
     scratch.replace(layout.placed)
 

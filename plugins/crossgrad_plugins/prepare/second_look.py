@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
+from crossgrad_core.commands import check_folder
 from crossgrad_plugins.prepare.by_pairs import Pairs, Support, best_place, support
+from crossgrad_plugins.prepare.waiting import JOURNAL
+from crossgrad_plugins.prepare.whole import write_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -71,6 +74,9 @@ def looked_again(
     Returns:
         The models, the largest one as it was when most matches agreed with its poses, and photos
         of it for which no better place is known, though pairs speak against theirs.
+
+    Raises:
+        UserError: The disk is full.
     """
     if not models:
         return [], frozenset()
@@ -88,7 +94,7 @@ def looked_again(
         moved |= look.better.keys()
         place = scratch / str(number)
         place.mkdir()
-        changed.write(place)
+        write_model(changed, place)
         try:
             main = adjust(again.copy, place)
         except (RuntimeError, ValueError) as error:
@@ -180,6 +186,8 @@ class _Again:
         A photo that few pairs agree with when the others have moved, too, is left out.
         """
         if not self.copy.exists():
+            # On a full disk SQLite ends the process.
+            check_folder(self.copy.parent, self._database.stat().st_size + JOURNAL)
             shutil.copyfile(self._database, self.copy)
         with _opened(self._database) as database, _opened(self.copy) as copied:
             for photo, pose in look.better.items():

@@ -1,5 +1,6 @@
 """Photos, masks and the model without lens distortion: the scene as `crossgrad run` reads it."""
 
+import io
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,11 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crossgrad_core.commands import UserError, disk_errors
+from crossgrad_core.commands import UserError, check_folder, disk_errors, write_atomically
+from crossgrad_core.scene.decode import decode_photo
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.masks import HALF, counting_pixels
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.waiting import quiet, waited
+from crossgrad_plugins.prepare.whole import check_written
 
 if TYPE_CHECKING:
     import pycolmap
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
 #: Photos that are undistorted between two looks at what is done.
 _BATCH: Final = 32
 _QUALITY: Final = 95
+#: Bytes that a pixel of a photo takes on the disk, and what is written beside photos and model:
+#: a sharp photo takes 0.4 as a JPEG file of this quality, one of nothing but noise 2.
+_BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
@@ -40,14 +46,33 @@ def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
     left = [name for name in names if name not in set(done)]
     for start in range(0, max(1, len(left)), _BATCH):
         batch = left[start : start + _BATCH] or names[:1]
+        check_folder(layout.scene, _room(layout, plan, model, batch))
         _undistort(layout, plan, batch, threads, f"{len(done) + start} of {len(names)} photos")
         for name in batch:
             _moved(work / "images" / name, layout.images / name)
     _write_masks(layout, plan, model)
     layout.model.parent.mkdir(exist_ok=True)
+    check_written(work / "sparse")
     with disk_errors(layout.model):
         (work / "sparse").replace(layout.model)
     shutil.rmtree(work)
+
+
+def _room(
+    layout: Layout, plan: Plan, model: "pycolmap.Reconstruction", names: Sequence[str]
+) -> int:
+    """Bytes that the undistorted photos of these names take, with the model of all beside them.
+
+    They are asked for beforehand: on a full disk the writer of JPEG files ends the process.
+    """
+    import pycolmap
+
+    room = sum(path.stat().st_size for path in layout.placed.iterdir()) + _BESIDE
+    for name in names:
+        image = model.find_image_with_name(name)
+        camera = pycolmap.undistort_camera(_options(plan), model.camera(image.camera_id))
+        room += int(_BYTES_PER_PIXEL * camera.width * camera.height)
+    return room
 
 
 def _undistort(layout: Layout, plan: Plan, names: Sequence[str], threads: int, far: str) -> None:
@@ -75,7 +100,7 @@ def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
 
 
 def _moved(here: Path, there: Path) -> None:
-    if not here.is_file():  # Pycolmap does not say why.
+    if not _is_written(here):  # Pycolmap does not say why.
         raise UserError(
             "the undistorted photo could not be written",
             where=there,
@@ -86,9 +111,22 @@ def _moved(here: Path, there: Path) -> None:
         here.replace(there)
 
 
+def _is_written(photo: Path) -> bool:
+    """Whether a photo is there, to its end."""
+    # What writes JPEG files does not go on where it cannot write; other files may be cut short.
+    if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
+        return photo.is_file()
+    try:
+        decode_photo(photo)
+    except UserError:
+        return False
+    return True
+
+
 def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -> None:
     """Writes the masks of the photos that have one or are transparent, undistorted as these are."""
     import pycolmap
+    from PIL import Image
 
     photos = {photo.name: photo for photo in plan.used}
     for number in model.reg_image_ids():
@@ -105,8 +143,8 @@ def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -
                 _options(plan), bitmap, model.camera(image.camera_id)
             )
         kept = np.where(bitmap.to_array() >= HALF, 255, 0).astype(np.uint8)
-        scratch = place.with_name(f".{place.name}.tmp.png")
+        content = io.BytesIO()
+        Image.fromarray(kept).save(content, format="PNG")
         with disk_errors(place):
             place.parent.mkdir(parents=True, exist_ok=True)
-            pycolmap.Bitmap.from_array(kept).write(scratch)
-            scratch.replace(place)
+        write_atomically(place, content.getvalue())

@@ -24,6 +24,8 @@ _COUNT: Final = (
     "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
 )
 _PATIENCE: Final = 5.0
+#: Bytes that SQLite may write beside a database before it takes them over.
+JOURNAL: Final = 2**23
 #: Glog's level of what ends the process. What pycolmap says below that does not concern the user: a
 #: failure that counts is told by its exception, or by what is missing afterwards.
 _FATAL: Final = 3
