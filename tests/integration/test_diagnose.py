@@ -157,6 +157,15 @@ def test_bad_requests_are_refused(scene, tmp_path):
         diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")
 
 
+@pytest.mark.parametrize("photos", [1, 2, 3])
+def test_too_few_photos_are_refused_as_such(tmp_path, photos):
+    scene = write_tiny_scene(tmp_path / "few", views=photos)
+    with pytest.raises(UserError) as told:
+        diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
+    assert told.value.what == "too few training photos to be probed"
+    assert "4 at least" in told.value.expected and "sampler" not in told.value.todo
+
+
 @pytest.mark.parametrize("name", sorted(FILES - {"diagnostics.csv"}))
 def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
     mine = tmp_path / name

@@ -3,9 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from sys import float_info
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from crossgrad_core.commands import RunConfig, UserError, find_runs, read_results, read_rows
 from crossgrad_plugins.compare.run import Run
@@ -19,6 +20,14 @@ _ID, _LABEL = "run", "configuration"
 _LENGTHS: Final = ("steps=", "max_views=", "seconds=")
 #: What a grid without arms calls its only one.
 _ONLY: Final = "run"
+_REPEAT: Final = "restore the file, or repeat the run: crossgrad run --config config.yaml"
+_OVERSIZED: Final = "a whole number that is too large"
+
+
+class _Seconds(BaseModel):
+    """The seconds of summary.json that are added up."""
+
+    phases: dict[str, Annotated[float, Field(strict=True, allow_inf_nan=False)]] | None = None
 
 
 class _Summary(BaseModel):
@@ -32,7 +41,7 @@ class _Summary(BaseModel):
     notes: list[str] = []
     definitions: dict[str, str] = {}
     environment: dict[str, Any] = {}
-    seconds: dict[str, Any] = {}
+    seconds: _Seconds = _Seconds()
 
 
 @dataclass
@@ -154,10 +163,24 @@ def _check_whole(results: "RunResults") -> None:
     """Refuses a finished run of which a file is cut off or gone: readings would be of elsewhere.
 
     Raises:
-        UserError: metrics.csv ends before the run did, held-out views have no figures, or the marks
-            of the scene cannot be read.
+        UserError: metrics.csv ends before the run did or has a number that is too large, held-out
+            views have no figures, or the marks of the scene cannot be read.
     """
-    _ = results.scene_marks  # Refuses damaged ones.
+    views = (results.scene_marks or {}).get("views") or {}  # Refuses what is no scene.json.
+    if not all(isinstance(view, Mapping) for view in views.values()):
+        raise UserError(
+            "unreadable scene.json",
+            where=results.folder / "scene.json",
+            expected="an object for each view, with what its photo is known by",
+            todo=_REPEAT,
+        )
+    if _oversized(list(results.rows)):
+        raise UserError(
+            "unreadable metrics.csv",
+            where=results.folder / "metrics.csv",
+            found=_OVERSIZED,
+            todo=_REPEAT,
+        )
     summary = results.summary or {}
     last = results.rows[-1].get("step") if results.rows else None
     steps = summary.get("step")
@@ -167,7 +190,7 @@ def _check_whole(results: "RunResults") -> None:
             where=results.folder / "metrics.csv",
             expected=f"a last row of step {steps}, which summary.json is of",
             found=f"step {last:.0f}" if last is not None else "no row with a step",
-            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
+            todo=_REPEAT,
         )
     if (summary.get("overall") or {}).get("views") and not results.views:
         raise UserError(
@@ -180,15 +203,32 @@ def _check_whole(results: "RunResults") -> None:
 
 
 def _check_summary(results: "RunResults") -> None:
+    found = _OVERSIZED if _oversized(results.summary) else ""
     try:
         _Summary.model_validate(results.summary)
     except ValueError as error:
+        found = _in_words(error)
+    if found:
         raise UserError(
             "unreadable summary.json",
             where=results.folder / "summary.json",
-            found=_in_words(error),
-            todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
-        ) from error
+            found=found,
+            todo=_REPEAT,
+        )
+
+
+def _oversized(content: object) -> bool:
+    """Whether a whole number in lists and objects is beyond those that can be reckoned with."""
+    rest = [content]
+    while rest:
+        each = rest.pop()
+        if isinstance(each, Mapping):
+            rest += each.values()
+        elif isinstance(each, list):
+            rest += each
+        elif isinstance(each, int) and abs(each) > float_info.max:
+            return True
+    return False
 
 
 def _in_words(error: ValueError) -> str:

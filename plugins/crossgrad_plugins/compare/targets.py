@@ -109,6 +109,13 @@ def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
     shared = set.intersection(*(set(by) for by in amounts.values())) if amounts else set()
     least = {problem: min(by[problem] for by in amounts.values()) for problem in shared}
     return {
-        arm: [by[p] / least[p] if isfinite(by[p]) else inf for p in sorted(shared)]
+        arm: [_ratio(by[problem], least[problem]) for problem in sorted(shared)]
         for arm, by in amounts.items()
     }
+
+
+def _ratio(amount: float, least: float) -> float:
+    """An amount over the least one; 1 where both are nothing, as of a run that began there."""
+    if isfinite(amount) and amount == least:
+        return 1.0
+    return amount / least if isfinite(amount) and least else inf

@@ -29,6 +29,7 @@ from crossgrad_plugins.diagnostics.plan import (
     ProbePlan,
     labelled,
     plan_probe,
+    require_views,
 )
 from crossgrad_plugins.diagnostics.probe import ModelProbe
 from crossgrad_plugins.diagnostics.report import Report
@@ -68,7 +69,8 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
         `failure` says what happened.
 
     Raises:
-        UserError: The scene cannot be read, or the grouping cannot group it.
+        UserError: The scene cannot be read, has too few training photos, or the grouping cannot
+            group it.
         TrainingFailedError: Training failed before the first probe.
     """
     vanilla = config.model_copy(
@@ -103,7 +105,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
     """Probes a run where it is.
 
     Raises:
-        UserError: The grouping cannot group its scene.
+        UserError: Its scene has too few training photos, or the grouping cannot group it.
     """
     plan = _plan(setup.scene, options, setup.groups)
     watch = Watch(plan, 1, state.step, options.seed)
@@ -119,6 +121,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
 
 def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
     """The views to probe; `groups` are the labels that the probed run was trained with."""
+    require_views(scene)
     if options.grouping is None and groups is not None:
         return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
     grouping = options.grouping or ComponentChoice(name=DEFAULT_GROUPING)

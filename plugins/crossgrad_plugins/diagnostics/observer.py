@@ -74,10 +74,12 @@ class Diagnostics(Observer):
             OF_THE_RUN,
             labelled,
             plan_probe,
+            require_views,
         )
         from crossgrad_plugins.diagnostics.report import PROBES, read_probes
         from crossgrad_plugins.diagnostics.watch import Watch
 
+        require_views(model.scene)
         if self.grouping is None and model.groups is not None:
             name, labels = OF_THE_RUN, model.groups
         else:

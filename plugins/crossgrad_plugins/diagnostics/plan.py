@@ -46,6 +46,23 @@ class ProbePlan:
         return self.labels.count(self.near_label), self.labels.count(self.far_label)
 
 
+def require_views(scene: Scene) -> None:
+    """Refuses a scene that no grouping could make two groups of.
+
+    Raises:
+        UserError: It has too few training photos.
+    """
+    least = 2 * SMALLEST_GROUP
+    if len(scene.train) < least:
+        raise UserError(
+            "too few training photos to be probed",
+            where=scene.name,
+            expected=f"{least} at least: two groups of {SMALLEST_GROUP}",
+            found=str(len(scene.train)),
+            todo="take more photos of the scene, or diagnose another one",
+        )
+
+
 def labelled(
     scene: Scene, grouping: str, seed: int, options: Mapping[str, Json] | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:

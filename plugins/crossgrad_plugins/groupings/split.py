@@ -94,7 +94,7 @@ def require_groups(
         expected=f"training views that differ in {quantity}",
         found=", ".join(f"{label}: {count}" for label, count in counts.items()),
         todo="choose another grouping (lists takes folders or your own lists), "
-        "or a sampler that needs none (epoch, random)",
+        "or, for a run, a sampler that needs none (epoch, random)",
     )
 
 

@@ -1,6 +1,8 @@
 """Folders that are damaged, unfinished, old, or alone."""
 
+import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,9 @@ from support.run_folders import RunFolder
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.targets import ratios
 from crossgrad_plugins.compare.words import headline
 
 OLD = Path(__file__).parents[2] / "integration" / "data" / "run-0.1"
@@ -61,6 +65,70 @@ def test_a_damaged_summary_is_found_below_its_surface(folder):
     (folder / "1-1" / "summary.json").write_text('{"status": "finished", "overall": 3, "notes": 1}')
     found = read_runs([folder], skip_broken=True)
     assert list(found.left_out) == ["1-1"]
+
+
+def changed(path: Path, change: Callable[[dict], None]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def set_phase(value):
+    return lambda summary: summary["seconds"]["phases"].update(decode=value)
+
+
+def set_view(value):
+    return lambda marks: marks["views"].update({"a/12.jpg": value})
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        *(("scene.json", set_view(view)) for view in (1, "photo", ["photo"], True, None)),
+        ("summary.json", lambda summary: summary["seconds"].update(phases=[0.5])),
+        ("summary.json", lambda summary: summary["seconds"].update(phases=float("nan"))),
+        *(
+            ("summary.json", set_phase(value))
+            for value in ([], {}, "1", None, float("nan"), 10**400)
+        ),
+        ("summary.json", lambda summary: summary.update(views=10**400)),
+        ("summary.json", lambda summary: summary["environment"].update(torch_threads=10**400)),
+    ],
+)
+def test_damage_deep_in_a_file_is_named_or_its_run_left_out(folder, file, change):
+    changed(folder / "1-1" / file, change)
+    with pytest.raises(UserError) as error:
+        read_runs([folder], skip_broken=False)
+    assert error.value.where == str(folder / "1-1" / file)
+    found = read_runs([folder], skip_broken=True)
+    assert list(found.left_out) == ["1-1"]
+    assert compared(found, Options()).ends
+
+
+@pytest.mark.parametrize("file", ["metrics.csv", "per_view.csv"])
+def test_a_number_beyond_all_others_is_damage(folder, file):
+    path = folder / "1-1" / file
+    first, second, *lines = path.read_text().splitlines()
+    cells = second.split(",")
+    cells[2] = "1" + "0" * 399
+    path.write_text("\n".join([first, ",".join(cells), *lines, ""]))
+    assert file in read_runs([folder], skip_broken=True).left_out["1-1"]
+
+
+def test_what_is_reached_before_anything_is_spent_has_a_ratio(tmp_path):
+    for views in (1, 2):
+        path = RunFolder(views_per_step=views).write(tmp_path / f"{views}") / "metrics.csv"
+        first, second, *lines = path.read_text().splitlines()
+        cells = ["0"] * 4 + second.split(",")[4:]
+        path.write_text("\n".join([first, ",".join(cells), *lines, ""]))
+    found = compared(read_runs([tmp_path], skip_broken=False), Options(target=10.0))
+    assert ratios(found.reached) == {"views=1": [1.0], "views=2": [1.0]}
+
+
+def test_a_run_without_phases_is_compared(folder):
+    changed(folder / "1-1" / "summary.json", lambda summary: summary["seconds"].pop("phases"))
+    found = compared(read_runs([folder], skip_broken=False), Options())
+    assert len(phases_of(found)) == 2
 
 
 def test_a_run_without_an_end_is_left_out_and_listed(folder):

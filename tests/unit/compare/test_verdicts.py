@@ -133,7 +133,8 @@ def test_the_verdict_on_few_comparisons_is_what_the_intervals_say():
     # The border of the 95 % interval lies between two draws here, and zero does, too.
     values = [-0.01908, -0.018, 0.13949, 0.02263, 0.13912, -0.03991, 0.1013, 0.15068]
     values += [0.2282, 0.23885, -0.02011, -0.08109, 0.15728, 0.11603]
-    found = estimate(values, "s0 s2 s0 s0 s2 s2 s0 s1 s0 s3 s0 s0 s0 s3".split(), 0.1)
+    scenes = [f"s{number}" for number in (0, 2, 0, 0, 2, 2, 0, 1, 0, 3, 0, 0, 0, 3)]
+    found = estimate(values, scenes, 0.1)
     assert 0.0 < found.wide[0] < 0.002
     assert found.p_different > 0.05
     assert verdicts([found]) == [Verdict.DIFFERENT]
