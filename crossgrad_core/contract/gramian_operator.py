@@ -192,7 +192,7 @@ def operator_context(
     return OperatorContext(
         step=context.step,
         blocks=names,
-        kinds=_kinds(names, context.blocks),
+        kinds=_kinds(names, context.blocks, granularity),
         losses=context.losses,
         labels=context.labels,
         distances=context.distances,
@@ -204,7 +204,9 @@ def operator_context(
     )
 
 
-def _kinds(names: Sequence[str], blocks: Sequence[Block]) -> tuple[BlockKind, ...]:
+def _kinds(
+    names: Sequence[str], blocks: Sequence[Block], granularity: Granularity
+) -> tuple[BlockKind, ...]:
     """Kinds of blocks; groups are named by their kind, the whole is neutral."""
     known: dict[str, BlockKind] = {
         "geometry": "geometry",
@@ -212,7 +214,8 @@ def _kinds(names: Sequence[str], blocks: Sequence[Block]) -> tuple[BlockKind, ..
         "neutral": "neutral",
         "all": "neutral",
     }
-    known |= {block.name: block.kind for block in blocks}
+    if granularity in {"block", "gaussian"}:  # A block may be called as a group is.
+        known = {block.name: block.kind for block in blocks}
     return tuple(map(known.__getitem__, names))
 
 

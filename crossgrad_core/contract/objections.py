@@ -45,7 +45,7 @@ def _of_the_sampler(selection: Selection) -> Iterator[str]:
     if sampler.groups is not None and labels is not None and len(labels) != sampler.groups:
         yield (
             f"sampler {name} draws from {sampler.groups} groups; grouping "
-            f"{selection.names['grouping']} gives {len(labels)}: {', '.join(labels)}"
+            f"{selection.names['grouping']} gives {len(labels)}: {', '.join(map(str, labels))}"
         )
 
 

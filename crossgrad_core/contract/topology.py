@@ -48,7 +48,12 @@ class Edit:
     @property
     def is_empty(self) -> bool:
         """Whether it changes nothing and counts nothing."""
-        return self.source is None and not self.values and not self.counts
+        return self.keeps_rows and not self.values and not self.counts
+
+    @property
+    def keeps_rows(self) -> bool:
+        """Whether all primitives stay, and none begins afresh."""
+        return self.source is None and self.fresh is None
 
 
 #: The explicit answer of a densifier that changes nothing in this step.
@@ -160,7 +165,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
     Rows that are fresh, and rows overwritten without `keep_moments`, start at zero.
     """
     source, fresh = gather_indices(edit, old.shape[0], old.device)
-    new = carried(old, source, fresh) if edit.source is not None else old
+    new = old if edit.keeps_rows else carried(old, source, fresh)
     overwrite = edit.values.get(name)
     if overwrite is not None and not overwrite.keep_moments:
         new = new.clone()

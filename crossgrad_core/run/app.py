@@ -58,6 +58,7 @@ from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.wording import listed
 
@@ -194,6 +195,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     refuse_labels_for_nothing(setup)
     refuse_settings_for_nothing(config, setup)
     known_starts(setup)
+    check_largest_draw(setup)
     return setup, load_seconds + seconds_of(setup.plan) + _decoded(setup, way)
 
 

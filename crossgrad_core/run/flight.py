@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.similarity import Similarity
@@ -150,10 +150,10 @@ def _unit(vector: _Floats) -> _Floats:
 class _Frame(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    camera_to_world: list[Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]] = Field(
+    camera_to_world: list[Annotated[float, Field(strict=True, ge=-FARTHEST, le=FARTHEST)]] = Field(
         min_length=16, max_length=16
     )
-    fov: float = Field(ge=0.01, lt=180)
+    fov: float = Field(strict=True, ge=0.01, lt=180)
 
 
 class _Path(BaseModel):
@@ -162,9 +162,9 @@ class _Path(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     camera_path: list[_Frame] = Field(min_length=1, max_length=MOST_FRAMES)
-    render_width: PositiveInt = Field(le=16_384)
-    render_height: PositiveInt = Field(le=16_384)
-    fps: float = Field(FRAMES_PER_SECOND, ge=0.01, le=1_000)
+    render_width: float = Field(strict=True, ge=1, le=16_384, multiple_of=1)
+    render_height: float = Field(strict=True, ge=1, le=16_384, multiple_of=1)
+    fps: float = Field(FRAMES_PER_SECOND, strict=True, ge=0.01, le=1_000)
     camera_type: Literal["perspective"] = "perspective"
 
 
@@ -177,7 +177,7 @@ def _read(path: Path, similarity: Similarity) -> Flight:
         raise UserError(
             "unreadable camera path", where=f"--path {path}", found=str(error), todo=_TODO
         ) from error
-    size = found.render_width, found.render_height
+    size = round(found.render_width), round(found.render_height)
     cameras = [_camera(frame, size, similarity, path) for frame in found.camera_path]
     return Flight(path.stem, tuple(cameras), found.fps)
 

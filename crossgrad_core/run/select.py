@@ -174,6 +174,7 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
     regimes = sorted({view.regime for view in scene.test_views})
     for name, choice in {each.name: each for each in config.metrics}.items():
         metric = _built(Metric, choice)
+        _check_form(name, metric.described().form)
         columns = columns_for(regimes, [each.figure for each in (*metrics.values(), metric)])
         twice = sorted({each for each in columns if columns.count(each) > 1})
         if not twice:
@@ -188,6 +189,19 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
                 todo=f"leave metric {name} out, or rename the folder of photos",
             )
     return metrics
+
+
+def _check_form(name: str, form: str) -> None:
+    try:
+        format(0.0, form)
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"metric {name} has a figure that cannot be shown",
+            where="its form",
+            expected="one that formats floating-point numbers, such as .4f or .0f",
+            found=repr(form),
+            todo=f"repair the plugin, or leave metric {name} out",
+        ) from error
 
 
 def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:

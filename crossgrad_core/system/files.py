@@ -15,6 +15,7 @@ from crossgrad_core.system.interrupts import UNFINISHED
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 _FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_IN_THE_WAY = frozenset({errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ELOOP})
 
 
 def size_text(count: int) -> str:
@@ -62,7 +63,7 @@ def is_full(error: OSError) -> bool:
 
 @contextmanager
 def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
-    """Turns a full disk or missing permission inside the block into a `UserError`.
+    """Turns a full disk, no permission or a wrong kind of file inside the block into a `UserError`.
 
     Args:
         path: What is being written.
@@ -75,6 +76,9 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
             raise disk_full(path, needed) from error
         if error.errno in _FORBIDDEN:
             raise read_only(path) from error
+        if error.errno in _IN_THE_WAY:
+            what, found = "something else is in the way", error.strerror or ""
+            raise UserError(what, where=path, found=found, todo="move it elsewhere") from error
         raise
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.state import PluginState
+from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)
 
@@ -73,17 +74,15 @@ def revived(state: PluginState) -> PluginState:
             f"the state's values do not survive JSON ({error}): keep plain numbers, strings, "
             "lists and dictionaries with string keys there, and tensors in `tensors`"
         ) from error
-    require(
-        values == _listed(state.values),
-        f"the state's values change on the way through JSON: {state.values!r} became {values!r}",
-    )
+    wrong = unsavable(state, "cpu")
+    require(not wrong, f"a checkpoint cannot hold the state: {wrong}")
     return PluginState(values, _cloned(state.tensors), _cloned(state.per_primitive))
 
 
 def same_state(one: PluginState, other: PluginState) -> bool:
     """Whether two states hold the same values and the same bits."""
     return (
-        _listed(one.values) == _listed(other.values)
+        dict(one.values) == dict(other.values)
         and _same_tensors(one.tensors, other.tensors)
         and _same_tensors(one.per_primitive, other.per_primitive)
     )
@@ -119,12 +118,3 @@ def _same_tensors(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> boo
     return one.keys() == other.keys() and all(
         torch.equal(tensor, other[name]) for name, tensor in one.items()
     )
-
-
-def _listed(value: object) -> object:
-    """Plain data with tuples as lists, as JSON gives them back."""
-    if isinstance(value, Mapping):
-        return {key: _listed(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_listed(each) for each in value]
-    return value

@@ -121,9 +121,8 @@ class DensifierRun:
         blocks, before = self.backbone.blocks(), self.primitives
         require_good(edit, blocks, self.parameters)
         self.parameters = apply_to_parameters(edit, blocks, self.parameters)
+        self.state = self.state.gathered(*gather_indices(edit, before, torch.device("cpu")))
         if edit.source is not None:
-            source, fresh = gather_indices(edit, before, edit.source.device)
-            self.state = self.state.gathered(source, fresh)
             phase = sample_phase()
             self.parameters = self.backbone.prepare(self.parameters, sample_scene(), phase)
 
@@ -182,6 +181,8 @@ def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) 
     """Requires of an edit that it can be applied, and that its values are finite."""
     misfit = misfit_of(edit, blocks, parameters)
     require(not misfit, f"the edit does not fit: {misfit}")
+    plain = all(type(each) is int for each in edit.counts.values())
+    require(plain, f"edit.counts is {edit.counts!r}; expected plain integers")
     number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
     for name, overwrite in edit.values.items():
         values, rows = overwrite.values, overwrite.rows

@@ -57,6 +57,7 @@ from crossgrad_core.testing.contract import (
 )
 from crossgrad_core.testing.densifiers import DensifierRun, require_good
 from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.renders import renders_of
 
 #: The hooks of one run's manager; pluggy gives them no types.
 Hooks: TypeAlias = Any
@@ -229,12 +230,13 @@ def _require_answer(answer: Answer, kind: type[Answer]) -> None:
 def _model(step: int) -> Model:
     """The model of a new run on the sample scene."""
     backbone = build(Backbone, BACKBONE, {})
-    parameters = created(backbone)
+    rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
+    parameters, phase, scene = created(backbone), sample_phase(step), sample_scene()
     return Model(
-        phase=sample_phase(step),
-        scene=sample_scene(),
+        phase=phase,
+        scene=scene,
         backbone=backbone,
-        rasterizer=build(Rasterizer, REFERENCE_RASTERIZER, {}),
+        rasterizer=rasterizer,
         parameters=parameters,
         adam=AdamState(
             exp_avg={name: torch.zeros_like(tensor) for name, tensor in parameters.items()},
@@ -244,6 +246,7 @@ def _model(step: int) -> Model:
         background=torch.zeros(3),
         loss=build(Loss, LOSS, {}),
         groups=None,
+        render=renders_of(scene, phase, backbone, rasterizer, parameters),
     )
 
 

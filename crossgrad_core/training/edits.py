@@ -84,7 +84,7 @@ def put_in_order(setup: Setup, state: TrainState) -> None:
 
 def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
     before = state.primitives(setup)
-    state.settle(edit.values if edit.source is None else None)
+    state.settle(edit.values if edit.keeps_rows else None)
     for block in setup.blocks:
         if block.per_primitive:
             for name in block.tensors:
@@ -92,9 +92,9 @@ def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
                     if name in moments:
                         moments[name] = apply_to_moment(edit, name, moments[name])
     state.tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
-    if edit.source is None:
+    if edit.keeps_rows:
         return
-    source, fresh = gather_indices(edit, before, edit.source.device)
+    source, fresh = gather_indices(edit, before, setup.device)
     state.states = {
         name: _gathered(name, old, source, fresh, before) for name, old in state.states.items()
     }
@@ -102,9 +102,12 @@ def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
 
 def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: int) -> PluginState:
     for key, tensor in old.per_primitive.items():
-        if tensor.shape[0] != rows:
-            raise RuntimeError(
-                f"per-primitive state {key!r} of {name} has {tensor.shape[0]} rows "
-                f"for {rows} primitives"
+        if tensor.shape[:1] != (rows,):
+            raise UserError(
+                f"the state of plugin {name} does not fit the primitives",
+                where=f"per_primitive, {key}",
+                expected=f"a row for each of {rows} primitives, as they were before the edit",
+                found=f"shape {list(tensor.shape)}",
+                todo="repair the plugin (docs/hooks.md)",
             )
     return old.gathered(source, fresh)

@@ -40,14 +40,14 @@ class Foresight:
         setup = self._setup
         if self._blind or not setup.photos_ahead.useful:
             return
-        self._follow(state)
         try:
+            self._follow(state)
             self._draw(state)
+            views = [setup.train_views[index] for draw in self._draws for index in draw]
         except Exception:  # The step itself will say what is wrong.
             self._blind = True
             return
         scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
-        views = [setup.train_views[index] for draw in self._draws for index in draw]
         small = setup.scaled_photos
         wanted = [v for v in views if not small.holds(v, photo_camera(setup, v, scale))]
         setup.photos_ahead.expect(wanted)
@@ -74,7 +74,7 @@ class Foresight:
                 states={**state.states, STATE: self._state},
             )
             draw, self._state = setup.sampler.sample(context, self._state)
-            self._draws.append(draw.views)
+            self._draws.append(tuple(map(int, draw.views)))
             self._step += 1
 
     def _enough(self) -> bool:

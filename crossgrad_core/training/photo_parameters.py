@@ -43,7 +43,7 @@ def started(setup: Setup) -> PluginState | None:
         _check(setup, f"starts parameter {name} with", start)
     tensors = {}
     for name, each in (known_starts(setup) or starts).items():
-        start = each.detach().to(setup.device).clone()
+        start = each.detach().to(setup.device).clone(memory_format=torch.contiguous_format)
         tensors[f"{_VALUE}.{name}"] = start
         tensors[f"{_FIRST}.{name}"] = torch.zeros_like(start)
         tensors[f"{_SECOND}.{name}"] = torch.zeros_like(start)

@@ -29,7 +29,7 @@ from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import in_one_line, listed
 
 _LOG = logging.getLogger(__name__)
 #: Random initial points where a scene has none (`--init random`).
@@ -49,7 +49,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        name: tensor.detach().to(setup.device).requires_grad_(name in trained)
+        # In one order of rows, as it comes out of a checkpoint: other orders round otherwise.
+        name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
     prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
@@ -80,10 +81,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     if reading.init_file is not None:
         gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, scene.similarity)
         return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
-    if reading.init == "random":
-        begun = with_random_points(scene, rng)
-    else:
-        begun = setup.selection.start.begun(scene)
+    begun = with_random_points(scene, rng) if reading.init == "random" else _begun(setup)
     parameters = _made(setup, setup.backbone.create(begun, rng), "create")
     present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
     if bound is None or bound == AUTO or present <= bound:
@@ -97,6 +95,48 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
         # Where several points make one primitive, or one makes several, it takes more than one try.
         share *= min(_LESS, wanted / made)
     return parameters, present
+
+
+def _begun(setup: Setup) -> Scene:
+    """The scene with the points that the start adds.
+
+    Raises:
+        UserError: They are none that primitives can be made of.
+    """
+    scene, start = setup.scene, setup.selection.start
+    try:
+        begun = start.begun(scene)
+        wrong = _misfit(begun, len(scene.points))
+    except ValueError as error:
+        start.more_points(scene)  # What the start itself raises comes through.
+        wrong = in_one_line(error)
+    if not wrong:
+        return begun
+    raise UserError(
+        f"start {setup.selection.names['start']} adds what cannot be points",
+        where=f"{type(start).__name__}.more_points",
+        expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0, opacities [N] in "
+        "(0, 1)",
+        found=wrong,
+        todo="choose another --start, or repair the plugin",
+    )
+
+
+def _misfit(begun: Scene, known: int) -> str:
+    """What is wrong with the points behind the known ones, in words; empty where nothing is."""
+    points, sizes, opacities = begun.points[known:], begun.point_sizes, begun.point_opacities
+    if sizes is None or opacities is None:
+        return ""
+    counts = {"colors": len(begun.point_colors), "sizes": len(sizes), "opacities": len(opacities)}
+    for name, count in counts.items():
+        if count != len(begun.points):
+            return f"{len(points)} positions, {count - known} {name}"
+    if not np.isfinite(points).all():
+        return "a position that is not finite"
+    if not ((sizes[known:] > 0.0) & np.isfinite(sizes[known:])).all():
+        return "a size that is no number above 0"
+    inside = (opacities[known:] > 0.0) & (opacities[known:] < 1.0)
+    return "" if inside.all() else "an opacity that is not between 0 and 1"
 
 
 def _made(setup: Setup, answer: object, method: str) -> Parameters:

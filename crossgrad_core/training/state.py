@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 from pluggy import HookCaller
 from torch import Tensor
 from typing_extensions import override
@@ -12,7 +13,7 @@ from typing_extensions import override
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.state import SLOTS, TAKEN, PluginState
+from crossgrad_core.contract.state import EMPTY_STATE, SLOTS, TAKEN, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.clock import Clock, Laps
@@ -125,6 +126,15 @@ class TrainState:
         for name, held in states.items():
             if not isinstance(held, PluginState):
                 raise _no_states(hook, f"its state {name!r}", "a PluginState", held)
+            device = next(iter(self.tensors.values())).device.type
+            if wrong := unsavable(held, device, self.states.get(name, EMPTY_STATE)):
+                raise UserError(
+                    f"a checkpoint cannot hold the state of plugin {name}",
+                    where=f"{hook.name}, {wrong}",
+                    expected="plain numbers, texts, lists and dictionaries with texts as keys in "
+                    "`values`, dense tensors of the run elsewhere",
+                    todo="repair the plugin (docs/hooks.md)",
+                )
         taken = TAKEN.intersection(states)
         stolen = taken - SLOTS.intersection(_answering(hook)) if taken else taken
         if stolen:
@@ -135,6 +145,42 @@ class TrainState:
                 todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
             )
         self.states.update(states)
+
+
+def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
+    """What of a state a checkpoint cannot hold, in words; empty where it can hold all.
+
+    To be cheap in each step it looks at those names only that the state `known` does not have.
+    """
+    for kind in ("values", "tensors", "per_primitive"):
+        have = getattr(known, kind)
+        for name, value in getattr(new, kind).items():
+            wrong = "" if isinstance(name, str) else "the key is no text"
+            if name not in have:
+                wrong = wrong or (no_json(value) if kind == "values" else _odd(value, device))
+            if wrong:
+                return f"{kind}, {name}: {wrong}"
+    return ""
+
+
+def no_json(value: object) -> str:
+    """Which part of a value JSON would change on the way; empty where it changes none."""
+    if isinstance(value, dict):
+        odd = (f"the key {key!r}" for key in value if not isinstance(key, str))
+        return next(odd, "") or no_json(list(value.values()))
+    if isinstance(value, list):
+        return next(filter(None, map(no_json, value)), "")
+    plain = value is None or isinstance(value, bool | int | float | str)
+    return "" if plain else f"{value!r:.60} of type {type(value).__name__}"
+
+
+def _odd(value: object, device: str) -> str:
+    """What something is that should be a tensor that a file can hold; empty where it is."""
+    if not isinstance(value, Tensor):
+        return f"of type {type(value).__name__}, not a tensor"
+    plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
+    found = value.layout, value.dtype, value.device
+    return "" if plain and value.device.type in {"cpu", device} else listed(map(str, found))
 
 
 def _answering(hook: HookCaller) -> list[str]:

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamRule
+from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -19,6 +20,7 @@ from crossgrad_core.contract.contexts import (
     StepRecord,
 )
 from crossgrad_core.contract.gradients import Gradients
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.by_rows import dense, tidy
@@ -36,6 +38,7 @@ from crossgrad_core.training.photo_parameters import take_photo_step
 from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
 from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.regularize import TensorGradients, add_regularization, joined
+from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.room import room_of
 from crossgrad_core.training.schedules import is_led
 from crossgrad_core.training.setup import Setup
@@ -83,7 +86,8 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         labels=draw.labels,
         losses=tuple(record.loss for record in rendered.records),
         primitives=primitives,
-        counts={**counted, **counts},
+        # NumPy's integers do not go into a checkpoint.
+        counts={name: int(count) for name, count in {**counted, **counts}.items()},
         train_seconds=state.clock.train,
         scales=scales,
     )
@@ -100,6 +104,19 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
     )
 
 
+def check_largest_draw(setup: Setup) -> None:
+    """Draws the most views that a step has, which one that is tried out need not draw.
+
+    Raises:
+        UserError: The sampler cannot draw so many.
+    """
+    blank = TrainState({}, AdamState(), make_streams(setup.config.seed))
+    context = sample_context(setup, blank, 1)
+    setup.sampler.sample(
+        replace(context, views_per_step=max(setup.schedule.pace.counts)), EMPTY_STATE
+    )
+
+
 def _sample(setup: Setup, state: TrainState) -> Draw:
     context = sample_context(setup, state, state.step)
     answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
@@ -109,13 +126,31 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
     if known and len(views) in counts:
         # NumPy's integers do not go into a checkpoint.
-        return replace(answer.draw, views=tuple(map(int, views)))
+        views = tuple(map(int, views))
+        return replace(answer.draw, views=views, labels=_labels(setup, state, answer.draw))
     raise UserError(
         "the sampler draws other views, or another number of them, than it says",
         where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
         expected=f"{listed(map(str, sorted(counts)))} views, positions from 0 to {photos - 1}",
         found=f"{len(views)} views: {views}",
         todo="choose another --sampler, or let the plugin's `counts` name every number",
+    )
+
+
+def _labels(setup: Setup, state: TrainState, draw: Draw) -> tuple[str, ...] | None:
+    """The labels of a draw; a plugin may list them otherwise than in a tuple."""
+    labels: object = draw.labels
+    if labels is None:
+        return None
+    given = tuple(labels) if isinstance(labels, tuple | list | np.ndarray) else ()
+    if len(given) == len(draw.views) and all(isinstance(each, str) for each in given):
+        return tuple(map(str, given))
+    raise UserError(
+        "the sampler does not label each view that it draws",
+        where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
+        expected=f"{len(draw.views)} texts, or None for no labels",
+        found=repr(labels),
+        todo="choose another --sampler, or repair the plugin",
     )
 
 
@@ -137,8 +172,34 @@ def _aggregate_context(
 def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Aggregated:
     answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
     state.accept(answer.states, setup.hook.crossgrad_aggregate_gradients)
-    state.counters.dropped += answer.counts.get("dropped", 0)
+    wanted = {name: state.tensors[name] for b in setup.trained_blocks for name in b.tensors}
+    if misfit := _misfit(answer, wanted):
+        raise UserError(
+            "the aggregated gradients do not fit the parameters",
+            where=f"operator {setup.selection.names['operator']} or a plugin that wraps it, "
+            f"step {state.step}",
+            expected="for each tensor that learns None, or a gradient of its shape and type",
+            found=misfit,
+            todo="choose another --operator, or repair the plugin (docs/hooks.md)",
+        )
+    state.counters.dropped += int(answer.counts.get("dropped", 0))
     return answer
+
+
+def _misfit(answer: Aggregated, wanted: Mapping[str, Tensor]) -> str:
+    """What of an answer is no gradient of the tensors that learn; empty where all fits."""
+    for part in (answer.gradients, answer.counts):
+        if not isinstance(part, Mapping):
+            return f"{type(part).__name__}, not a mapping of names"
+    if strange := wanted.keys() ^ answer.gradients.keys():
+        return listed(f"{n} is {'missing' if n in wanted else 'unknown'}" for n in strange)
+    for name, found in answer.gradients.items():
+        if found is not None and not isinstance(found, Tensor):
+            return f"{name}: {type(found).__name__}"
+        shape, dtype = wanted[name].shape, wanted[name].dtype
+        if found is not None and (found.shape != shape or found.dtype != dtype):
+            return f"{name}: {list(found.shape)} of {found.dtype}, not {list(shape)} of {dtype}"
+    return ""
 
 
 def _finish(

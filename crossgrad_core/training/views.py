@@ -83,7 +83,7 @@ def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
     if len(scales) == len(draw.views) and all(
         isinstance(each, Real) and 0.0 < each <= 1.0 for each in scales
     ):
-        return scales
+        return tuple(map(float, scales))  # NumPy's do not go into a checkpoint.
     raise UserError(
         "the resolution does not give each view a scale",
         where=f"resolution {setup.selection.names['resolution']}, step {state.step}",

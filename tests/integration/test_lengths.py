@@ -153,6 +153,14 @@ def test_a_dry_run_of_views_within_seconds_is_a_configuration_of_it(scene, tmp_p
     assert merged(tmp_path / "config.yaml", {"seconds": 30.0}, ()).get("max_views") is None
 
 
+@pytest.mark.parametrize("views", [9, "1..9@0.5"])
+def test_a_dry_run_refuses_more_different_views_than_there_are(scene, views):
+    given = {"scene": str(scene), "steps": 8, "views_per_step": views, "threads": 1}
+    given["sampler"] = {"name": "epoch"}
+    with pytest.raises(UserError, match="9 different views of 7 training views"):
+        app.run(given, dry_run=True, verbosity=-1)
+
+
 def test_views_within_seconds_are_at_least_a_step():
     with pytest.raises(UserError, match="at least 4, the views of a step"):
         assembled(views=4, max_views=3, seconds=1.0)

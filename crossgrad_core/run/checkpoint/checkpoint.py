@@ -57,7 +57,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     tensors = pack(checkpoint)
     state = _plain_state(checkpoint, list(tensors))
     for name, plugin in checkpoint.plugins.items():
-        check_json(plugin.values, f"plugin {name}")
+        check_json(dict(plugin.values), f"plugin {name}")
     final = run / CHECKPOINTS / f"step-{checkpoint.step:06d}"
     keep = keep or Keep()
     with disk_errors(final, packed_bytes(tensors)):

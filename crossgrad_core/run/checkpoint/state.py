@@ -10,6 +10,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.folders import STATE, damaged
 from crossgrad_core.system.text_files import read_json
 from crossgrad_core.system.version import VERSION
+from crossgrad_core.training.state import no_json
 
 #: Version of the layout; raised whenever an older reader could misread a newer checkpoint.
 FORMAT = 1
@@ -34,16 +35,14 @@ def check_json(value: object, where: str) -> None:
     Raises:
         UserError: Names the place and the culprit.
     """
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            if not isinstance(key, str):
-                raise _not_json(where, f"the key {key!r}")
-            check_json(item, f"{where}, {key}")
-    elif isinstance(value, list):
-        for item in value:
-            check_json(item, where)
-    elif not isinstance(value, bool | int | float | str | None):
-        raise _not_json(where, f"{value!r} of type {type(value).__name__}")
+    if wrong := no_json(value):
+        raise UserError(
+            "state that a checkpoint cannot hold",
+            where=where,
+            expected="numbers, strings, lists, dictionaries with text keys, None",
+            found=wrong,
+            todo="keep arrays as tensors in PluginState.tensors",
+        )
 
 
 def read_state(folder: Path) -> dict[str, Any]:
@@ -112,13 +111,3 @@ _PARTS: Mapping[str, Callable[[Any], bool]] = {
     "generators": lambda states: _is_map(states) and all(map(_is_map, states.values())),
     "plugins": lambda states: _is_map(states) and all(map(_is_map, states.values())),
 }
-
-
-def _not_json(where: str, found: str) -> UserError:
-    return UserError(
-        "state that a checkpoint cannot hold",
-        where=where,
-        expected="numbers, strings, lists, dictionaries with text keys, None",
-        found=found,
-        todo="keep arrays as tensors in PluginState.tensors",
-    )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.images import eight_bit
 from crossgrad_core.errors import UserError
-from crossgrad_core.system.files import atomic_file, write_atomically
+from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 
 #: A program that writes films; where there is none, Pillow writes an animated picture.
 ENCODER: Final = "ffmpeg"
@@ -34,7 +34,8 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
     """
     from PIL import Image
 
-    folder.mkdir(parents=True, exist_ok=True)
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     files = []
     for number, image in enumerate(images):
         picture = io.BytesIO()

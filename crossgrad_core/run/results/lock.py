@@ -79,7 +79,8 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
     path = folder / FILE
     check_own(path)
     with disk_errors(path):
-        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
+        # Unbuffered: what a full disk did not take would be written again as the file is closed.
+        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
     with file:
         taken = _take(file)
         if taken == "by another":
@@ -140,7 +141,6 @@ def _write(file: BinaryIO, text: str) -> None:
     file.seek(0)
     file.truncate()
     file.write(text.encode())
-    file.flush()
 
 
 def _read(file: BinaryIO) -> Holder | None:

@@ -14,7 +14,7 @@ from crossgrad_core.evaluation.evaluation import Evaluated
 from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.panel_layout import Layout, enlargement, folder_of
 from crossgrad_core.run.results.panel_names import chosen_views, flat_names
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import disk_errors, write_atomically
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -61,7 +61,8 @@ class PanelWriter:
         file = self.files.get(evaluated.compared.view.name)
         if file is None:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
+        with disk_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
         picture = io.BytesIO()
         draw_panel(evaluated, self.step).save(picture, format="png")
         write_atomically(self.folder / f"{file}.png", picture.getvalue())

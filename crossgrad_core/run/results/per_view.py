@@ -41,29 +41,23 @@ def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
         return ()
     header, *lines = read_rows(path, FILE, _TODO) or [[]]
     if tuple(header[:2]) != _NAMES or len(set(header)) < len(header):
-        raise UserError(
-            f"unreadable {FILE}",
-            where=path,
-            expected=f"a first line that begins with {','.join(_NAMES)}",
-            found=",".join(header) or "an empty file",
-            todo=_TODO,
-        )
+        expected = f"a first line that begins with {','.join(_NAMES)}"
+        raise _unreadable(path, ",".join(header) or "an empty file", expected)
     return tuple(_view(path, header, line) for line in lines)
 
 
 def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
     if len(line) != len(header):
-        raise UserError(
-            f"unreadable {FILE}",
-            where=path,
-            expected=f"{len(header)} cells in each line",
-            found=f"{len(line)}: {','.join(line)}",
-            todo=_TODO,
-        )
+        expected = f"{len(header)} cells in each line"
+        raise _unreadable(path, f"{len(line)}: {','.join(line)}", expected)
     try:
         cells = dict(zip(header[2:], line[2:], strict=True))
         values = {name: float(parse_number(cell)) if cell else None for name, cell in cells.items()}
         name, regime = line[:2]
-    except ValueError as error:
-        raise UserError(f"unreadable {FILE}", where=path, found=str(error), todo=_TODO) from error
+    except (ValueError, OverflowError) as error:
+        raise _unreadable(path, str(error)) from error
     return ViewMetrics(name, regime, values)
+
+
+def _unreadable(path: Path, found: str, expected: str = "") -> UserError:
+    return UserError(f"unreadable {FILE}", where=path, expected=expected, found=found, todo=_TODO)

@@ -9,6 +9,8 @@ from crossgrad_core.plugin import Json
 
 #: Figures that a decision rests on, by name.
 Figures: TypeAlias = Mapping[str, float]
+#: Settings as options are called.
+Settings: TypeAlias = Mapping[str, Json]
 #: How a decision came about: the evidence decided; the default stays, since the evidence is missing
 #: or undecided; or the user set it.
 Basis: TypeAlias = Literal["decided", "default", "given"]
@@ -44,7 +46,7 @@ class Decision:
     force: str
     saved: str = NOTHING
     figures: Figures = field(default_factory=dict)
-    settings: Mapping[str, str | int] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
     seconds: float = 0.0
 
     def found(
@@ -69,7 +71,7 @@ class Decision:
         )
 
     def changed(
-        self, choice: str, settings: Mapping[str, str | int], force: str, saved: str = NOTHING
+        self, choice: str, settings: Settings, force: str, saved: str = NOTHING
     ) -> "Decision":
         """Another choice on the same evidence, which decides.
 

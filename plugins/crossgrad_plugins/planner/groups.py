@@ -94,7 +94,7 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     grouping = cut.grouping
     return plain.found(shown, figures=figures).changed(
         f"near-far by {grouping.name}",
-        {"sampler": "near-far", **_settings_of(grouping)},
+        {"sampler": "near-far", **settings_of(grouping)},
         f"--sampler {plain.choice}",
         f"{probe.rho / (1.0 + probe.rho):.0%} of a step's gradient variance",
     )
@@ -117,7 +117,8 @@ def _even(views: ViewPlan) -> bool:
     return all(count % 2 == 0 for count in views.counts)
 
 
-def _settings_of(grouping: ComponentChoice) -> dict[str, str]:
+def settings_of(grouping: ComponentChoice) -> dict[str, str]:
+    """A grouping as options are called."""
     options = {f"grouping.{name}": str(value) for name, value in grouping.options.items()}
     return {"grouping": grouping.name, **options}
 

@@ -154,8 +154,8 @@ def _steps(evidence: Evidence) -> int | None:
     if config.seconds is not None:
         return None
     views = length(evidence).settings.get("max_views", config.max_views)
-    if views is not None:
-        return views_of_steps(evidence).steps_of(int(views))
+    if isinstance(views, int):
+        return views_of_steps(evidence).steps_of(views)
     return config.steps or DEFAULT_STEPS
 
 

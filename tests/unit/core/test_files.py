@@ -47,6 +47,10 @@ def test_an_error_in_the_block_keeps_the_old_file(tmp_path: Path):
         (errno.EDQUOT, "not enough disk space"),
         (errno.EACCES, "cannot write here"),
         (errno.EROFS, "cannot write here"),
+        (errno.EISDIR, "something else is in the way"),
+        (errno.ENOTDIR, "something else is in the way"),
+        (errno.EEXIST, "something else is in the way"),
+        (errno.ELOOP, "something else is in the way"),
     ],
 )
 def test_disk_errors_become_user_errors(tmp_path: Path, number: int, message: str):
@@ -56,8 +60,15 @@ def test_disk_errors_become_user_errors(tmp_path: Path, number: int, message: st
 
 
 def test_other_system_errors_pass(tmp_path: Path):
-    with pytest.raises(IsADirectoryError), disk_errors(tmp_path):
-        tmp_path.write_text("")
+    with pytest.raises(FileNotFoundError), disk_errors(tmp_path):
+        (tmp_path / "a" / "b.txt").write_text("")
+
+
+def test_a_folder_in_place_of_a_file_stays(tmp_path: Path):
+    (tmp_path / "a.txt").mkdir()
+    with pytest.raises(UserError, match="something else is in the way"):
+        write_atomically(tmp_path / "a.txt", b"new")
+    assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,12 @@ def test_overwritten_rows_lose_their_moments_unless_kept():
     assert apply_to_moment(Edit(values={"o": kept}), "o", moment).tolist() == [1.0, 2.0, 3.0]
 
 
+def test_fresh_rows_need_no_gather():
+    edit = Edit(fresh=torch.tensor([False, True, False]))
+    assert not edit.is_empty
+    assert apply_to_moment(edit, "means", torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 0.0, 3.0]
+
+
 def test_overwriting_without_gather_leaves_the_old_tensor_untouched():
     old = parameters()
     edit = Edit(values={"means": Rows(torch.full((4, 2), 9.0))})

@@ -1,5 +1,6 @@
 """Standard 3DGS PLY files: what is written, and what is read back from anybody's file."""
 
+import os
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -250,6 +251,13 @@ def test_bad_files_are_explained(tmp_path: Path, damage, message: str):
 def test_missing_file_is_explained(tmp_path: Path):
     with pytest.raises(UserError, match="no such PLY file"):
         read_ply(tmp_path / "none.ply")
+
+
+def test_a_pipe_is_not_waited_for_and_called_one(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(UserError) as told:
+        read_ply(tmp_path / "pipe.ply")
+    assert told.value.found == "a pipe or device in place of a file"
 
 
 @pytest.mark.parametrize(

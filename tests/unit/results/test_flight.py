@@ -120,6 +120,11 @@ def test_a_camera_path_is_read_in_input_coordinates(tmp_path):
         ({"render_width": 0}, "render_width"),
         ({"fps": "fast"}, "fps"),
         ({"fps": 1e-9}, "fps"),
+        ({"fps": True}, "fps"),
+        ({"render_width": True}, "render_width"),
+        ({"render_height": 20.5}, "render_height"),
+        ({"camera_path": [{"camera_to_world": IDENTITY, "fov": True}]}, "fov"),
+        ({"camera_path": [{"camera_to_world": [True] * 16, "fov": 50}]}, "camera_to_world"),
         ({"camera_type": "equirectangular"}, "camera_type"),
         ({"camera_path": [{"camera_to_world": TURNED, "fov": 50}]}, "row by row"),
         ({"camera_path": [{"camera_to_world": [1.0] * 15, "fov": 50}]}, "camera_to_world"),
@@ -143,6 +148,19 @@ def test_a_file_that_is_no_camera_path_is_refused(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(UserError, match=r"tour\.json"):
         flight(scene_with(Similarity(np.zeros(3), 1.0)), str(path), FRAMES)
+
+
+@pytest.mark.parametrize("width", [30, 30.0])
+def test_a_whole_number_of_pixels_may_have_a_point(tmp_path, width):
+    path = path_of(tmp_path, render_width=width)
+    camera = flight(scene_with(Similarity(np.zeros(3), 1.0)), path, FRAMES).cameras[0]
+    assert (camera.width, type(camera.width)) == (30, int)
+
+
+def test_something_else_in_place_of_the_folder_of_frames(tmp_path):
+    (tmp_path / "renders").touch()
+    with pytest.raises(UserError, match="something else is in the way"):
+        film.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")
 
 
 def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypatch):

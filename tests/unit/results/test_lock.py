@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import io
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.afterwards.places import writing_if_possible
 from crossgrad_core.run.results.lock import FILE, RunInUseError, locked, writer_of
 
 HOLD = """
@@ -79,6 +81,25 @@ def test_where_there_are_no_locks_the_run_goes_on(tmp_path, monkeypatch, number)
     with locked(tmp_path, "training") as held:
         assert not held
     assert writer_of(tmp_path) is None
+
+
+class FullDisk(io.FileIO):
+    """A file of which nothing more can be written."""
+
+    def write(self, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_is_told_once(tmp_path, monkeypatch):
+    def opened(descriptor, mode, buffering=-1):
+        file = FullDisk(descriptor, mode)
+        return file if buffering == 0 else io.BufferedRandom(file)
+
+    monkeypatch.setattr(os, "fdopen", opened)
+    with pytest.raises(UserError, match="not enough disk space"), locked(tmp_path, "exporting"):
+        pass
+    with writing_if_possible(tmp_path, "evaluating") as writes:
+        assert not writes
 
 
 def test_a_folder_that_may_not_be_written_to(tmp_path: Path, monkeypatch):

@@ -113,6 +113,17 @@ def test_writer_writes_the_chosen_views_only(tmp_path: Path, make_view):
         assert image.mode == "RGB"
 
 
+@pytest.mark.parametrize("link", [False, True])
+def test_something_else_in_place_of_the_folder_of_panels(tmp_path: Path, make_view, link):
+    place = tmp_path / "renders"
+    place.symlink_to(tmp_path / "nowhere") if link else place.touch()
+    view = make_view("a/1.jpg", "a")
+    with pytest.raises(UserError, match="something else is in the way"):
+        PanelWriter.of(tmp_path, 7, [view], count=1).write(
+            make_evaluated(view, torch.zeros(16, 24, 3, dtype=torch.uint8))
+        )
+
+
 @pytest.mark.parametrize(("width", "height"), [(400, 60), (24, 16), (989, 3), (1300, 700), (1, 1)])
 def test_photo_render_and_error_are_found_again_in_a_panel(
     make_view, tmp_path: Path, width: int, height: int

@@ -702,10 +702,29 @@ class ClampsInPlace(api.Observer):
         context.parameters["scales"].data.clamp_(max=-9.0)
 
 
+class Renders(api.Observer):
+    @api.hookimpl
+    def crossgrad_model(self, model):
+        assert model.render(0, 0.5).loss.isfinite()
+
+
 class Shifts(api.Observer):
     @api.hookimpl
     def crossgrad_model(self, model):
         model.parameters["means"].data.add_(1.0)
+
+
+class KeepsATuple(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        state = api.PluginState({"range": (0.0, 1.0)})
+        return api.Densified(api.NO_EDIT).with_state("range", state)
+
+
+class CountsInNumpy(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        return api.Densified(api.Edit(counts={"clamped": np.int64(3)}))
 
 
 class FitsToItself(NoExposure):
@@ -910,6 +929,8 @@ DEFECTS = [
     (observers.questions_are_answered_in_kind, LossOfNothing),
     (observers.questions_are_answered_in_kind, BareState),
     (observers.questions_are_answered_in_kind, StateOfSets),
+    (observers.questions_are_answered_in_kind, KeepsATuple),
+    (observers.questions_are_answered_in_kind, CountsInNumpy),
     (observers.questions_are_answered_in_kind, BareEdit),
     (observers.questions_are_answered_in_kind, NoEditInside),
     (observers.questions_are_answered_in_kind, ClampsWhatIsNotThere),
@@ -959,6 +980,7 @@ def test_an_error_of_the_component_comes_through(check, make, error):
     [
         (operators.OPERATOR_CHECKS, Adding),
         (samplers.SAMPLER_CHECKS, InTurn),
+        (observers.OBSERVER_CHECKS, Renders),
     ],
     ids=name_of,
 )

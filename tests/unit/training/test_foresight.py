@@ -3,10 +3,12 @@
 from copy import deepcopy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.contract.contexts import Draw, StepRecord
+from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import WIDTH, sample_scene
 from crossgrad_core.training.foresight import Foresight
@@ -72,6 +74,32 @@ def test_a_step_that_drew_something_else_begins_the_guess_anew():
     foresight.look(state)
     expected = setup.photos_ahead.names[-1]
     assert tuple(expected[:2]) == timed_step(setup, state).names
+
+
+def test_views_in_an_array_are_foreseen():
+    setup = setup_of("random", views_per_step=2)
+    sample = setup.sampler.sample
+
+    def as_array(*given):
+        draw, state = sample(*given)
+        return replace(draw, views=np.array(draw.views)), state
+
+    object.__setattr__(setup.sampler, "sample", as_array)
+    state, foresight = first_state(setup), Foresight(setup)
+    for _ in range(3):
+        foresight.look(state)
+        drawn = timed_step(setup, state).names
+        assert tuple(setup.photos_ahead.names[-1][:2]) == drawn
+    assert len(setup.photos_ahead.names) == 3
+
+
+@pytest.mark.parametrize("views", [(99,), None])
+def test_nothing_is_foreseen_of_views_that_are_not_there(views):
+    setup = setup_of("random")
+    wrong = Draw(views)
+    object.__setattr__(setup.sampler, "sample", lambda *_: (wrong, EMPTY_STATE))
+    Foresight(setup).look(first_state(setup))
+    assert setup.photos_ahead.names == []
 
 
 def test_nothing_is_foreseen_of_a_sampler_that_fails():

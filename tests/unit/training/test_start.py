@@ -1,5 +1,8 @@
-"""Runs that start from the Gaussians of a file."""
+"""Runs that start from the Gaussians of a file, and from points in any order of memory."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
@@ -55,3 +58,15 @@ def test_file_and_degree_are_written_down(trained, monkeypatch):
 def test_points_begin_with_the_degree_that_is_asked_for(asked, degree):
     setup = assemble(RunConfig(steps=1000, sh_from=asked), sample_scene(), "none")
     assert decoded(setup, first_state(setup)).sh_degree == degree
+
+
+def test_parameters_lie_row_by_row_as_they_come_out_of_a_checkpoint():
+    scene = sample_scene()
+    turned = replace(scene, points=np.asfortranarray(scene.points))
+    assert not turned.points.flags.c_contiguous
+    usual, found = (
+        first_state(assemble(RunConfig(steps=1000), each, "none")) for each in (scene, turned)
+    )
+    for name, tensor in found.tensors.items():
+        assert tensor.is_contiguous(), name
+        assert torch.equal(tensor, usual.tensors[name]), name

@@ -9,10 +9,13 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract import densifier, operator, resolution, sampler
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.contexts import Densified, Regularized
+from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.contexts import Densified, Draw, Regularized
 from crossgrad_core.contract.exposure import Exposure
-from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting
+from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting, _kinds
 from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.objections import objections_to
+from crossgrad_core.contract.start import MorePoints
 from crossgrad_core.contract.state import TAKEN, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.errors import UserError
@@ -22,6 +25,7 @@ from crossgrad_core.run import select as selecting
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import photo_parameters, regrouping, room, start, steady
+from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
 
@@ -285,3 +289,203 @@ def test_values_that_spread_over_the_rows_fit(values):
     state = first_state(setup)
     take_step(setup, state)
     assert not state.parameters["means"].detach().any()
+
+
+class Wraps:
+    """A plugin that replaces the aggregated gradients by what a function makes of them."""
+
+    def __init__(self, change):
+        self.change = change
+
+    @hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        answer = yield
+        return self.change(answer)
+
+
+def with_means(means):
+    return Wraps(lambda answer: replace(answer, gradients={**answer.gradients, "means": means}))
+
+
+@pytest.mark.parametrize(
+    ("plugin", "found"),
+    [
+        (Wraps(lambda answer: replace(answer, gradients=None)), "NoneType, not a mapping"),
+        (Wraps(lambda answer: replace(answer, counts=None)), "NoneType, not a mapping"),
+        (Wraps(lambda answer: replace(answer, gradients={})), "means is missing"),
+        (
+            Wraps(lambda answer: replace(answer, gradients={**answer.gradients, "mean": None})),
+            "mean is unknown",
+        ),
+        (with_means(np.zeros((40, 3), np.float32)), "means: ndarray"),
+        (with_means(torch.zeros(40, 2)), "means: [40, 2] of torch.float32, not [40, 3]"),
+        (with_means(torch.zeros(40, 3).double()), "[40, 3] of torch.float64, not [40, 3]"),
+    ],
+)
+def test_aggregated_gradients_fit_the_parameters(plugin, found):
+    error = refused(setup_of(wrapping=plugin))
+    assert error.what == "the aggregated gradients do not fit the parameters"
+    assert "operator sum" in error.where
+    assert found in error.found
+
+
+def test_a_tensor_may_be_skipped_and_counts_be_numbers_of_numpy():
+    counts = {"dropped": np.int64(2), "odd": torch.tensor(3)}
+    setup = setup_of(
+        wrapping=Wraps(lambda answer: replace(answer, counts=counts)), a=with_means(None)
+    )
+    state = first_state(setup)
+    record = take_step(setup, state)
+    numbers = {**record.counts, "": state.counters.dropped}
+    assert numbers == {"dropped": 2, "odd": 3, "": 2}
+    assert {type(each) for each in numbers.values()} == {int}
+
+
+def labelled(labels):
+    return of_slot("samplers", "random", "sample", (Draw((0,), labels), PluginState()))
+
+
+@pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
+def test_labels_are_one_text_for_each_view(labels):
+    error = refused(setup_of({"sampler": labelled(labels)}))
+    assert error.what == "the sampler does not label each view that it draws"
+    assert "sampler epoch" in error.where
+
+
+@pytest.mark.parametrize("labels", [["a"], np.array(["a"])])
+def test_labels_may_be_listed(labels):
+    setup = setup_of({"sampler": labelled(labels)})
+    assert take_step(setup, first_state(setup)).labels == ("a",)
+
+
+def test_scales_of_numpy_are_numbers_in_the_record():
+    wrong = of_slot("resolutions", "full", "scales", ((np.float32(0.5),), PluginState()))
+    setup = setup_of({"resolution": wrong})
+    scales = take_step(setup, first_state(setup)).scales
+    assert scales == (0.5,) and type(scales[0]) is float
+
+
+@pytest.mark.parametrize(
+    ("held", "found"),
+    [
+        (PluginState({"range": (0.0, 1.0)}), "values, range: (0.0, 1.0) of type tuple"),
+        (PluginState({"a": [{"b": {1: 2}}]}), "values, a: the key 1"),
+        (PluginState({"n": np.int64(3)}), "values, n: "),
+        (PluginState({1: 2}), "values, 1: the key is no text"),
+        (PluginState(tensors={"t": np.zeros(3)}), "tensors, t: of type ndarray"),
+        (PluginState(tensors={"t": torch.eye(3).to_sparse()}), "tensors, t: torch.sparse_coo"),
+        (PluginState(tensors={"t": torch.zeros(3, device="meta")}), "meta"),
+        (PluginState(per_primitive={"t": torch.zeros(40).cdouble()}), "per_primitive, t: "),
+    ],
+)
+def test_a_state_that_no_checkpoint_can_hold_is_refused_at_once(held, found):
+    error = refused(setup_of(stranger=Answers(Densified(NO_EDIT, states={"stranger": held}))))
+    assert error.what == "a checkpoint cannot hold the state of plugin stranger"
+    assert found in error.where
+
+
+def test_a_state_is_looked_at_where_it_has_new_names():
+    plugin = Answers(Densified(NO_EDIT, states={"stranger": PluginState()}))
+    setup = setup_of(stranger=plugin)
+    state = first_state(setup)
+    take_step(setup, state)
+    plugin.after = Densified(NO_EDIT, states={"stranger": PluginState({"seen": {1}})})
+    with pytest.raises(UserError, match="a checkpoint cannot hold"):
+        take_step(setup, state)
+
+
+def test_fresh_rows_without_new_primitives_lose_moments_and_statistics():
+    fresh = torch.arange(40) < 3
+    held = PluginState(per_primitive={"seen": torch.ones(40)})
+    plugin = Answers(Densified(NO_EDIT, states={"stranger": held}))
+    setup = setup_of(stranger=plugin)
+    state = first_state(setup)
+    take_step(setup, state)
+    before = {name: tensor.detach().clone() for name, tensor in state.parameters.items()}
+    assert apply_edit(setup, state, Edit(fresh=fresh)) is False
+    for moments in (state.adam.exp_avg, state.adam.exp_avg_sq):
+        assert not moments["scales"][:3].any() and moments["scales"][3:].any()
+    assert torch.equal(state.states["stranger"].per_primitive["seen"], (~fresh).float())
+    assert all(torch.equal(before[name], t) for name, t in state.parameters.items())
+
+
+@pytest.mark.parametrize("rows", [torch.tensor(3.0), torch.zeros(39)])
+def test_a_state_without_a_row_for_each_primitive_names_its_plugin(rows):
+    held = PluginState(per_primitive={"seen": rows})
+    edit = Edit(source=torch.arange(40))
+    plugin = Answers(Densified(edit, states={"stranger": held}))
+    error = refused(setup_of(stranger=plugin))
+    assert error.what == "the state of plugin stranger does not fit the primitives"
+    assert error.found == f"shape {list(rows.shape)}"
+
+
+def more_points(**changed):
+    good = {
+        "positions": np.zeros((2, 3)),
+        "colors": np.zeros((2, 3), np.uint8),
+        "sizes": np.ones(2),
+        "opacities": np.full(2, 0.5),
+    }
+    return MorePoints(**{**good, **changed})
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [
+        ({"sizes": np.ones(1)}, "2 positions, 1 sizes"),
+        ({"colors": np.zeros((3, 3), np.uint8)}, "2 positions, 3 colors"),
+        ({"positions": np.zeros((2, 2))}, "ValueError"),
+        ({"positions": np.full((2, 3), np.nan)}, "position that is not finite"),
+        ({"sizes": np.array([1.0, 0.0])}, "a size that is no number above 0"),
+        ({"sizes": np.array([1.0, np.inf])}, "a size that is no number above 0"),
+        ({"opacities": np.array([0.5, 1.0])}, "an opacity that is not between 0 and 1"),
+    ],
+)
+def test_what_a_start_adds_can_be_points(changed, found):
+    start = of_slot("starts", "sfm", "more_points", more_points(**changed))
+    error = refused(setup_of({"start": start}))
+    assert error.what == "start sfm adds what cannot be points"
+    assert "Wrong.more_points" in error.where
+    assert found in error.found
+
+
+def test_good_points_of_a_start_are_taken_and_its_own_errors_come_through():
+    setup = setup_of({"start": of_slot("starts", "sfm", "more_points", more_points())})
+    assert first_state(setup).primitives(setup) == 42
+
+    class Failing(type(build("starts", "sfm", {}))):
+        def more_points(self, scene):
+            raise ValueError("no luck")
+
+    with pytest.raises(ValueError, match="no luck"):
+        first_state(setup_of({"start": Failing()}))
+
+
+@pytest.mark.parametrize("form", ["d", "%.2f"])
+def test_a_form_that_formats_no_numbers_is_refused_before_the_run(monkeypatch, form):
+    psnr = type(build("metrics", "psnr", {}))
+    monkeypatch.setattr(psnr, "figure", replace(psnr.figure, form=form))
+    with pytest.raises(UserError, match="metric psnr has a figure that cannot be shown") as caught:
+        assemble(RunConfig(steps=10), sample_scene(), "none")
+    assert caught.value.found == repr(form)
+
+
+def test_groups_of_any_labels_are_counted_in_words():
+    setup = setup_of({"sampler": build("samplers", "near-far", {})})
+    names = {**setup.selection.names, "grouping": "odd"}
+    selection = replace(setup.selection, names=names, labels=(0, 1, 2))
+    assert "gives 3: 0, 1, 2" in " ".join(objections_to(selection))
+
+
+def test_groups_are_named_by_their_kind_whatever_blocks_are_called():
+    rate = LearningRate(1.0)
+    blocks = (
+        Block("all", ("a",), True, "geometry", rate),
+        Block("geometry", ("b",), True, "appearance", rate),
+        Block("appearance", ("c",), False, "neutral", rate),
+    )
+    names = ("geometry", "appearance")
+    assert _kinds(names, blocks, "kind") == names
+    assert _kinds(("all",), blocks, "global") == ("neutral",)
+    for granularity in ("block", "gaussian"):
+        assert _kinds(names, blocks, granularity) == ("appearance", "neutral")

@@ -118,10 +118,11 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
 
 def _require_file(path: Path) -> None:
     if not is_file(path):
+        other = "a pipe or device in place of a file" if os.path.exists(path) else "nothing"
         raise UserError(
             "no such PLY file",
             where=path,
-            found="a folder" if os.path.isdir(path) else "nothing",
+            found="a folder" if os.path.isdir(path) else other,
             todo="check the path",
         )
 

@@ -177,7 +177,7 @@ TARGET = Target(
     parser={
         checkpoint: ("save", "_write", "_drop", "drop_later", "load_latest", "_plain_state"),
         checkpoint_folders: ("Keep", "scratch_folder", "discard", "_take_name", "_clear"),
-        checkpoint_state: ("state_text", "check_json", "_not_json"),
+        checkpoint_state: ("state_text", "check_json"),
         checkpoint_tensors: ("pack", "packed_bytes", "write_tensors", "_all"),
         persist: ("to_checkpoint",),
         rngs: ("make_streams", "stream_states"),
