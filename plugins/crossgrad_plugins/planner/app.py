@@ -46,6 +46,7 @@ def plan(
     if write is not None:
         _check_free(write)
     settings = merged(file, options, assignments)
+    # Without a plan the bundled scene has a bound on its views, which is the plan's to decide.
     config = configured({**settings, "plan": "auto"})
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)

@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Grouping, Json, Scene, build_component
 from crossgrad_plugins.groupings.split import FAR
 from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
-from crossgrad_plugins.planner.groups import pairs, settings_of
+from crossgrad_plugins.planner.groups import EVEN, pairs, settings_of
 
 #: Far views to a near one in the first part of a run; what that part is, sampler `horizon` knows.
 FAR_TO_NEAR: Final = 5
@@ -56,17 +56,26 @@ def turns(evidence: Evidence) -> Decision:
         return given(part, usual, "--sampler NAME")
     rule = (
         f"far : near = {FAR_TO_NEAR} : 1 at first where far views look in one direction (median "
-        f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more): drone and "
-        "street"
+        f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more), drone and "
+        f"street, and {EVEN:.0%} of the views or more on each side"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
     plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
     if not evidence.modes.two:
         return plain.found("no two modes", decided=evidence.modes.one)
+    return _turns_of_two_modes(evidence, plain)
+
+
+def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
+    """Whether far views come more often, by where both look."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
-    grouping = evidence.modes.cut.grouping
-    found = directions(evidence.scene, grouping)
+    if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
+        return plain.found("measured with our rules and single views only")
+    cut = evidence.modes.cut
+    if cut.share < EVEN:
+        return plain.found(f"the smaller mode has {cut.share:.0%} of the views")
+    found = directions(evidence.scene, cut.grouping)
     figures = {"far_degrees": found.far, "near_degrees": found.near}
     shown = (
         f"from the mean direction of the far views these look {found.far:.0f} degrees away, near "
@@ -76,5 +85,7 @@ def turns(evidence: Evidence) -> Decision:
     if not found.differ:
         return made
     sampler: dict[str, Json] = {"sampler": "horizon", "sampler.coarse": [FAR_TO_NEAR, 1]}
-    choice = f"horizon by {grouping.name}, {FAR_TO_NEAR} far views to a near one at first"
-    return made.changed(choice, {**sampler, **settings_of(grouping)}, f"--sampler {usual}")
+    choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views to a near one at first"
+    return made.changed(
+        choice, {**sampler, **settings_of(cut.grouping)}, f"--sampler {plain.choice}"
+    )

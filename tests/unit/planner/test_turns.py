@@ -83,6 +83,21 @@ def test_what_the_user_set_wins(given):
     assert decision(scene_of(AROUND), **given).basis == "given"
 
 
+@pytest.mark.parametrize(
+    "given", [{"operator": {"name": "pcgrad"}}, {"views_per_step": 2}, {"preset": "inria"}]
+)
+def test_what_was_not_measured_is_not_chosen(given):
+    found = decision(scene_of(AROUND), **given)
+    assert (found.basis, dict(found.settings)) == ("default", {})
+
+
+def test_few_far_views_do_not_come_again_and_again():
+    views = scene_of(AROUND).views
+    found = decision(posed_scene([*views[:6], *views[12:]], CLOUD))
+    assert not found.settings
+    assert found.evidence == "the smaller mode has 33% of the views"
+
+
 def test_far_views_that_look_everywhere_have_no_direction():
     low = scene_of(AROUND).views[12:]
     ring = [(np.cos(angle), np.sin(angle), 0) for angle in np.linspace(0, 2 * np.pi, 12, False)]
