@@ -86,19 +86,49 @@ def _jobs(threads: int) -> list[Jobs]:
 
 def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
-    own, *others = _jobs(numba.get_num_threads())
-    calls = [_Call(partial(kernel, jobs, *args, **kwargs)) for jobs in others]
-    if calls:
-        _helpers(os.getpid()).ask(calls)
-    try:
-        kernel(own, *args, **kwargs)
-    finally:
-        # Whatever happens, nobody works on the arrays any more when this returns.
-        for call in calls:
+    Begun(kernel, *args, **kwargs).end()
+
+
+class Begun:
+    """A kernel that the other threads have begun with, while this one does something else.
+
+    Nobody may touch what the kernel reads or writes until `end`. One thread alone does all of it at
+    once.
+
+    Args:
+        kernel: As for `share`, like its arguments.
+    """
+
+    def __init__(
+        self, kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
+    ) -> None:
+        own, *others = _jobs(numba.get_num_threads())
+        self._own = partial(kernel, own, *args, **kwargs)
+        self._calls = [_Call(partial(kernel, jobs, *args, **kwargs)) for jobs in others]
+        self._done = False
+        if self._calls:
+            _helpers(os.getpid()).ask(self._calls)
+        else:
+            self.end()
+
+    def end(self) -> None:
+        """Does what is left, on this thread, too; returns when all jobs are done."""
+        if self._done:
+            return
+        try:
+            self._own()
+        finally:
+            # Whatever happens, nobody works on the arrays any more when this returns.
+            self.leave()
+        for call in self._calls:
+            if call.error is not None:
+                raise call.error
+        self._done = True
+
+    def leave(self) -> None:
+        """Returns when nobody works on it any more, whether or not all jobs are done."""
+        for call in self._calls:
             call.end()
-    for call in calls:
-        if call.error is not None:
-            raise call.error
 
 
 class _Call:
@@ -134,8 +164,10 @@ class _Call:
 
     def end(self) -> None:
         """Returns when the call has been made, or never will be."""
-        if not self._begun.acquire(blocking=False):
-            self._under_way.acquire()
+        if self._begun.acquire(blocking=False):
+            self._under_way.release()
+        with self._under_way:
+            pass
 
 
 class _Helpers:

@@ -9,11 +9,13 @@ from crossgrad_core.training.state import TrainState
 
 def are_parameters_finite(state: TrainState) -> bool:
     """Whether no parameter is NaN or infinite."""
+    state.late.finish()
     return all(is_finite(tensor) for tensor in state.tensors.values())
 
 
 def check_parameters(state: TrainState) -> None:
     """Raises NonFiniteError where a parameter is NaN or infinite after a step."""
+    state.late.finish()
     for name, tensor in state.tensors.items():
         if not is_finite(tensor):
             views = () if state.last is None else state.last.names

@@ -75,5 +75,5 @@ def _is_whole(state: TrainState) -> bool:
     """Whether all parameters are finite, as far as the machine lets it be seen."""
     try:
         return are_parameters_finite(state)
-    except RuntimeError:  # Torch has no memory for it, or the GPU has failed.
+    except (RuntimeError, MemoryError):  # No memory for it or its last step, or the GPU failed.
         return False

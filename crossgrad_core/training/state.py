@@ -274,7 +274,7 @@ class Snapshot:
 
     def restore(self, state: TrainState, seed: int) -> None:
         """Puts `state` back, with fresh random streams so that the same draw does not recur."""
-        state.late = Late()
+        state.late.forget()
         state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
         state.moments = copied_moments(self.adam)
         state.states = dict(self.mark.states)
@@ -289,7 +289,7 @@ class Snapshot:
         The copy itself becomes its tensors, as memory may be what has run out: nothing is left to
         go back to.
         """
-        state.late = Late()
+        state.late.forget()
         state.tensors = self._tensors(state, self.parameters)
         state.moments = self.adam
         self.mark.restore(state)

@@ -213,6 +213,9 @@ def _finish(
     if not setup.densify_first:
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
+        if setup.schedule.densifies(state.step):
+            # What is under way holds gradients, whose memory an edit needs.
+            state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)

@@ -3,12 +3,15 @@
 Such a row has a gradient of zero; Adam moves it all the same, by moments that fade. What it is
 behind with is done row by row when the row is next drawn, or all at once when somebody reads the
 tensor, by the same float32 operations in the same order: the bits are those of steps taken at once.
+
+Steps that are taken are under way for a while: nobody reads such a tensor before it is drawn or
+asked for, so that the other threads work on it while this one does what one thread alone can do.
 """
 
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -18,6 +21,9 @@ from torch import Tensor
 from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.gradients.by_rows import rows_of, values_of
 from crossgrad_core.training.adam.coefficients import Coefficients
+
+if TYPE_CHECKING:
+    from crossgrad_core.numerics.jobs import Begun
 
 #: Steps that a row may be late with: tables stay short.
 LONGEST: Final = 256
@@ -71,27 +77,47 @@ class Late:
 
     def __init__(self) -> None:
         self._behind: dict[str, _Behind] = {}
+        self._under_way: dict[str, Begun] = {}
 
     @property
     def names(self) -> frozenset[str]:
-        """The tensors of which rows may be behind."""
-        return frozenset(self._behind)
+        """The tensors of which rows may be behind, or which a step is changing."""
+        return frozenset(self._behind).union(self._under_way)
+
+    def finish(self, name: str | None = None) -> None:
+        """Returns when no step is under way any more; rows that are late stay so.
+
+        Args:
+            name: The tensor; None: all.
+        """
+        for each in [name] if name is not None else list(self._under_way):
+            if (begun := self._under_way.get(each)) is not None:
+                # One that fails is no step, and stays to fail again.
+                begun.end()
+                del self._under_way[each]
+
+    def forget(self) -> None:
+        """Forgets all steps; nobody changes a tensor any more when this returns."""
+        for begun in self._under_way.values():
+            begun.leave()
+        self._under_way, self._behind = {}, {}
 
     def step(
         self, name: str, param: Tensor, grad: Tensor, adam: AdamState, step: Coefficients
     ) -> None:
         """Takes a step with the rows that `grad` (sparse) has; the others are late from now on.
 
-        Where it has many rows, the step is taken with all of them, and none is late.
+        Where it has many rows, the step is taken with all of them, and none is late. It may be
+        under way when this returns (`finish`).
 
         Args:
             name: Name of the tensor; its count in `adam` includes this step.
             param: The tensor, float32 and contiguous, on the CPU.
-            grad: Its gradient by rows.
+            grad: Its gradient by rows, which nobody changes any more.
             adam: Moments and counts.
             step: The coefficients of the step.
         """
-        from crossgrad_core.numerics.jobs import share
+        from crossgrad_core.numerics.jobs import Begun
         from crossgrad_core.training.adam.numba_kernels.fused import numbers_of
         from crossgrad_core.training.adam.numba_kernels.late import update_all, update_rows
 
@@ -102,7 +128,8 @@ class Late:
         flat, numbers, width = _flat(name, param, adam), numbers_of(step), _width(param)
         values = values_of(grad).contiguous().view(-1).numpy()
         update = update_all if most else update_rows
-        share(update, rows, width, flat[0], values, flat[1], flat[2], numbers)
+        begun = Begun(update, rows, width, flat[0], values, flat[1], flat[2], numbers)
+        self._under_way[name] = begun
         _changed(name, param, adam)
         if most:
             return
@@ -127,6 +154,7 @@ class Late:
             adam: Moments and counts.
             rows: [R] int32, each once; None: all, and nothing of the tensor is late any more.
         """
+        self.finish(name)
         behind = self._behind.get(name)
         if behind is None:
             return

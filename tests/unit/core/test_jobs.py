@@ -98,6 +98,68 @@ def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
     assert (marks == 1).all()
 
 
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_what_was_begun_is_done_at_its_end(threads, count):
+    marks = np.zeros(count, np.int64)
+    begun = jobs.Begun(mark, marks)
+    assert threads > 1 or (marks == 1).all()
+    for _ in range(2):
+        begun.end()
+        assert (marks == 1).all()
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_other_work_goes_on_beside_what_was_begun(threads):
+    enough, marks = threading.Event(), np.zeros(1000, np.int64)
+
+    def waits(_numbers):
+        assert enough.wait(timeout=30)
+
+    begun = jobs.Begun(waits)
+    jobs.share(mark, marks)
+    assert (marks == 1).all()
+    enough.set()
+    begun.end()
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_what_was_begun_and_fails_does_so_whenever_its_end_is_asked_for(threads):
+    def fails(_numbers):
+        if threading.current_thread() is not threading.main_thread():
+            raise ValueError("of a helper")
+        ended.wait(timeout=30)
+
+    ended = threading.Event()
+    begun = jobs.Begun(fails)
+    jobs._helpers(os.getpid()).ask([after := jobs._Call(ended.set)])
+    for _ in range(2):
+        with pytest.raises(ValueError, match="of a helper"):
+            begun.end()
+    begun.leave()
+    after.end()
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_what_is_left_alone_is_not_worked_on_any_more(threads):
+    busy, enough = threading.Event(), threading.Event()
+
+    def occupied():
+        busy.set()
+        assert enough.wait(timeout=30)
+
+    jobs._helpers(os.getpid()).ask([call := jobs._Call(occupied)])
+    assert busy.wait(timeout=30)
+    marks = np.zeros(1000, np.int64)
+    begun = jobs.Begun(mark, marks)
+    begun.leave()
+    enough.set()
+    call.end()
+    jobs._helpers(os.getpid()).ask([after := jobs._Call(lambda: None)])
+    while not after._under_way.acquire(timeout=0.1):
+        pass
+    assert (marks == 0).all()
+
+
 @pytest.mark.parametrize("threads", [2], indirect=True)
 def test_helpers_keep_nothing_of_what_they_were_given(threads):
     marks = np.zeros(1000, np.int64)

@@ -13,6 +13,7 @@ from crossgrad_core.contract.contexts import Regularized
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
+from crossgrad_core.numerics.jobs import Begun
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
@@ -21,6 +22,7 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.late import Late
+from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.start import first_state
@@ -127,6 +129,7 @@ def test_with_many_rows_a_step_is_taken_with_all(monkeypatch, shape, share):
         both.step(
             rows, rng.normal(size=(len(rows), *shape[1:])).astype(np.float32), 1e-3, AdamRule()
         )
+        both.late.finish()
         assert ("x" in both.late.names) == (size < 0.2)
     assert both.same()
 
@@ -363,6 +366,7 @@ def behind():
         gradient = by_rows(rows, torch.ones(len(rows), 2), (3, 2))
         coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
         state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
+    state.late.finish()
     return state
 
 
@@ -400,6 +404,28 @@ def test_going_back_forgets_what_was_late(go_back):
     state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     go_back(snapshot, state)
     assert not state.late.names and torch.equal(state.parameters["x"], kept)
+
+
+def fails(*_):
+    raise MemoryError
+
+
+def test_a_step_that_was_under_way_and_fails_is_gone_back_from(monkeypatch):
+    state = behind()
+    state.rngs = make_streams(0)
+    keeper, kept = Keeper(state), state.parameters["x"].clone()
+    gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
+    coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
+    state.touched = True
+    monkeypatch.setattr(Begun, "end", fails)
+    state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
+    keeper.settle(state)
+    # It is noticed when the tensor is wanted, and whenever it is wanted.
+    for _ in range(2):
+        with pytest.raises(MemoryError):
+            state.late.catch_up("x", state.tensors["x"], state.moments)
+    keeper.restore(state)
+    assert torch.equal(state.parameters["x"], kept)
 
 
 def test_density_control_takes_what_is_seen_from_what_was_drawn():
