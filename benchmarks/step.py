@@ -3,7 +3,8 @@
 A step is, as in a run: decode with SH degree 3, render, loss against a random photo, backward pass,
 one step of Adam, that of the positions along the axes of their Gaussians, that of the colours by
 rows: of those drawn, which are brought up to date first.
-Each timed step follows one of another view, turned by `--turn`, so that some rows are behind.
+Each timed step follows one of another view, turned by `--turn`, so that some rows are behind. On
+two threads the colours' step of Adam goes on beside the next step, whose `render` has what is left.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
         [--sh-every N]

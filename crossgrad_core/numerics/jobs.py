@@ -103,17 +103,21 @@ class Begun:
         self, kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
     ) -> None:
         own, *others = _jobs(numba.get_num_threads())
-        self._own = partial(kernel, own, *args, **kwargs)
+        self._own: Callable[[], None] | None = partial(kernel, own, *args, **kwargs)
         self._calls = [_Call(partial(kernel, jobs, *args, **kwargs)) for jobs in others]
-        self._done = False
         if self._calls:
             _helpers(os.getpid()).ask(self._calls)
         else:
             self.end()
 
+    @property
+    def done(self) -> bool:
+        """Whether it has come to its end; it holds nothing any more."""
+        return self._own is None
+
     def end(self) -> None:
         """Does what is left, on this thread, too; returns when all jobs are done."""
-        if self._done:
+        if self._own is None:
             return
         try:
             self._own()
@@ -123,7 +127,7 @@ class Begun:
         for call in self._calls:
             if call.error is not None:
                 raise call.error
-        self._done = True
+        self._own, self._calls = None, []
 
     def leave(self) -> None:
         """Returns when nobody works on it any more, whether or not all jobs are done."""
@@ -134,7 +138,7 @@ class Begun:
 class _Call:
     """A call that a helper makes, unless it is not needed any more by then.
 
-    Two bare locks: a `Future` makes conditions anew for each call and for each wait.
+    A bare lock: a `Future` makes conditions anew for each call and for each wait.
 
     Args:
         call: What to call.
@@ -146,26 +150,22 @@ class _Call:
     def __init__(self, call: Callable[[], None]) -> None:
         self.error: BaseException | None = None
         self._call = call
-        # Who has it decides: the helper makes the call, or nobody does any more.
-        self._begun = threading.Lock()
+        self._needed = True
         self._under_way = threading.Lock()
-        self._under_way.acquire()
 
     def make(self) -> None:
         """Makes the call; by the helper."""
-        if not self._begun.acquire(blocking=False):
-            return
-        try:
-            self._call()
-        except BaseException as error:
-            self.error = error
-        finally:
-            self._under_way.release()
+        with self._under_way:
+            if not self._needed:
+                return
+            try:
+                self._call()
+            except BaseException as error:
+                self.error = error
 
     def end(self) -> None:
-        """Returns when the call has been made, or never will be."""
-        if self._begun.acquire(blocking=False):
-            self._under_way.release()
+        """Returns when the call has been made, or never will be; may be repeated."""
+        self._needed = False
         with self._under_way:
             pass
 

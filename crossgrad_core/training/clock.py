@@ -32,10 +32,11 @@ class Clock:
         load: Reading the scene and decoding photos.
         evaluate: Evaluating held-out views.
         report: Writing results.
-        phases: Training seconds by phase of the step; together they are `train`. On a GPU work is
-            counted in the phase that waits for it.
-        cpu: Seconds of CPU time that the process took while it trained, all threads together; NaN
-            where an earlier version, which did not count them, trained a part.
+        phases: Training seconds by phase of the step; together they are `train`. Work of a GPU, or
+            of the other threads alone, is counted in the phase that waits for it.
+        cpu: Seconds of CPU time that the process took while it trained, all threads together, but
+            for what others do between two steps where this clock is no budget; NaN where an
+            earlier version, which did not count them, trained a part.
     """
 
     train: float = 0.0

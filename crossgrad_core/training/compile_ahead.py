@@ -83,6 +83,7 @@ def compile_rows() -> None:
         late.step(
             "rows", values, grad, state, counted("rows", values, state, 1e-3, AdamRule(), 1.0)
         )
+    late.finish()
 
 
 if __name__ == "__main__":

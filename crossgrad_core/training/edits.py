@@ -84,7 +84,6 @@ def put_in_order(setup: Setup, state: TrainState) -> None:
 
 def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
     before = state.primitives(setup)
-    state.late.finish()
     state.settle(edit.values if edit.keeps_rows else None)
     for block in setup.blocks:
         if block.per_primitive:

@@ -64,16 +64,16 @@ class Keeper:
         """
         for tensor in state.tensors.values():
             tensor.grad = None
-        if not state.touched and _is_whole(state):
+        if not state.touched and is_whole(state):
             self._mark.restore(state)
         else:
             self._snapshot.hand_over(state)
             state.touched = False
 
 
-def _is_whole(state: TrainState) -> bool:
+def is_whole(state: TrainState) -> bool:
     """Whether all parameters are finite, as far as the machine lets it be seen."""
     try:
         return are_parameters_finite(state)
-    except (RuntimeError, MemoryError):  # No memory for it or its last step, or the GPU failed.
+    except Exception:  # Its last step has failed, there is no memory for it, or the GPU failed.
         return False

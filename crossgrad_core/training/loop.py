@@ -6,11 +6,11 @@ from typing import Literal, Protocol
 
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.system.allocator import use_large_pages
-from crossgrad_core.training.checks import are_parameters_finite, check_dropped, check_start
+from crossgrad_core.training.checks import check_dropped, check_start
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.foresight import Foresight
-from crossgrad_core.training.keeper import Keeper
+from crossgrad_core.training.keeper import Keeper, is_whole
 from crossgrad_core.training.model import model_of
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
@@ -68,7 +68,7 @@ def train(
     try:
         status = _steps(setup, state, sink, stopper, pauses, keeper)
     except TrainingFailedError:
-        if not are_parameters_finite(state):
+        if not is_whole(state):
             keeper.restore(state)
         raise
     except BaseException as error:
@@ -120,11 +120,14 @@ def _steps(
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     """One step on the training clock; decoding photos is counted as loading.
 
-    A GPU may still be at the optimizer when the step is over; the next one waits for it.
+    A GPU, or the other threads, may still be at the optimizer when the step is over; the next one
+    waits for them.
     """
     state.laps = Laps()
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
+    if setup.config.clock == "cpu" or looks_after(setup, state.step):
+        state.late.finish()  # On this step's clock.
     state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
     state.clock.count(state.laps)

@@ -44,7 +44,8 @@ class TrainState:
     """Everything that a step reads and writes.
 
     Attributes:
-        tensors: The parameters as they lie in memory: rows may be late with steps of Adam.
+        tensors: The parameters as they lie in memory: rows may be late with steps of Adam, and a
+            step may be under way on other threads.
         moments: The optimizer's moments, likewise.
         rngs: Stream name -> its generator.
         states: Plugin name -> its state.
@@ -55,7 +56,7 @@ class TrainState:
         laps: What the step under way has spent its time on.
         rewinds: How often training went back to the last good state.
         touched: Whether a step that is not complete has begun to change parameters or moments.
-        late: The steps that rows are late with.
+        late: The steps that rows are late with, and those under way.
     """
 
     tensors: Parameters

@@ -96,6 +96,10 @@ class Late:
                 begun.end()
                 del self._under_way[each]
 
+    def _begin(self, name: str, begun: "Begun") -> None:
+        if not begun.done:
+            self._under_way[name] = begun
+
     def forget(self) -> None:
         """Forgets all steps; nobody changes a tensor any more when this returns."""
         for begun in self._under_way.values():
@@ -128,8 +132,7 @@ class Late:
         flat, numbers, width = _flat(name, param, adam), numbers_of(step), _width(param)
         values = values_of(grad).contiguous().view(-1).numpy()
         update = update_all if most else update_rows
-        begun = Begun(update, rows, width, flat[0], values, flat[1], flat[2], numbers)
-        self._under_way[name] = begun
+        self._begin(name, Begun(update, rows, width, flat[0], values, flat[1], flat[2], numbers))
         _changed(name, param, adam)
         if most:
             return
@@ -159,7 +162,7 @@ class Late:
         if behind is None:
             return
         if behind.count and (rows is None or len(rows)):
-            from crossgrad_core.numerics.jobs import share
+            from crossgrad_core.numerics.jobs import Begun
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
             # Of one type in any case: for another one the kernel would be compiled once more.
@@ -168,7 +171,9 @@ class Late:
             steps, before = behind.table, behind.before
             whole = rows is None
             done = behind.done
-            share(catch_up, whole, which, width, flat[0], flat[1], flat[2], done, before, steps)
+            arrays = flat[0], flat[1], flat[2], done, before, steps
+            self._begin(name, Begun(catch_up, whole, which, width, *arrays))
+            self.finish(name)
             _changed(name, param, adam)
         if rows is None:
             del self._behind[name]

@@ -154,9 +154,9 @@ def test_what_is_left_alone_is_not_worked_on_any_more(threads):
     begun.leave()
     enough.set()
     call.end()
-    jobs._helpers(os.getpid()).ask([after := jobs._Call(lambda: None)])
-    while not after._under_way.acquire(timeout=0.1):
-        pass
+    over = threading.Event()
+    jobs._helpers(os.getpid()).ask([jobs._Call(over.set)])
+    assert over.wait(timeout=30)
     assert (marks == 0).all()
 
 

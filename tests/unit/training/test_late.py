@@ -13,7 +13,6 @@ from crossgrad_core.contract.contexts import Regularized
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
-from crossgrad_core.numerics.jobs import Begun
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
@@ -406,23 +405,32 @@ def test_going_back_forgets_what_was_late(go_back):
     assert not state.late.names and torch.equal(state.parameters["x"], kept)
 
 
-def fails(*_):
-    raise MemoryError
+class Failing:
+    """A step under way whose end is an error."""
+
+    done = False
+
+    def __init__(self, tensor):
+        self.tensor = tensor
+
+    def end(self):
+        self.leave()
+        raise LookupError("of a helper")
+
+    def leave(self):
+        self.tensor[0] = 5.0
 
 
-def test_a_step_that_was_under_way_and_fails_is_gone_back_from(monkeypatch):
+def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     state = behind()
     state.rngs = make_streams(0)
     keeper, kept = Keeper(state), state.parameters["x"].clone()
-    gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
-    coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
     state.touched = True
-    monkeypatch.setattr(Begun, "end", fails)
-    state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
+    state.late._begin("x", Failing(state.tensors["x"]))
     keeper.settle(state)
     # It is noticed when the tensor is wanted, and whenever it is wanted.
     for _ in range(2):
-        with pytest.raises(MemoryError):
+        with pytest.raises(LookupError):
             state.late.catch_up("x", state.tensors["x"], state.moments)
     keeper.restore(state)
     assert torch.equal(state.parameters["x"], kept)
