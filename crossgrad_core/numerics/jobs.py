@@ -110,13 +110,11 @@ class Begun:
         else:
             self.end()
 
-    @property
-    def done(self) -> bool:
-        """Whether it has come to its end; it holds nothing any more."""
-        return self._own is None
-
     def end(self) -> None:
-        """Does what is left, on this thread, too; returns when all jobs are done."""
+        """Does what is left, on this thread, too; returns when all jobs are done.
+
+        It holds nothing any more then, and can be ended again.
+        """
         if self._own is None:
             return
         try:

@@ -96,10 +96,6 @@ class Late:
                 begun.end()
                 del self._under_way[each]
 
-    def _begin(self, name: str, begun: "Begun") -> None:
-        if not begun.done:
-            self._under_way[name] = begun
-
     def forget(self) -> None:
         """Forgets all steps; nobody changes a tensor any more when this returns."""
         for begun in self._under_way.values():
@@ -132,7 +128,8 @@ class Late:
         flat, numbers, width = _flat(name, param, adam), numbers_of(step), _width(param)
         values = values_of(grad).contiguous().view(-1).numpy()
         update = update_all if most else update_rows
-        self._begin(name, Begun(update, rows, width, flat[0], values, flat[1], flat[2], numbers))
+        begun = Begun(update, rows, width, flat[0], values, flat[1], flat[2], numbers)
+        self._under_way[name] = begun
         _changed(name, param, adam)
         if most:
             return
@@ -172,7 +169,7 @@ class Late:
             whole = rows is None
             done = behind.done
             arrays = flat[0], flat[1], flat[2], done, before, steps
-            self._begin(name, Begun(catch_up, whole, which, width, *arrays))
+            self._under_way[name] = Begun(catch_up, whole, which, width, *arrays)
             self.finish(name)
             _changed(name, param, adam)
         if rows is None:

@@ -350,8 +350,17 @@ def test_a_run_prepares_photos_where_it_is_told_to(report, photos, capsys):
     assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
     told = capsys.readouterr().out
     assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
+    assert "poses of its own" not in told
     read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos-alone"}), photos)
     assert (name, len(read.views)) == ("photos-alone", COUNT)
+
+
+def test_poses_that_are_there_already_and_not_used_are_named(copied, tmp_path):
+    shutil.rmtree(copied / "prepare")
+    place = shutil.copytree(bundled_scene(), tmp_path / "photos")
+    read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
+    (told,) = (note for note in read.notes if "poses of its own" in note)
+    assert "reader colmap" in told and "leave --prepare out" in told
 
 
 def test_a_run_of_photos_says_what_to_do(photos, capsys):

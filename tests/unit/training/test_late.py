@@ -408,8 +408,6 @@ def test_going_back_forgets_what_was_late(go_back):
 class Failing:
     """A step under way whose end is an error."""
 
-    done = False
-
     def __init__(self, tensor):
         self.tensor = tensor
 
@@ -426,7 +424,7 @@ def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     state.rngs = make_streams(0)
     keeper, kept = Keeper(state), state.parameters["x"].clone()
     state.touched = True
-    state.late._begin("x", Failing(state.tensors["x"]))
+    state.late._under_way["x"] = Failing(state.tensors["x"])
     keeper.settle(state)
     # It is noticed when the tensor is wanted, and whenever it is wanted.
     for _ in range(2):
