@@ -4,7 +4,8 @@ A step is, as in a run: decode with SH degree 3, render, loss against a random p
 one step of Adam, that of the positions along the axes of their Gaussians, that of the colours by
 rows: of those drawn, which are brought up to date first.
 Each timed step follows one of another view, turned by `--turn`, so that some rows are behind. On
-two threads the colours' step of Adam goes on beside the next step, whose `render` has what is left.
+two threads the colours' step of Adam goes on beside the next step, whose `render` has what is left;
+not with `--sh-every`, where steps of two kinds follow each other.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
         [--sh-every N]
@@ -79,6 +80,8 @@ class Trainer:
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
         self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
         self.state, self.late = AdamState(), Late()
+        #: Whether nothing of a step is left to the next one.
+        self.apart = False
         # Rates of zero keep the case the same from repetition to repetition at the same cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
@@ -99,6 +102,8 @@ class Trainer:
         loss.backward()
         yield "backward"
         self._optimize()
+        if self.apart:
+            self.late.finish()
         yield "adam"
 
     def _bring(self, rows: Tensor | None) -> None:
@@ -137,6 +142,7 @@ def main() -> None:
     with np.load(arguments.case) as file:
         case = dict(file)
     trainer = Trainer(case, arguments.max_alpha)
+    trainer.apart = arguments.sh_every > 1
     views = camera_of(case, arguments.turn), camera_of(case, 0.0)
     shape = (views[0].height, views[0].width, 3)
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
-    from crossgrad_core.run.assemble import DEFAULT_STEPS, assemble
+    from crossgrad_core.run.assemble import DEFAULT_STEPS, accepts, assemble
     from crossgrad_core.run.opening import opened as open_run
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
@@ -83,6 +83,7 @@ __all__ = [
     "TrainState",
     "TrainingFailedError",
     "UserError",
+    "accepts",
     "affordable_steps",
     "announce",
     "assemble",
@@ -164,6 +165,7 @@ _LATE: Final = {
     "Setup": "training.setup",
     "TrainState": "training.state",
     "TrainingFailedError": "training.failure",
+    "accepts": "run.assemble",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
     "counting_of": "training.schedules",

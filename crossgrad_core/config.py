@@ -206,7 +206,6 @@ class RunConfig(BaseModel):
     rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
         None,
         gt=0,
-        le=1e6,
         description="Multiplies all learning rates of the backbone. Default: 1 from 30,000 steps "
         "on and with --preset inria, more in shorter runs.",
     )

@@ -9,8 +9,10 @@ from typing import TypeVar
 from crossgrad_core.commands import (
     Progress,
     UserError,
+    accepts,
     available_cores,
     disk_errors,
+    entries,
     locked,
     way_on,
     write_atomically,
@@ -88,11 +90,17 @@ def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
         why = f"{layout.work} is gone, which says what it was made of"
     elif layout.is_ready and not has_photos(photos):
         why = f"there are no photos in {photos} any more"
-    return (
+    told = (
         [f"{why}: the scene is taken as it is"]
         if why
         else summary_lines(prepared(photos, scene, settings))
     )
+    able = [name for name in entries("readers") if accepts(name, photos)]
+    return told + [
+        f"the folder has poses of its own (reader {name}), which are not used; to train with them, "
+        "leave --prepare out"
+        for name in able[:1]
+    ]
 
 
 def _check_lens(name: str) -> None:

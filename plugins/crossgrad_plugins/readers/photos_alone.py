@@ -1,20 +1,12 @@
 """Reads folders of photos alone: finds their cameras first, as `crossgrad prepare` does."""
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import (
-    Reader,
-    Scene,
-    SceneOptions,
-    UserError,
-    build_component,
-    installed_plugins,
-)
+from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 
@@ -49,20 +41,5 @@ class PhotosAloneReader(Reader):
         place = self.scene or photos.with_name(f"{photos.name}-scene")
         told = made_or_ready(photos, place, Settings())
         scene = ColmapReader().read(place, options)
-        lines = [f"the photos were prepared into {place}", *told]
-        if able := _able(photos):
-            lines.append(
-                f"the folder has poses of its own (reader {able[0]}), which are not used; to train "
-                "with them, leave --prepare out"
-            )
+        lines = (f"the photos were prepared into {place}", *told)
         return replace(scene, notes=(*(f"prepare: {line}" for line in lines), *scene.notes))
-
-
-def _able(path: Path) -> list[str]:
-    """The readers that take the folder as it is."""
-    found = []
-    for name in installed_plugins("readers"):
-        # One that fails has nothing to say about what is prepared.
-        with suppress(Exception):
-            found += [name] * build_component(Reader, name, {}).accepts(path)
-    return found

@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 import weakref
+from contextlib import contextmanager
 
 import numba
 import numpy as np
@@ -80,8 +81,9 @@ def test_an_error_of_a_helper_is_raised(threads):
         jobs.share(fails)
 
 
-@pytest.mark.parametrize("threads", [2], indirect=True)
-def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
+@contextmanager
+def occupied_helper():
+    """The helper has something else to do meanwhile."""
     busy, enough = threading.Event(), threading.Event()
 
     def occupied():
@@ -90,11 +92,17 @@ def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
 
     jobs._helpers(os.getpid()).ask([call := jobs._Call(occupied)])
     assert busy.wait(timeout=30)
-    marks = np.zeros(1000, np.int64)
-    jobs.share(mark, marks)
+    yield
     enough.set()
     call.end()
     assert call.error is None
+
+
+@pytest.mark.parametrize("threads", [2], indirect=True)
+def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
+    marks = np.zeros(1000, np.int64)
+    with occupied_helper():
+        jobs.share(mark, marks)
     assert (marks == 1).all()
 
 
@@ -141,19 +149,9 @@ def test_what_was_begun_and_fails_does_so_whenever_its_end_is_asked_for(threads)
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
 def test_what_is_left_alone_is_not_worked_on_any_more(threads):
-    busy, enough = threading.Event(), threading.Event()
-
-    def occupied():
-        busy.set()
-        assert enough.wait(timeout=30)
-
-    jobs._helpers(os.getpid()).ask([call := jobs._Call(occupied)])
-    assert busy.wait(timeout=30)
     marks = np.zeros(1000, np.int64)
-    begun = jobs.Begun(mark, marks)
-    begun.leave()
-    enough.set()
-    call.end()
+    with occupied_helper():
+        jobs.Begun(mark, marks).leave()
     over = threading.Event()
     jobs._helpers(os.getpid()).ask([jobs._Call(over.set)])
     assert over.wait(timeout=30)

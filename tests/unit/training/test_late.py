@@ -67,6 +67,16 @@ class Both:
 
 
 @pytest.mark.parametrize("most", [0.2, 2.0])
+def test_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatch, most):
+    monkeypatch.setattr(late, "MOST_ROWS", most)
+    both = Both(torch.zeros(10, 3))
+    both.step(np.arange(4), np.ones((4, 3), np.float32), 1e300, AdamRule())
+    both.catch_up()
+    for found in (both.whole, both.rows):
+        assert torch.equal(found[:4], torch.full((4, 3), -torch.inf))
+
+
+@pytest.mark.parametrize("most", [0.2, 2.0])
 @pytest.mark.parametrize("seed", range(10))
 def test_late_steps_have_the_bits_of_steps_taken_at_once(monkeypatch, seed, most):
     monkeypatch.setattr(late, "MOST_ROWS", most)

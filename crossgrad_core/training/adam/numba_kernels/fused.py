@@ -101,18 +101,19 @@ def _update_chunks(
 
 
 def numbers_of(step: Coefficients) -> Numbers:
-    """The numbers of a step in the type of the kernels."""
-    return (
-        np.float32(step.beta1),
-        np.float32(1 - step.beta1),
-        np.float32(step.beta2),
-        np.float32(1 - step.beta2),
-        np.float32(step.step_size),
-        np.float32(step.root_scale),
-        np.float32(step.eps),
-        np.float32(step.square_floor),
-        np.float32(step.scale),
-    )
+    """The numbers of a step in the type of the kernels; rates beyond it are infinite."""
+    with np.errstate(over="ignore"):  # What they make of the parameters is found and named.
+        return (
+            np.float32(step.beta1),
+            np.float32(1 - step.beta1),
+            np.float32(step.beta2),
+            np.float32(1 - step.beta2),
+            np.float32(step.step_size),
+            np.float32(step.root_scale),
+            np.float32(step.eps),
+            np.float32(step.square_floor),
+            np.float32(step.scale),
+        )
 
 
 def update_at(
