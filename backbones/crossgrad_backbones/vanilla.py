@@ -58,7 +58,7 @@ class Vanilla(Backbone):
     def blocks(self) -> tuple[Block, ...]:
         rows = (
             Block("means", ("means",), True, "geometry", self._means_lr()),
-            Block("scales", ("scales",), True, "geometry", LearningRate(self.lr_scales)),
+            Block("scales", ("scales",), True, "geometry", self._scales_lr()),
             Block("quats", ("quats",), True, "geometry", LearningRate(self.lr_quats)),
             Block("opacities", ("opacities",), True, "appearance", LearningRate(self.lr_opacities)),
             Block("f_dc", ("f_dc",), True, "appearance", LearningRate(self.lr_f_dc)),
@@ -68,6 +68,10 @@ class Vanilla(Backbone):
         rate = LearningRate(self.lr_f_rest)
         rest = Block("f_rest", ("f_rest",), True, "appearance", rate, rests=True)
         return (*rows, rest)
+
+    def _scales_lr(self) -> LearningRate:
+        # Measured by us (docs/schedules.md).
+        return LearningRate(self.lr_scales, hurried=2.0)
 
     def _means_lr(self) -> LearningRate:
         return LearningRate(self.lr_means, self.lr_means_final)

@@ -135,7 +135,7 @@ def notes_on(setup: Setup) -> tuple[str, ...]:
     if config.beta1 is None and first != published:
         notes.append(f"Adam's first moment: beta1 {first:.3g} (--set beta1={published}: published)")
     if in_a_hurry(config, schedule, photos):
-        notes.append(_hurry_note(config, schedule))
+        notes.append(_hurry_note(setup))
     return tuple(notes)
 
 
@@ -151,7 +151,7 @@ def _rules(setup: Setup) -> Iterator[str]:
             f"views, {BETAS[0]} as published from {REFERENCE:,} on"
         )
     if config.beta2 is None and setup.train_views:
-        rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, "
+        rates = f"{ratio}^{HURRIED_SHORTNESS}, at most {HURRIED_MOST}, {_own_rates(setup)}"
         memory = f"Adam's second moment averages over a {1 / MEMORY:.0f}th of the steps"
         yield (
             f"if these are fewer than {HURRY} views of each training photo: "
@@ -159,11 +159,17 @@ def _rules(setup: Setup) -> Iterator[str]:
         )
 
 
+def _own_rates(setup: Setup) -> str:
+    """The blocks whose rates a hurried run multiplies beside all others."""
+    own = [each for each in setup.trained_blocks if each.lr.hurried != 1.0]
+    return "".join(f"the rate of {each.name} times {each.lr.hurried:g} more, " for each in own)
+
+
 def note_on_plan(setup: Setup) -> tuple[str, ...]:
     """Which rules a run within a budget has, once its length is planned."""
     config, schedule = setup.config, setup.schedule
     hurried = in_a_hurry(config, schedule, len(setup.train_views))
-    return (_hurry_note(config, schedule),) if hurried else ()
+    return (_hurry_note(setup),) if hurried else ()
 
 
 def note_on_axes(setup: Setup) -> tuple[str, ...]:
@@ -176,10 +182,13 @@ def note_on_axes(setup: Setup) -> tuple[str, ...]:
     )
 
 
-def _hurry_note(config: RunConfig, schedule: Schedule) -> str:
+def _hurry_note(setup: Setup) -> str:
+    config, schedule = setup.config, setup.schedule
+    rates = _own_rates(setup) if config.rate_factor is None else ""
     return (
-        f"fewer than {HURRY} views of each training photo: Adam's second moment averages over "
-        f"{_memory(config, schedule):,.0f} steps (--set beta2=0.999 has what longer runs have)"
+        f"fewer than {HURRY} views of each training photo: "
+        f"{rates}Adam's second moment averages over {_memory(config, schedule):,.0f} steps "
+        "(--set beta2=0.999 has what longer runs have)"
     )
 
 
@@ -239,8 +248,10 @@ def means_rate_at(setup: Setup, step: int) -> float:
 
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     """A learning rate of the backbone in a step: of the schedule, times what the run asks for."""
-    config, schedule = setup.config, setup.schedule
-    factor = factor_of(config, schedule, len(setup.train_views))
+    config, schedule, photos = setup.config, setup.schedule, len(setup.train_views)
+    factor = factor_of(config, schedule, photos)
+    if config.rate_factor is None and in_a_hurry(config, schedule, photos):
+        factor *= rate.hurried
     factor *= faded(config, rate, step=step, total=schedule.total)
     if config.batch_rule == "sqrt":
         factor *= sqrt(schedule.pace.at(step))

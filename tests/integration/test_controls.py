@@ -84,8 +84,12 @@ EIGHTH = 8.0**0.45
 )
 def test_a_shorter_run_has_larger_rates(settings, factor):
     setup = assembled(**settings)
-    (published,) = (block.lr for block in setup.blocks if block.name == "opacities")
-    assert rates_at(setup, 1)["opacities"] == pytest.approx(factor * published.at(0), rel=1e-9)
+    published = {block.name: block.lr for block in setup.blocks}
+    # Not so few views of nine photos that sizes have a rate of their own, but in runs of 5 steps.
+    sizes = 2.0 if settings == {"steps": 5} else 1.0
+    for name, own in (("opacities", 1.0), ("scales", sizes), ("f_rest", 1.0)):
+        rate = own * factor * published[name].at(0)
+        assert rates_at(setup, 1)[name] == pytest.approx(rate, rel=1e-9)
     told = [note for note in setup.notes if "learning rates" in note]
     assert len(told) == (factor != 1.0 and "rate_factor" not in settings)
     assert all(note.endswith(f" times {factor:.3g}") for note in told)
@@ -118,6 +122,10 @@ def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, be
     told = [note for note in setup.notes if "second moment" in note]
     assert len(told) == (beta2 == 0.98)
     assert all("fewer than 40 views " in note and " over 50 steps " in note for note in told)
+    own = beta2 == 0.98 and "rate_factor" not in settings
+    assert all(("the rate of scales times 2 more" in note) == own for note in told)
+    plain = factor_of(setup.config, setup.schedule, 9) * 5e-3
+    assert rates_at(setup, 1)["scales"] == pytest.approx((2.0 if own else 1.0) * plain, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -204,11 +212,12 @@ def test_where_the_clock_decides_the_rates_follow_its_plan():
     assert note.endswith(" times (30,000 / steps)^0.45, at most 4.5")
     assert hurried == (
         "if these are fewer than 40 views of each training photo: (30,000 / steps)^0.65, at most "
-        "6.3, Adam's second moment averages over a 50th of the steps, 50 at least"
+        "6.3, the rate of scales times 2 more, Adam's second moment averages over a 50th of the "
+        "steps, 50 at least"
     )
     own = assembled(steps=None, seconds=60.0, rate_factor=2.0)
     (note,) = (note for note in own.notes if "second moment" in note)
-    assert note.startswith("if these are") and "30,000" not in note
+    assert note.startswith("if these are") and "30,000" not in note and "scales" not in note
     own = assembled(steps=None, seconds=60.0, beta2=0.99)
     assert not any("second moment" in note for note in own.notes)
     shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
