@@ -193,6 +193,9 @@ class RunConfig(BaseModel):
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
+    sh_after: float | None = Field(
+        None, ge=0, le=1, description="share of the run before the SH degree grows"
+    )
     sh_every: int | None = Field(
         None, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
     )

@@ -87,6 +87,7 @@ class Schedule:
         anchors_every: Interval of anchor growing.
         coarse_until: Backbones that train from coarse to fine have all levels from here on.
         sh_from: SH degree at the first step.
+        sh_wait: The degree stays that of the first step before this.
         sh_every: Blocks that may rest learn in one of so many steps.
         counting: What is counted.
         pace: K of every step.
@@ -107,6 +108,7 @@ class Schedule:
     anchors_every: int
     coarse_until: int
     sh_from: int = 0
+    sh_wait: int = 0
     sh_every: int = 1
     counting: Counting = IN_STEPS
     pace: Pace = ONE_BY_ONE
@@ -233,14 +235,16 @@ class Schedule:
         The ends of the run, of the learning-rate decay and of density control move as far as they
         are still ahead, and so does a change of K. Intervals stay, so that nothing happens twice or
         is left out; density control that is over does not come back, and no level closes that was
-        open. Edits that are counted in views are planned anew: those that are left out before the
-        first one, and the interval of the others where there would be too few.
+        open, nor do harmonics go that were drawn. Edits that are counted in views are planned anew:
+        those that are left out before the first one, and the interval of the others where there
+        would be too few.
 
         Args:
             wanted: The schedule of a run that was as long from its start.
             step: The step that the run has reached.
         """
-        over = self.counted(step) >= self.densify_until
+        count = self.counted(step)
+        over = count >= self.densify_until
         longer = replace(
             self,
             total=wanted.total,
@@ -248,17 +252,20 @@ class Schedule:
             lr_until=wanted.lr_until,
             pace=self.pace.moved(wanted.pace, step),
             coarse_until=min(self.coarse_until, wanted.coarse_until),
+            sh_wait=self.sh_wait if count >= self.sh_wait else max(count, wanted.sh_wait),
         )
         if over:
             return longer
         longer = replace(longer, fewest_edits=wanted.fewest_edits)
         if longer.fewest_edits:
             return _with_edits_ahead(longer, wanted, step)
-        return replace(longer, densify_until=max(self.counted(step), wanted.densify_until))
+        return replace(longer, densify_until=max(count, wanted.densify_until))
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
         """Active spherical-harmonics degree at a step."""
-        return min(maximum, self.sh_from + self.counted(step) // self.sh_interval)
+        count = self.counted(step)
+        more = count // self.sh_interval if count >= self.sh_wait else 0
+        return min(maximum, self.sh_from + more)
 
     def rests(self, step: int) -> bool:
         """Whether blocks that may rest do not learn in this step.

@@ -61,6 +61,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest.setdefault("beta1", 0.9)
         rest.setdefault("beta2", 0.999)
         rest.setdefault("position_steps", "extent")
+        rest.setdefault("sh_after", 0.0)
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)

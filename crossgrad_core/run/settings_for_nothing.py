@@ -151,10 +151,12 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.fewest_edits and not setup.schedule.fewest_edits:
         why = "are published or have times that were set are not made to fit"
         yield "fewest_edits", f"edits that count steps, {why}"
-    learns_less = (config.sh_every or 1) > 1
-    if learns_less and not any(block.rests for block in setup.trained_blocks):
-        name = setup.selection.names["backbone"]
-        yield "sh_every", f"backbone {name} trains no SH bands above the first"
+    if not any(block.rests for block in setup.trained_blocks):
+        why = f"backbone {setup.selection.names['backbone']} trains no SH bands above the first"
+        if (config.sh_every or 1) > 1:
+            yield "sh_every", why
+        if config.sh_after:
+            yield "sh_after", why
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

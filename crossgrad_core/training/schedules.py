@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.contract.densifier import Densifier
@@ -15,8 +15,13 @@ from crossgrad_core.contract.schedule import (
     Schedule,
     Unit,
     is_published,
+    shortness,
 )
 from crossgrad_core.training.setup import Setup
+
+#: Share of a short run before harmonics above the first degree are drawn: until then they cost time
+#: and are worth little. Measured by us (docs/schedules.md).
+SH_AFTER: Final = 0.5
 
 #: Times of density control that the user may set.
 _EDITS = ("densify_from", "densify_until", "densify_every")
@@ -76,9 +81,20 @@ def schedule_of(
         # They hold back growth, which the curve does, and with them goes what fills the far ground.
         schedule = replace(schedule, reset_every=None)
     edits = _given(config, _EDITS)
+    schedule = replace(schedule, sh_wait=_before_harmonics(config, schedule))
     schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from", "sh_every")))
     # What the user sets stays, whatever the length.
     return replace(schedule, fewest_edits=0) if edits else schedule
+
+
+def _before_harmonics(config: RunConfig, schedule: Schedule) -> int:
+    """The count before which harmonics above the first degree are not drawn."""
+    length = schedule.length
+    if config.sh_after is not None:
+        return round(config.sh_after * length)
+    ours = config.preset != "inria" and schedule.counting.unit == "views"
+    ours = ours and not schedule.published
+    return int(SH_AFTER * shortness(length) * length) if ours else 0
 
 
 def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
@@ -88,7 +104,20 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
 def notes_on_length(setup: Setup) -> tuple[str, ...]:
     """What is noted about a run of this length."""
     resolution = setup.selection.resolution
-    return (*growth_note(setup), *_curve_note(setup), *resolution.remarks(setup.schedule))
+    remarks = resolution.remarks(setup.schedule)
+    return (*growth_note(setup), *_curve_note(setup), *_harmonics_note(setup), *remarks)
+
+
+def _harmonics_note(setup: Setup) -> tuple[str, ...]:
+    """Says that harmonics come late, where nobody asked for it."""
+    schedule, banded = setup.schedule, any(block.rests for block in setup.trained_blocks)
+    usual = setup.config.sh_after is None and banded and not schedule.sh_from
+    if not usual or schedule.sh_wait <= schedule.sh_interval:
+        return ()
+    return (
+        f"harmonics above the first band are drawn after {schedule.sh_wait:,} views (--set "
+        "sh_after=0: band by band from the start, as published)",
+    )
 
 
 def _curve_note(setup: Setup) -> tuple[str, ...]:

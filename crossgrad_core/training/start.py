@@ -230,10 +230,8 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     setup.rasterizer.burn_in(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
     # A run of one step has no second one to be tried out with.
-    steps = [
-        min(1, schedule.total - 1),
-        *(schedule.step_of(schedule.sh_interval * degree) for degree in (1, 2, 3)),
-    ]
+    degrees = {max(schedule.sh_interval * degree, schedule.sh_wait) for degree in (1, 2, 3)}
+    steps = [min(1, schedule.total - 1), *map(schedule.step_of, sorted(degrees))]
     if setup.densifier.needs:
         # Once density control is over, its statistics are left out: other kernels.
         steps.append(schedule.step_of(schedule.densify_until))

@@ -99,6 +99,43 @@ def test_a_shorter_run_has_larger_rates(settings, factor):
 PASSES = 360
 
 
+@pytest.mark.parametrize(
+    ("settings", "wait"),
+    [
+        ({"steps": 2_000, "views": 1}, 1_000),
+        ({"steps": 1_000, "views": 2}, 1_000),
+        ({"steps": 9_487, "views": 1}, 2_371),
+        ({"steps": 30_000, "views": 1}, 0),
+        ({"steps": 2_000, "preset": "inria"}, 0),
+        ({"steps": 2_000, "preset": "inria", "events": "views"}, 0),
+        ({"steps": 2_000, "events": "steps"}, 0),
+        ({"steps": 2_000, "schedule": "absolute"}, 0),
+        ({"steps": 9, "schedule": "absolute", "reference": 2_000, "views": 1}, 1_000),
+        ({"steps": 2_000, "sh_after": 0.0}, 0),
+        ({"steps": 2_000, "views": 1, "sh_after": 0.3}, 600),
+        ({"steps": 2_000, "preset": "inria", "sh_after": 0.3}, 600),
+    ],
+)
+def test_harmonics_come_when_half_of_a_short_run_is_over(settings, wait):
+    setup = assembled(**settings)
+    schedule = setup.schedule
+    assert schedule.sh_wait == pytest.approx(wait, abs=1)
+    first = schedule.step_of(max(schedule.sh_wait, 3 * schedule.sh_interval))
+    assert schedule.sh_degree(first) == 3
+    if wait:
+        assert schedule.sh_degree(schedule.step_of(schedule.sh_wait) - 1) == 0
+    told = [note for note in setup.notes if "harmonics above" in note]
+    assert len(told) == (wait > 0 and "sh_after" not in settings)
+    assert all(f" after {schedule.sh_wait:,} views " in note for note in told)
+
+
+def test_harmonics_of_a_backbone_without_any_wait_for_nothing():
+    setup = assembled(backbone={"name": "scaffold"}, sh_after=0.5, steps=2_000)
+    with pytest.raises(UserError, match="sh_after"):
+        refuse_settings_for_nothing(setup.config, setup)
+    assert not any("harmonics" in note for note in assembled(backbone={"name": "scaffold"}).notes)
+
+
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize(
     ("length", "settings", "beta2"),

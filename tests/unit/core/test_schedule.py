@@ -94,6 +94,27 @@ def test_large_gaussians_are_pruned_after_the_first_reset_whatever_the_length(to
     assert not schedule.prunes_large(first) and schedule.prunes_large(first + 1)
 
 
+def test_harmonics_wait_and_then_come_as_many_as_would_be_there():
+    plain = Schedule.for_run(2000)
+    waiting = replace(plain, sh_wait=250)
+    assert [waiting.sh_degree(step) for step in (0, 100, 249, 250, 299, 300)] == [0, 0, 0, 2, 2, 3]
+    assert replace(waiting, sh_from=1).sh_degree(249) == 1
+    assert all(waiting.sh_degree(step) == plain.sh_degree(step) for step in range(250, 2001))
+
+
+@pytest.mark.parametrize(
+    ("step", "wait"), [(100, 900), (899, 900), (950, 950), (999, 999), (1000, 1000), (1500, 1000)]
+)
+def test_harmonics_that_are_drawn_do_not_go_when_the_run_gets_another_length(step, wait):
+    schedule = replace(Schedule.for_run(2000), sh_wait=1000)
+    other = replace(Schedule.for_run(1800), sh_wait=900)
+    longer = replace(Schedule.for_run(4000), sh_wait=2000)
+    assert schedule.lengthened(other, step).sh_wait == wait
+    later = schedule.lengthened(longer, step)
+    assert later.sh_wait == (2000 if step < 1000 else 1000)
+    assert later.sh_degree(step) == schedule.sh_degree(step)
+
+
 def test_the_coarse_phase_never_gets_longer():
     schedule = Schedule.for_run(1000)
     assert schedule.lengthened(Schedule.for_run(2000), 100).coarse_until == 250

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
@@ -53,6 +54,7 @@ class Run:
     hook: Hook = field(default_factory=Hook)
     notes: tuple[str, ...] = ("a note on the scene",)
     pixel_share: float = 0.6
+    trained_blocks: tuple[Block, ...] = ()
 
 
 def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
