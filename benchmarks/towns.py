@@ -36,12 +36,13 @@ EVERY: Final = 8
 
 @dataclass(frozen=True, eq=False)
 class Town:
-    """What stands where.
+    """Boxes and trees along a grid of roads, and the sun.
 
     Attributes:
         pitch: Metres from road to road.
         road: Width of a road.
-        boxes: [B, 10], trees: [T, 5], as in _town_photos.py.
+        boxes: [B, 10], as in _town_photos.py.
+        trees: [T, 5], as there.
         sun: Unit vector towards it.
     """
 
