@@ -17,10 +17,11 @@ from crossgrad_core.contract.schedule import (
     is_published,
     shortness,
 )
+from crossgrad_core.training.rates import in_a_hurry
 from crossgrad_core.training.setup import Setup
 
-#: Share of a short run before harmonics above the first degree are drawn: until then they cost time
-#: and are worth little. Measured by us (docs/schedules.md).
+#: Share of a short run in a hurry before harmonics above the first degree are drawn: they cost time,
+#: and are worth little until then. Measured by us (docs/schedules.md).
 SH_AFTER: Final = 0.5
 
 #: Times of density control that the user may set.
@@ -92,9 +93,9 @@ def _before_harmonics(config: RunConfig, schedule: Schedule) -> int:
     length = schedule.length
     if config.sh_after is not None:
         return round(config.sh_after * length)
-    ours = config.preset != "inria" and schedule.counting.unit == "views"
-    ours = ours and not schedule.published
-    return int(SH_AFTER * shortness(length) * length) if ours else 0
+    ours = schedule.counting.unit == "views" and not schedule.published
+    waits = ours and in_a_hurry(config, schedule, schedule.counting.photos)
+    return int(SH_AFTER * shortness(length) * length) if waits else 0
 
 
 def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:

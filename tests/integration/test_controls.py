@@ -25,6 +25,7 @@ from crossgrad_core.training.rates import (
     rule_at,
 )
 from crossgrad_core.training.rngs import STREAMS
+from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.start import first_state
 
 
@@ -114,9 +115,11 @@ PASSES = 360
         ({"steps": 2_000, "sh_after": 0.0}, 0),
         ({"steps": 2_000, "views": 1, "sh_after": 0.3}, 600),
         ({"steps": 2_000, "preset": "inria", "sh_after": 0.3}, 600),
+        ({"steps": 2_000, "beta2": 0.999}, 0),
     ],
 )
-def test_harmonics_come_when_half_of_a_short_run_is_over(settings, wait):
+def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wait, monkeypatch):
+    monkeypatch.setattr(rates, "HURRY", 10_000)
     setup = assembled(**settings)
     schedule = setup.schedule
     assert schedule.sh_wait == pytest.approx(wait, abs=1)
@@ -127,6 +130,16 @@ def test_harmonics_come_when_half_of_a_short_run_is_over(settings, wait):
     told = [note for note in setup.notes if "harmonics above" in note]
     assert len(told) == (wait > 0 and "sh_after" not in settings)
     assert all(f" after {schedule.sh_wait:,} views " in note for note in told)
+
+
+def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
+    assert assembled(steps=PASSES, views=1).schedule.sh_wait == 0
+    assert assembled(steps=PASSES - 2, views=1).schedule.sh_wait == (PASSES - 2) // 2
+    # As it was planned, whatever the clock makes of it.
+    planned = parsed({"steps": PASSES - 2, "views": 1})
+    setup = assemble(planned, sample_scene(), "none")
+    longer = schedule_of(setup.config, setup.densifier, 2 * PASSES, setup.schedule.counting)
+    assert longer.sh_wait == PASSES
 
 
 def test_harmonics_of_a_backbone_without_any_wait_for_nothing():

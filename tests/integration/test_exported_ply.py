@@ -30,7 +30,7 @@ def exported(request, tmp_path_factory):
     choice = {"name": request.param, **NEEDED.get(("backbone", request.param), {})}
     setup = assemble(RunConfig.model_validate({"steps": 1000, "backbone": choice}), scene, "none")
     state = first_state(setup)
-    state.step = 3 * setup.schedule.sh_interval
+    state.step = max(3 * setup.schedule.sh_interval, setup.schedule.sh_wait)
     for _ in range(2):
         timed_step(setup, state)
     path = tmp_path_factory.mktemp(request.param) / "point_cloud.ply"

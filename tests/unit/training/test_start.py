@@ -21,7 +21,7 @@ def trained(tmp_path_factory):
     """A run of some steps with all SH bands, and the file that it wrote."""
     setup = assemble(RunConfig(steps=1000), sample_scene(), "none")
     state = first_state(setup)
-    state.step = 3 * setup.schedule.sh_interval
+    state.step = max(3 * setup.schedule.sh_interval, setup.schedule.sh_wait)
     for _ in range(3):
         timed_step(setup, state)
     path = tmp_path_factory.mktemp("start") / "point_cloud.ply"
