@@ -20,8 +20,8 @@ from crossgrad_core.contract.schedule import (
 from crossgrad_core.training.rates import in_a_hurry
 from crossgrad_core.training.setup import Setup
 
-#: Share of a short run in a hurry before harmonics above the first degree are drawn: they cost time,
-#: and are worth little until then. Measured by us (docs/schedules.md).
+#: Share of a short run in a hurry before harmonics above the first degree are drawn: until then
+#: they cost time and are worth little. Measured by us (docs/schedules.md).
 SH_AFTER: Final = 0.5
 
 #: Times of density control that the user may set.
