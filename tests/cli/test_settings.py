@@ -93,7 +93,12 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
     then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0}
     then |= {"beta1": 0.9, "beta2": 0.999}
-    then |= {"floaters": "keep", "position_steps": "extent", "resolution": {"name": "full"}}
+    then |= {
+        "floaters": "keep",
+        "position_steps": "extent",
+        "sh_after": 0.0,
+        "resolution": {"name": "full"},
+    }
     expected = {"seconds": 5.0, "seed": 1, **then}
     assert merged(path, options, assignments) == expected
     kept = merged(path, {"seed": 2}, [])
