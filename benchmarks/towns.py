@@ -344,6 +344,8 @@ def main() -> None:
     parser.add_argument("--street", type=int, default=64)
     parser.add_argument("--width", type=int, default=640, help="of photos, pixels")
     args = parser.parse_args()
+    if min(args.aerial, args.street) < 2 or args.width < 8:
+        parser.error("two photos of either kind or more, of 8 pixels or more across")
     rng = np.random.default_rng(args.seed)
     town = build(rng)
     views = [

@@ -86,7 +86,7 @@ class DistanceConditioned(Vanilla):
         weights = []
         for each in self._conditioned():
             base = plain[each.base]
-            rate = LearningRate(self.lr_share * base.lr.initial)
+            rate = LearningRate(self.lr_share * base.lr.initial, hurried=base.lr.hurried)
             weights.append(Block(each.weights, (each.weights,), True, base.kind, rate))
         scale = Block(SCALE, (SCALE,), False, "neutral", LearningRate(0.0))
         return (*plain.values(), *weights, scale)

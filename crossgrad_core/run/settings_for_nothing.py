@@ -18,6 +18,7 @@ from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
 from crossgrad_core.training.floaters import cameras_that_tell
 from crossgrad_core.training.rates import axes_of
+from crossgrad_core.training.schedules import MOST_DEGREES
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
 from crossgrad_core.wording import listed, plural
@@ -151,12 +152,18 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.fewest_edits and not setup.schedule.fewest_edits:
         why = "are published or have times that were set are not made to fit"
         yield "fewest_edits", f"edits that count steps, {why}"
+    yield from _of_harmonics(config, setup)
+
+
+def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if not any(block.rests for block in setup.trained_blocks):
         why = f"backbone {setup.selection.names['backbone']} trains no SH bands above the first"
         if (config.sh_every or 1) > 1:
             yield "sh_every", why
         if config.sh_after:
             yield "sh_after", why
+    elif config.sh_after and setup.schedule.sh_from >= MOST_DEGREES:
+        yield "sh_after", "all harmonics are drawn from the first step on (sh_from, --init)"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

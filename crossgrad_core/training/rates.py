@@ -162,7 +162,9 @@ def _rules(setup: Setup) -> Iterator[str]:
 def _own_rates(setup: Setup) -> str:
     """The blocks whose rates a hurried run multiplies beside all others."""
     own = [each for each in setup.trained_blocks if each.lr.hurried != 1.0]
-    return "".join(f"the rate of {each.name} times {each.lr.hurried:g} more, " for each in own)
+    return "".join(
+        f"{each.name} at {each.lr.hurried:g} times the rate of the rest, " for each in own
+    )
 
 
 def note_on_plan(setup: Setup) -> tuple[str, ...]:

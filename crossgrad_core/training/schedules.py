@@ -20,9 +20,11 @@ from crossgrad_core.contract.schedule import (
 from crossgrad_core.training.rates import in_a_hurry
 from crossgrad_core.training.setup import Setup
 
-#: Share of a short run in a hurry before harmonics above the first degree are drawn: until then
-#: they cost time and are worth little. Measured by us (docs/schedules.md).
+#: Share of a short run in a hurry before harmonics above degree 0 are drawn: until then they cost
+#: time and are worth little. Measured by us (docs/schedules.md).
 SH_AFTER: Final = 0.5
+#: The highest degree of harmonics.
+MOST_DEGREES: Final = 3
 
 #: Times of density control that the user may set.
 _EDITS = ("densify_from", "densify_until", "densify_every")
@@ -89,13 +91,14 @@ def schedule_of(
 
 
 def _before_harmonics(config: RunConfig, schedule: Schedule) -> int:
-    """The count before which harmonics above the first degree are not drawn."""
-    length = schedule.length
+    """The count before which harmonics above those of the first step are not drawn."""
+    # Another schedule than the run's own may be longer than the run.
+    length = min(schedule.length, schedule.counted(schedule.total))
     if config.sh_after is not None:
         return round(config.sh_after * length)
     ours = schedule.counting.unit == "views" and not schedule.published
     waits = ours and in_a_hurry(config, schedule, schedule.counting.photos)
-    return int(SH_AFTER * shortness(length) * length) if waits else 0
+    return int(SH_AFTER * shortness(schedule.length) * length) if waits else 0
 
 
 def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
@@ -112,12 +115,12 @@ def notes_on_length(setup: Setup) -> tuple[str, ...]:
 def _harmonics_note(setup: Setup) -> tuple[str, ...]:
     """Says that harmonics come late, where nobody asked for it."""
     schedule, banded = setup.schedule, any(block.rests for block in setup.trained_blocks)
-    usual = setup.config.sh_after is None and banded and not schedule.sh_from
+    usual = setup.config.sh_after is None and banded and schedule.sh_from < MOST_DEGREES
     if not usual or schedule.sh_wait <= schedule.sh_interval:
         return ()
     return (
-        f"harmonics above the first band are drawn after {schedule.sh_wait:,} views (--set "
-        "sh_after=0: band by band from the start, as published)",
+        f"harmonics above degree {schedule.sh_from} are drawn after {schedule.sh_wait:,} views "
+        "(--set sh_after=0: degree by degree from the start, as published)",
     )
 
 

@@ -111,7 +111,9 @@ PASSES = 360
         ({"steps": 2_000, "preset": "inria", "events": "views"}, 0),
         ({"steps": 2_000, "events": "steps"}, 0),
         ({"steps": 2_000, "schedule": "absolute"}, 0),
-        ({"steps": 9, "schedule": "absolute", "reference": 2_000, "views": 1}, 1_000),
+        ({"steps": 900, "schedule": "absolute", "reference": 2_000, "views": 1}, 450),
+        ({"steps": 2_000, "schedule": "absolute", "sh_after": 0.5}, 1_000),
+        ({"steps": 2_000, "sh_from": 1, "views": 1}, 1_000),
         ({"steps": 2_000, "sh_after": 0.0}, 0),
         ({"steps": 2_000, "views": 1, "sh_after": 0.3}, 600),
         ({"steps": 2_000, "preset": "inria", "sh_after": 0.3}, 600),
@@ -126,7 +128,8 @@ def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wa
     first = schedule.step_of(max(schedule.sh_wait, 3 * schedule.sh_interval))
     assert schedule.sh_degree(first) == 3
     if wait:
-        assert schedule.sh_degree(schedule.step_of(schedule.sh_wait) - 1) == 0
+        before = schedule.step_of(schedule.sh_wait) - 1
+        assert schedule.sh_degree(before) == settings.get("sh_from", 0)
     told = [note for note in setup.notes if "harmonics above" in note]
     assert len(told) == (wait > 0 and "sh_after" not in settings)
     assert all(f" after {schedule.sh_wait:,} views " in note for note in told)
@@ -142,11 +145,23 @@ def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
     assert longer.sh_wait == PASSES
 
 
-def test_harmonics_of_a_backbone_without_any_wait_for_nothing():
-    setup = assembled(backbone={"name": "scaffold"}, sh_after=0.5, steps=2_000)
+@pytest.mark.parametrize("settings", [{"backbone": {"name": "scaffold"}}, {"sh_from": 3}])
+def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
+    monkeypatch.setattr(rates, "HURRY", 10_000)
+    setup = assembled(sh_after=0.5, steps=2_000, **settings)
     with pytest.raises(UserError, match="sh_after"):
         refuse_settings_for_nothing(setup.config, setup)
-    assert not any("harmonics" in note for note in assembled(backbone={"name": "scaffold"}).notes)
+    assert not any("harmonics above" in n for n in assembled(steps=2_000, **settings).notes)
+    assert any("harmonics above" in note for note in assembled(steps=2_000).notes)
+
+
+def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
+    setup = assembled(backbone={"name": "distance"}, steps=5)
+    found = {name: rate for name, rate in rates_at(setup, 1).items() if "distance_" in name}
+    assert len(found) == 3
+    plain = rates_at(setup, 1)
+    for name, rate in found.items():
+        assert rate == pytest.approx(0.1 * plain[name.removeprefix("distance_")], rel=1e-9), name
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -173,7 +188,7 @@ def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, be
     assert len(told) == (beta2 == 0.98)
     assert all("fewer than 40 views " in note and " over 50 steps " in note for note in told)
     own = beta2 == 0.98 and "rate_factor" not in settings
-    assert all(("the rate of scales times 2 more" in note) == own for note in told)
+    assert all(("scales at 2 times the rate of the rest" in note) == own for note in told)
     plain = factor_of(setup.config, setup.schedule, 9) * 5e-3
     assert rates_at(setup, 1)["scales"] == pytest.approx((2.0 if own else 1.0) * plain, rel=1e-9)
 
@@ -262,8 +277,8 @@ def test_where_the_clock_decides_the_rates_follow_its_plan():
     assert note.endswith(" times (30,000 / steps)^0.45, at most 4.5")
     assert hurried == (
         "if these are fewer than 40 views of each training photo: (30,000 / steps)^0.65, at most "
-        "6.3, the rate of scales times 2 more, Adam's second moment averages over a 50th of the "
-        "steps, 50 at least"
+        "6.3, scales at 2 times the rate of the rest, Adam's second moment averages over a 50th of "
+        "the steps, 50 at least"
     )
     own = assembled(steps=None, seconds=60.0, rate_factor=2.0)
     (note,) = (note for note in own.notes if "second moment" in note)
