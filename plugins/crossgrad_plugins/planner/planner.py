@@ -7,13 +7,13 @@ from typing import Any, Final
 
 from crossgrad_core.commands import RunConfig, configured, layered
 from crossgrad_core.plugin import Json, Scene
-from crossgrad_plugins.planner import groups, looks, reading, sizes
+from crossgrad_plugins.planner import groups, looks, reading, sizes, turns
 from crossgrad_plugins.planner.decision import Decision, Settings
 from crossgrad_plugins.planner.evidence import Evidence
 
 #: What decides each part, in the order of the table.
 PARTS: Final[tuple[Callable[[Evidence], Decision], ...]] = (
-    *(groups.modes, groups.pairs, groups.views_per_step, groups.operator),
+    *(groups.modes, groups.pairs, turns.turns, groups.views_per_step, groups.operator),
     *(looks.exposure, looks.degree, looks.scale_filter),
     *(sizes.resolution, sizes.count, sizes.length, sizes.densifier, sizes.dropout),
     *(reading.start, reading.undistortion, reading.masks, reading.background),

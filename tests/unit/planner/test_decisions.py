@@ -52,7 +52,7 @@ TABLE = Path(__file__).with_name("cameras.csv")
 PAIRS_BY_HEIGHT = {"sampler": "near-far", "grouping": "altitude", "grouping.cut": "otsu"}
 LENGTHS = {"steps", "max_views", "seconds"}
 PARTS_OF_THE_TABLE = [
-    *("modes", "pairs of views", "views per step", "operator"),
+    *("modes", "pairs of views", "turns of views", "views per step", "operator"),
     *("exposure", "SH degree"),
     *("scale filter", "resolution", "primitives", "length", "densifier", "dropout"),
     *("start", "undistortion", "masks", "background"),

@@ -1,0 +1,91 @@
+"""How often far and near views come, where far cameras look down and near ones to the side."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from crossgrad_core.commands import ComponentChoice
+from crossgrad_core.plugin import Grouping, Json, Scene, build_component
+from crossgrad_plugins.groupings.split import FAR
+from crossgrad_plugins.planner.decision import Decision, given
+from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.groups import EVEN, pairs, settings_of
+
+#: Far views to a near one in the first part of a run; what that part is, sampler `horizon` knows.
+FAR_TO_NEAR: Final = 5
+#: Degrees from the far views' common direction: far ones that have one, near ones that look
+#: elsewhere.
+WITHIN, BEYOND = 45.0, 60.0
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Median angles to the mean direction in which far views look.
+
+    Attributes:
+        far: Of the far views themselves, degrees.
+        near: Of the near views, degrees.
+    """
+
+    far: float
+    near: float
+
+    @property
+    def differ(self) -> bool:
+        """Whether far views look one way, and near ones another one."""
+        return self.far <= WITHIN and self.near >= BEYOND
+
+
+def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
+    """Where the far and the near training views of a grouping look."""
+    made = build_component(Grouping, grouping.name, grouping.options)
+    labels = made.fit(scene, np.random.default_rng(0)).labels(scene.train_views)
+    far = np.array([label == FAR for label in labels])
+    axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views])
+    mean = axes[far].mean(axis=0)
+    cosines = axes @ (mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny))
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return Directions(float(np.median(angles[far])), float(np.median(angles[~far])))
+
+
+def turns(evidence: Evidence) -> Decision:
+    """Whether far views come more often than near ones at first."""
+    part, usual = "turns of views", evidence.config.sampler.name
+    if evidence.is_given("sampler", "grouping"):
+        return given(part, usual, "--sampler NAME")
+    rule = (
+        f"far : near = {FAR_TO_NEAR} : 1 at first where far views look in one direction (median "
+        f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more), drone and "
+        f"street, and {EVEN:.0%} of the views or more on each side"
+    )
+    source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
+    plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
+    if not evidence.modes.two:
+        return plain.found("no two modes", decided=evidence.modes.one)
+    return _turns_of_two_modes(evidence, plain)
+
+
+def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
+    """Whether far views come more often, by where both look."""
+    if "sampler" in pairs(evidence).settings:
+        return plain.found("a step has a near and a far view", decided=True)
+    if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
+        return plain.found("measured with our rules and single views only")
+    cut = evidence.modes.cut
+    if cut.share < EVEN:
+        return plain.found(f"the smaller mode has {cut.share:.0%} of the views")
+    found = directions(evidence.scene, cut.grouping)
+    figures = {"far_degrees": found.far, "near_degrees": found.near}
+    shown = (
+        f"from the mean direction of the far views these look {found.far:.0f} degrees away, near "
+        f"ones {found.near:.0f} (medians)"
+    )
+    made = plain.found(shown, decided=True, figures=figures)
+    if not found.differ:
+        return made
+    sampler: dict[str, Json] = {"sampler": "horizon", "sampler.coarse": [FAR_TO_NEAR, 1]}
+    choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views to a near one at first"
+    return made.changed(
+        choice, {**sampler, **settings_of(cut.grouping)}, f"--sampler {plain.choice}"
+    )

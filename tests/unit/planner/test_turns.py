@@ -1,0 +1,107 @@
+"""When the planner lets far views come more often: drone and street, not two flight levels."""
+
+import json
+
+import numpy as np
+import pytest
+
+from crossgrad_core.commands import ComponentChoice, configured
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.planner import plan_of
+from crossgrad_plugins.planner.turns import directions, turns
+
+RNG = np.random.default_rng(0)
+CLOUD = np.column_stack([RNG.uniform(0, 60, 400), RNG.uniform(0, 60, 400), RNG.uniform(0, 6, 400)])
+EVERY = range(len(CLOUD))
+#: How near photos look: along the street, and down from a lower flight level.
+AROUND = [(0.3, 1, 0), (0, 1, 0), (-0.3, 1, 0), (0, 1, 0.1)]
+DOWN = [(0.1, 0, -1), (0, 0.1, -1)]
+
+
+def scene_of(low, height=2.0):
+    """Twelve photos from 90 m down, twelve from `height` in the directions of `low`."""
+    far = [
+        posed_view(
+            (20 * (i % 4), 20 * (i // 4), 90.0), f"far{i}.png", forward=(0, 0.2, -1), seen=EVERY
+        )
+        for i in range(12)
+    ]
+    near = [
+        posed_view(
+            (20 * (i % 4), -20 - 2 * (i // 4), height),
+            f"near{i}.png",
+            forward=low[i % len(low)],
+            seen=EVERY,
+        )
+        for i in range(12)
+    ]
+    return posed_scene([*far, *near], CLOUD)
+
+
+def decision(scene, **given):
+    return turns(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
+
+
+def test_far_views_come_first_where_near_ones_look_around():
+    scene = scene_of(AROUND)
+    found = decision(scene)
+    assert found.basis == "decided"
+    assert found.settings["sampler"] == "horizon"
+    assert found.settings["sampler.coarse"] == [5, 1]
+    assert found.figures["far_degrees"] < 5 and found.figures["near_degrees"] > 70
+    assert found.force == "--sampler epoch"
+    json.dumps(found.as_data())
+
+
+def test_what_is_decided_is_a_run_that_draws_so():
+    scene = scene_of(AROUND)
+    plan = plan_of(configured({"scene": "x", "steps": 100}), scene)
+    run = assemble(configured(plan.applied_to({"scene": "x", "steps": 100})), scene, "colmap")
+    assert (run.sampler.coarse, run.sampler.fine) == ((5, 1), (1, 1))
+    assert run.sampler.default_views == 1
+
+
+@pytest.mark.parametrize("height", [20.0, 30.0])
+def test_two_flight_levels_come_alike(height):
+    found = decision(scene_of(DOWN, height))
+    assert not found.settings
+    assert found.choice == "epoch"
+    assert "degrees away" in found.evidence
+
+
+def test_one_mode_has_no_turns():
+    views = [posed_view((3 * i, 0, 90.0), f"{i}.png", forward=(0, 0.2, -1)) for i in range(24)]
+    found = decision(posed_scene(views, CLOUD))
+    assert (found.choice, dict(found.settings)) == ("epoch", {})
+
+
+@pytest.mark.parametrize("given", [{"sampler": "random"}, {"grouping": "radial"}])
+def test_what_the_user_set_wins(given):
+    given = {name: {"name": value} for name, value in given.items()}
+    assert decision(scene_of(AROUND), **given).basis == "given"
+
+
+@pytest.mark.parametrize(
+    "given", [{"operator": {"name": "pcgrad"}}, {"views_per_step": 2}, {"preset": "inria"}]
+)
+def test_what_was_not_measured_is_not_chosen(given):
+    found = decision(scene_of(AROUND), **given)
+    assert (found.basis, dict(found.settings)) == ("default", {})
+
+
+def test_few_far_views_do_not_come_again_and_again():
+    views = scene_of(AROUND).views
+    found = decision(posed_scene([*views[:6], *views[12:]], CLOUD))
+    assert not found.settings
+    assert found.evidence == "the smaller mode has 33% of the views"
+
+
+def test_far_views_that_look_everywhere_have_no_direction():
+    low = scene_of(AROUND).views[12:]
+    ring = [(np.cos(angle), np.sin(angle), 0) for angle in np.linspace(0, 2 * np.pi, 12, False)]
+    high = [posed_view((0, 0, 90.0), f"{i}.png", forward=f) for i, f in enumerate(ring)]
+    found = directions(posed_scene([*high, *low], CLOUD), ComponentChoice(name="altitude"))
+    assert found.far > 45.0
+    assert not found.differ
