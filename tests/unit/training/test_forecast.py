@@ -16,7 +16,16 @@ from crossgrad_core.training.expected_cost import COST_PER_EDIT, COUNTED_EDITS
 
 RUN = make_dataclass(
     "Run",
-    ["config", "densifier", "selection", "schedule", "hook", "notes", "pixel_share"],
+    [
+        "config",
+        "densifier",
+        "selection",
+        "schedule",
+        "hook",
+        "notes",
+        "pixel_share",
+        "trained_blocks",
+    ],
     frozen=True,
 )
 
@@ -38,6 +47,7 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
         hook=hook,
         notes=(),
         pixel_share=0.6,
+        trained_blocks=(),
     )
     length = Forecast(Planned(revisions))
     state = SimpleNamespace(

@@ -18,10 +18,18 @@ from crossgrad_core.training.start import first_state
 STEPS, RUNS = 30, 24
 TIMES = {"events": "steps", "densify_from": 10, "densify_every": 10, "densify_until": 25}
 #: How a run steps -> how far apart in PSNR perturbed runs may end. A step by size is up to five
-#: times as long, and so is a difference of the last bit; a first moment of few steps averages less.
+#: times as long, and so is a difference of the last bit, one of sizes in a hurry twice; a first
+#: moment of few steps averages less.
 WAYS = {"extent": 0.01, "size": 0.03, "as by default": 0.05}
 SETTINGS = {
-    **{way: {"position_steps": way, "beta1": 0.9} for way in ("extent", "size")},
+    **{
+        way: {
+            "position_steps": way,
+            "beta1": 0.9,
+            "backbone": {"name": "vanilla", "lr_scales": 0.0025},
+        }
+        for way in ("extent", "size")
+    },
     "as by default": {},
 }
 OFFSETS = [(1e6, 1e6, 1e6), (4e5, 5.6e6, 120.0), (0.0, 0.0, -1e6)]
