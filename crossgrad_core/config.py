@@ -196,6 +196,12 @@ class RunConfig(BaseModel):
     sh_after: float | None = Field(
         None, ge=0, le=1, description="share of the run before the SH degree grows"
     )
+    size_bound: float | None = Field(
+        None,
+        ge=0,
+        description="most that a standard deviation may be of the distance to the nearest training "
+        "camera that has a Gaussian at its side; 0 for no bound",
+    )
     sh_every: int | None = Field(
         None, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
     )
@@ -241,10 +247,11 @@ class RunConfig(BaseModel):
         description="Training rules: fast, what was measured to be best at equal time, or inria "
         "(order of a step, 3-sigma footprint and near plane of the original code). Default: fast.",
     )
-    plan: Annotated[Literal["auto", "off"], Flag("auto|off", CONFIGURATION)] = Field(
-        "off",
+    plan: Annotated[Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION)] = Field(
+        "turns",
         description="auto: what the scene does not need is left out, on evidence that is shown; "
-        "what is set here wins. Default: off.",
+        "turns: far views come first where drone and street meet, and nothing else is decided. "
+        "What is set here wins. Default: turns.",
     )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",

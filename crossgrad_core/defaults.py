@@ -32,7 +32,7 @@ READER: Final = "colmap"
 PREPARING_READER: Final = "photos-alone"
 #: The operator that runs the links of `--operator a+b`.
 CHAIN: Final = "chain"
-#: The planner of `--plan auto`.
+#: The planner of `--plan`.
 PLANNER: Final = "scene"
 #: The observer that every run has.
 PROGRESS: Final = "progress"

@@ -28,7 +28,7 @@ LISTS: Final = ("metrics", "observers")
 COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
-#: What decides settings of a run by its scene (`--plan auto`); no slot of a run either.
+#: What decides settings of a run by its scene (`--plan`); no slot of a run either.
 PLANNERS: Final = "planners"
 #: The core's own commands, which no plugin replaces.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")

@@ -60,6 +60,7 @@ from crossgrad_core.training.start import first_state, initial_bytes, told_of_st
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.training.veils import note_on_sizes
 from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
@@ -253,7 +254,14 @@ def _within(setup: Setup, seconds: float) -> Setup:
     schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
     idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
-    told = (note, *note_on_plan(setup), *note_on_axes(setup), *notes_on_length(setup), *idle)
+    told = (
+        note,
+        *note_on_plan(setup),
+        *note_on_axes(setup),
+        *note_on_sizes(setup),
+        *notes_on_length(setup),
+        *idle,
+    )
     return replace(setup, notes=(*setup.notes, *told))
 
 

@@ -34,6 +34,7 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import notes_on as at_the_end
+from crossgrad_core.training.veils import note_on_sizes
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
 _LOG = logging.getLogger(__name__)
@@ -100,7 +101,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         UserError: A name or option is wrong, or the components cannot work together.
     """
     plan = None
-    if config.plan == AUTO:
+    if config.plan != "off":
         config, plan = planned(config, scene)
         scene = replace(scene, notes=(*scene.notes, *notes_of(plan)))
     config = _with_first_degree(config)
@@ -135,7 +136,11 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         plan=plan,
     )
     # The length of a run within a budget is not known yet.
-    timed = (*note_on_axes(setup), *notes_on_length(setup)) if config.seconds is None else ()
+    timed = (
+        (*note_on_axes(setup), *note_on_sizes(setup), *notes_on_length(setup))
+        if config.seconds is None
+        else ()
+    )
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [each.name for each in config.operators]
     added = (

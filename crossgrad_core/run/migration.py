@@ -62,6 +62,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest.setdefault("beta2", 0.999)
         rest.setdefault("position_steps", "extent")
         rest.setdefault("sh_after", 0.0)
+        rest.setdefault("size_bound", 0.0)
         rest.setdefault("final_decay", 0.0)
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)

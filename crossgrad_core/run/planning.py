@@ -1,14 +1,14 @@
-"""`--plan auto`: a planner decides settings by the scene, before a run is assembled."""
+"""`--plan`: a planner decides settings by the scene, before a run is assembled."""
 
 import logging
 from collections.abc import Callable, Mapping
 from typing import TypeAlias, cast
 
-from crossgrad_core.config import RunConfig
+from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.state import Json
 from crossgrad_core.defaults import PLANNER
-from crossgrad_core.registry.entries import find, resolve_entry
+from crossgrad_core.registry.entries import find, offers, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS
 
 _LOG = logging.getLogger(__name__)
@@ -16,25 +16,33 @@ _LOG = logging.getLogger(__name__)
 #: `decisions`, whatever else it says of each.
 Plan: TypeAlias = Mapping[str, Json]
 #: A planner: the configuration, in which only what the user set is set, and the scene -> the
-#: configuration with its decisions, and the plan.
+#: configuration with its decisions, and the plan. `plan` of the configuration says what it may
+#: decide: `auto` all, `turns` how often far and near views come.
 Planner: TypeAlias = Callable[[RunConfig, Scene], tuple[RunConfig, Plan]]
 
 
-def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan]:
+def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan | None]:
     """The configuration with what the planner decided, which repeats the run without it.
+
+    There is no plan where nothing was asked for and nothing is decided.
 
     Raises:
         UserError: There is no planner, it cannot be imported, or a photo cannot be decoded.
     """
-    _LOG.info("looking at what the scene needs")
+    asked = config.plan == AUTO
+    if asked:
+        _LOG.info("looking at what the scene needs")
+    elif PLANNER not in {entry.name for entry in offers(PLANNERS)}:
+        return config.model_copy(update={"plan": "off"}), None
     planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
     decided, plan = planner(config, scene)
-    return decided.model_copy(update={"plan": "off"}), plan
+    changed = asked or decided is not config
+    return decided.model_copy(update={"plan": "off"}), plan if changed else None
 
 
-def notes_of(plan: Plan) -> tuple[str, ...]:
+def notes_of(plan: Plan | None) -> tuple[str, ...]:
     """What the user should know of a plan."""
-    notes = plan.get("notes")
+    notes = (plan or {}).get("notes")
     return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
 

@@ -21,6 +21,7 @@ from crossgrad_core.training.rates import axes_of
 from crossgrad_core.training.schedules import MOST_DEGREES
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
+from crossgrad_core.training.veils import bounds_sizes
 from crossgrad_core.wording import listed, plural
 
 _SLOTS = ("grouping", *ALWAYS)
@@ -61,6 +62,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_exposure(config, setup),
         *_of_the_split(config),
         *_of_positions(config, setup),
+        *_of_sizes(config, setup),
         *_of_the_start(config),
         *_of_the_end(config, setup),
     ]
@@ -231,6 +233,12 @@ def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.position_steps == "size" and axes_of(setup) is None:
         name = setup.selection.names["backbone"]
         yield "position_steps", f"primitives of backbone {name} are no Gaussians with axes"
+
+
+def _of_sizes(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.size_bound and not bounds_sizes(setup):
+        name = setup.selection.names["backbone"]
+        yield "size_bound", f"backbone {name} has no Gaussians with axes that learn"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

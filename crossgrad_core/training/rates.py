@@ -197,19 +197,34 @@ def _hurry_note(setup: Setup) -> str:
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
     """Tensors of positions, scales and rotations, where positions step along axes; else None.
 
-    Runs as long as the published ones have the published steps. Before the length of a run within
-    a budget is planned it counts as short: its kernels are then there, whatever is planned.
+    Runs as long as the published ones have the published steps.
     """
-    config, schedule, backbone = setup.config, setup.schedule, setup.backbone
-    waits = config.seconds is not None and config.steps is None and schedule.mode == "scaled"
-    short = waits or _planned(config, schedule) < REFERENCE
-    by_size = short and config.preset != "inria"
+    config = setup.config
+    by_size = is_short(config, setup.schedule)
     if config.position_steps is not None:
         by_size = config.position_steps == "size"
-    names = backbone.positions, *backbone.axes
-    # Rows of what may be stepped by rows are not all up to date.
-    late = not set(backbone.passed_on.values()).isdisjoint(names)
-    return names if by_size and all(names) and len(names) == len(_AXES) and not late else None
+    return gaussians_of(setup) if by_size else None
+
+
+def is_short(config: RunConfig, schedule: Schedule) -> bool:
+    """Whether a run is shorter than published ones, and has not their rules.
+
+    Before the length of a run within a budget is planned it counts as short: its kernels are then
+    there, whatever is planned.
+    """
+    waits = config.seconds is not None and config.steps is None and schedule.mode == "scaled"
+    short = waits or _planned(config, schedule) < REFERENCE
+    return short and config.preset != "inria"
+
+
+def gaussians_of(setup: Setup) -> tuple[str, str, str] | None:
+    """Tensors of positions, scales and rotations; None where primitives are no Gaussians of those.
+
+    And where rows of these are not all up to date, as they may be stepped by rows.
+    """
+    names = setup.backbone.positions, *setup.backbone.axes
+    late = not set(setup.backbone.passed_on.values()).isdisjoint(names)
+    return names if all(names) and len(names) == len(_AXES) and not late else None
 
 
 def check_axes(setup: Setup, parameters: Parameters) -> None:
@@ -218,17 +233,17 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
     Raises:
         UserError: It names the backbone.
     """
-    if (names := axes_of(setup)) is None:
+    if (names := gaussians_of(setup)) is None:
         return
     rows = len(parameters[names[0]]) if names[0] in parameters else 0
     found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
     if found != [(rows, columns) for columns in _AXES]:
         raise UserError(
-            "positions cannot step along the axes that the backbone names",
+            "the axes that the backbone names are none of Gaussians",
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),
-            todo="repair the plugin (docs/write-a-backbone.md), or --position-steps extent",
+            todo="repair the plugin (docs/write-a-backbone.md)",
         )
 
 

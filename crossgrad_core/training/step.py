@@ -45,6 +45,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.steady import follow, restart
 from crossgrad_core.training.targets import context_fields
+from crossgrad_core.training.veils import bound_sizes
 from crossgrad_core.training.views import Rendered, render_views, scales_of
 from crossgrad_core.wording import listed
 
@@ -245,6 +246,7 @@ def _optimize(
     whole = {name: dense(g) for name, g in found.items() if name not in by_rows}
     state.settle(name for name, g in whole.items() if g is not None)
     _take_adam_step(setup, state, whole, rates, rule, scale)
+    bound_sizes(setup, state)
     for name, gradient in by_rows.items():
         param, to_sum = state.tensors[name], scale.to_sum[name]
         step = one_more(name, param, state.moments, rates[name], rule, to_sum)

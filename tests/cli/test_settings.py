@@ -97,6 +97,7 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
         "floaters": "keep",
         "position_steps": "extent",
         "sh_after": 0.0,
+        "size_bound": 0.0,
         "resolution": {"name": "full"},
     }
     expected = {"seconds": 5.0, "seed": 1, **then}

@@ -212,7 +212,7 @@ def test_bands_that_are_left_out_are_not_allocated(scene, tmp_path, monkeypatch)
 
 
 def test_without_a_plan_the_planner_is_not_imported(scene, tmp_path):
-    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--dry-run"]
+    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--plan", "off", "--dry-run"]
     done = subprocess.run(
         list(map(str, arguments)), capture_output=True, text=True, check=True, cwd=tmp_path
     )

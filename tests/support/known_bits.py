@@ -43,6 +43,7 @@ USUAL: Mapping[str, Any] = {
     "beta2": 0.999,
     "floaters": "keep",
     "position_steps": "extent",
+    "size_bound": 0.0,
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from crossgrad_core.commands import RunConfig, configured, layered
 from crossgrad_core.plugin import Json, Scene
@@ -11,8 +11,9 @@ from crossgrad_plugins.planner import groups, looks, reading, sizes, turns
 from crossgrad_plugins.planner.decision import Decision, Settings
 from crossgrad_plugins.planner.evidence import Evidence
 
+Parts: TypeAlias = tuple[Callable[[Evidence], Decision], ...]
 #: What decides each part, in the order of the table.
-PARTS: Final[tuple[Callable[[Evidence], Decision], ...]] = (
+PARTS: Final[Parts] = (
     *(groups.modes, groups.pairs, turns.turns, groups.views_per_step, groups.operator),
     *(looks.exposure, looks.degree, looks.scale_filter),
     *(sizes.resolution, sizes.count, sizes.length, sizes.densifier, sizes.dropout),
@@ -66,30 +67,33 @@ class Plan:
         }
 
 
-def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None) -> Plan:
+def plan_of(
+    config: RunConfig, scene: Scene, probe_seconds: float | None = None, parts: Parts = PARTS
+) -> Plan:
     """What the scene calls for; what the user set stays as it is.
 
     Args:
         config: The configuration, in which only what the user set is set.
         scene: Its scene.
         probe_seconds: Training seconds of a probe; None for none.
+        parts: What is decided.
 
     Raises:
         UserError: A photo cannot be decoded.
     """
     begun = perf_counter()
     evidence = Evidence(config, scene, probe_seconds)
-    decisions = tuple(_timed(part, evidence) for part in PARTS)
+    decisions = tuple(_timed(part, evidence) for part in parts)
     return Plan(scene.name, decisions, perf_counter() - begun)
 
 
 def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Mapping[str, Json]]:
-    """What `--plan auto` makes of a run: its configuration with the decisions, and the plan.
+    """What `--plan` makes of a run: its configuration with the decisions, and the plan.
 
     Raises:
         UserError: A photo cannot be decoded.
     """
-    plan = plan_of(config, scene)
+    plan = plan_of(config, scene, parts=PARTS if config.plan == "auto" else (turns.turns,))
     if not plan.settings:
         return config, plan.as_data()
     return configured(plan.applied_to(config.model_dump(exclude_unset=True))), plan.as_data()

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from crossgrad_core.commands import ComponentChoice
-from crossgrad_core.plugin import Grouping, Json, Scene, build_component
+from crossgrad_core.plugin import REFERENCE, Grouping, Json, Scene, build_component
 from crossgrad_plugins.groupings.split import FAR
 from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
@@ -57,7 +57,8 @@ def turns(evidence: Evidence) -> Decision:
     rule = (
         f"far : near = {FAR_TO_NEAR} : 1 at first where far views look in one direction (median "
         f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more), drone and "
-        f"street, and {EVEN:.0%} of the views or more on each side"
+        f"street, and {EVEN:.0%} of the views or more on each side; in runs of fewer than "
+        f"{REFERENCE:,} views"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
     plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
@@ -72,6 +73,8 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
         return plain.found("a step has a near and a far view", decided=True)
     if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
         return plain.found("measured with our rules and single views only")
+    if not _is_short(evidence):
+        return plain.found("measured in shorter runs only")
     cut = evidence.modes.cut
     if cut.share < EVEN:
         return plain.found(f"the smaller mode has {cut.share:.0%} of the views")
@@ -89,3 +92,14 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     return made.changed(
         choice, {**sampler, **settings_of(cut.grouping)}, f"--sampler {plain.choice}"
     )
+
+
+def _is_short(evidence: Evidence) -> bool:
+    """Whether the run is shorter than published ones, as far as that is known."""
+    config, length = evidence.config, evidence.config.max_views or evidence.config.steps
+    if config.schedule == "absolute":
+        return False
+    if length is None:
+        # A plan of all parts ends a run that names no length after some passes over the photos.
+        return config.seconds is not None or config.plan == "auto"
+    return length < REFERENCE

@@ -77,7 +77,7 @@ PAIRS_PAY = Probe(rho=0.5, rho_low=0.2, rho_high=0.9, conflict=0.7, conflict_low
 
 
 def config_of(**given):
-    return configured({"scene": "nowhere", **given})
+    return configured({"scene": "nowhere", "plan": "auto", **given})
 
 
 def evidence_of(name, probe=None, **given):
@@ -128,7 +128,7 @@ def test_exposure_as_measured(name, monkeypatch):
 def test_the_scenes_themselves(name):
     if not (SCENES / name).is_dir():
         pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
-    config = configured({"scene": str(SCENES / name)})
+    config = configured({"scene": str(SCENES / name), "plan": "auto"})
     plan = plan_of(config, read_scene(config)[0])
     choice, separability, ratio, spread, *_, exposure = MEASURED[name]
     figures = plan.of_part("modes").figures
@@ -143,7 +143,8 @@ def test_the_scenes_themselves(name):
 
 @pytest.fixture(scope="module")
 def bundled():
-    settings = {"scene": str(bundled_scene()), "reading": {"max_size": 100}, "steps": 3_000}
+    reading = {"max_size": 100}
+    settings = {"scene": str(bundled_scene()), "reading": reading, "steps": 3_000, "plan": "auto"}
     config = configured(settings)
     return config, read_scene(config)[0]
 
@@ -593,7 +594,7 @@ def test_no_scene_breaks_the_planner(centers, points, asked, notes):
         for i, center in enumerate(centers)
     ]
     scene = replace(posed_scene(views, points), notes=tuple(notes))
-    config = configured(layered([{"scene": "nowhere", **asked}]))
+    config = configured(layered([{"scene": "nowhere", "plan": "auto", **asked}]))
     decided, plan = planned(config, scene)
     json.dumps(plan, allow_nan=False)
     assert len(plan["decisions"]) == len(PARTS)

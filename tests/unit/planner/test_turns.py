@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.commands import ComponentChoice, configured
+from crossgrad_core.run import planning
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
@@ -61,6 +62,46 @@ def test_what_is_decided_is_a_run_that_draws_so():
     run = assemble(configured(plan.applied_to({"scene": "x", "steps": 100})), scene, "colmap")
     assert (run.sampler.coarse, run.sampler.fine) == ((5, 1), (1, 1))
     assert run.sampler.default_views == 1
+
+
+@pytest.mark.parametrize(
+    "length", [{"steps": 100}, {"seconds": 5.0}, {"max_views": 100}, {"steps": 29_999}], ids=str
+)
+def test_a_short_run_without_a_plan_draws_so(length):
+    run = assemble(configured({"scene": "x", **length}), scene_of(AROUND), "colmap")
+    assert run.selection.names["sampler"] == "horizon"
+    assert run.selection.names["grouping"] == run.config.grouping.name
+    assert (run.sampler.coarse, run.config.plan) == ((5, 1), "off")
+    assert [each["part"] for each in run.plan["decisions"]] == ["turns of views"]
+    assert any("--sampler epoch overrules it" in note for note in run.notes)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"steps": 100, "plan": "off"},
+        {"steps": 100, "sampler": {"name": "epoch"}},
+        {"steps": 100, "schedule": "absolute"},
+        {"steps": 30_000},
+        {},
+    ],
+    ids=str,
+)
+def test_other_runs_without_a_plan_draw_epochs(given):
+    run = assemble(configured({"scene": "x", **given}), scene_of(AROUND), "colmap")
+    assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
+    assert not [note for note in run.notes if note.startswith("plan:")]
+
+
+def test_other_scenes_draw_epochs_without_a_plan():
+    run = assemble(configured({"scene": "x", "steps": 100}), scene_of(DOWN, 20.0), "colmap")
+    assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
+
+
+def test_without_a_planner_runs_draw_epochs(monkeypatch):
+    monkeypatch.setattr(planning, "offers", lambda _slot: ())
+    run = assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
+    assert (run.selection.names["sampler"], run.config.plan) == ("epoch", "off")
 
 
 @pytest.mark.parametrize("height", [20.0, 30.0])

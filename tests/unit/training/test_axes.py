@@ -183,7 +183,7 @@ def test_a_class_that_inherits_has_no_axes_unless_it_says_so():
     assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
     assert axes_of(with_backbone(Round())) is None
     first_state(with_backbone(Round()))
-    with pytest.raises(UserError, match="cannot step along the axes") as caught:
+    with pytest.raises(UserError, match="are none of Gaussians") as caught:
         first_state(with_backbone(RoundWithAxes()))
     assert "(40, 1)" in caught.value.found
 
