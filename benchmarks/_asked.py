@@ -16,8 +16,8 @@ from crossgrad_plugins.sweep.summary import earlier_rows
 
 #: What a run decides at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
-#: Paths, which a grid may name from its own folder.
-_PATHS: Final = ("exposure_from", "reading.init")
+#: Paths, which a grid may name from its own folder, and what a run replaces by its decisions.
+_OTHERWISE: Final = ("exposure_from", "reading.init", "plan")
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Asked:
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
             for name, asked in self.settings.items()
-            if name not in _PATHS
+            if name not in _OTHERWISE
         )
 
     def _fits_length(self, run: Run) -> bool:

@@ -37,7 +37,8 @@ class Backbone(Component):
             (floaters). Where it is empty, only edits move or remove rows.
         axes: Tensors [N, 3] of the logarithms of standard deviations and [N, 4] of rotations (wxyz,
             of any length) of Gaussians that primitives are, each about its position, which may then
-            step along these axes. Empty where primitives are none. Of the very class, too.
+            step along these axes, and whose deviations may be bounded. Empty where primitives are
+            none. Of the very class, too.
     """
 
     slot: ClassVar[str] = "backbones"

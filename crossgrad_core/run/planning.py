@@ -4,12 +4,13 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import TypeAlias, cast
 
-from crossgrad_core.config import AUTO, RunConfig
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.state import Json
 from crossgrad_core.defaults import PLANNER
-from crossgrad_core.registry.entries import find, offers, resolve_entry
+from crossgrad_core.registry.entries import find, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS
+from crossgrad_core.wording import in_one_line
 
 _LOG = logging.getLogger(__name__)
 #: What a planner decided, as plain data: `seconds` that it took, `notes` for the user, and
@@ -24,20 +25,29 @@ Planner: TypeAlias = Callable[[RunConfig, Scene], tuple[RunConfig, Plan]]
 def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan | None]:
     """The configuration with what the planner decided, which repeats the run without it.
 
-    There is no plan where nothing was asked for and nothing is decided.
+    There is no plan where nothing was asked for and nothing is decided, or nothing can decide it.
 
     Raises:
-        UserError: There is no planner, it cannot be imported, or a photo cannot be decoded.
+        UserError: One was asked for, and there is no planner, it cannot be imported, or a photo
+            cannot be decoded.
     """
-    asked = config.plan == AUTO
-    if asked:
+    if "plan" in config.model_fields_set:
         _LOG.info("looking at what the scene needs")
-    elif PLANNER not in {entry.name for entry in offers(PLANNERS)}:
-        return config.model_copy(update={"plan": "off"}), None
-    planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
-    decided, plan = planner(config, scene)
-    changed = asked or decided is not config
-    return decided.model_copy(update={"plan": "off"}), plan if changed else None
+        decided, plan = _answer(config, scene)
+    else:
+        try:
+            decided, plan = _answer(config, scene)
+        except Exception as error:  # Who asked for nothing is not to be stopped by it.
+            why = getattr(error, "what", in_one_line(error))
+            _LOG.warning("nothing is planned: %s", why)
+            decided, plan = config, None
+        if decided is config:
+            plan = None
+    return decided.model_copy(update={"plan": "off"}), plan
+
+
+def _answer(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan]:
+    return cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))(config, scene)
 
 
 def notes_of(plan: Plan | None) -> tuple[str, ...]:

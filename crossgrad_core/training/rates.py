@@ -228,12 +228,14 @@ def gaussians_of(setup: Setup) -> tuple[str, str, str] | None:
 
 
 def check_axes(setup: Setup, parameters: Parameters) -> None:
-    """Refuses tensors of other shapes than those that `Backbone.axes` promises.
+    """Refuses tensors of other shapes than those that `Backbone.axes` promises, where they count.
 
     Raises:
         UserError: It names the backbone.
     """
-    if (names := gaussians_of(setup)) is None:
+    config = setup.config
+    used = axes_of(setup) or (is_short(config, setup.schedule) and config.size_bound is None)
+    if (names := gaussians_of(setup)) is None or not (used or config.size_bound):
         return
     rows = len(parameters[names[0]]) if names[0] in parameters else 0
     found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
@@ -243,7 +245,8 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),
-            todo="repair the plugin (docs/write-a-backbone.md)",
+            todo="repair the plugin (docs/write-a-backbone.md), or --position-steps extent --set "
+            "size_bound=0",
         )
 
 

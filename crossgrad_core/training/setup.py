@@ -42,7 +42,7 @@ class Setup:
         notes: What was chosen or left out, and why.
         scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
         photos_ahead: The threads that decode photos beside the steps.
-        plan: What a planner decided and why, as plain data; None where none was asked.
+        plan: What a planner decided and why, as plain data; None where nothing was.
         pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
 

@@ -7,6 +7,7 @@ ours.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from math import log
 from typing import Final
 
@@ -22,10 +23,10 @@ from crossgrad_core.training.state import TrainState
 BOUND: Final = 0.5
 #: Sizes are looked at once in so many steps.
 EVERY: Final = 50
-#: Scene extents. Hardly a smaller Gaussian is above the bound, and most Gaussians are smaller.
+#: Scene extents. Smaller Gaussians stay, which most are, and hardly one of them is above the bound.
 LEAST: Final = 0.01
 #: Distances that are worked out at once.
-_AT_ONCE: Final = 2**22
+_AT_ONCE: Final = 2**20
 
 
 def size_bound_of(setup: Setup) -> float:
@@ -64,46 +65,71 @@ def bound_sizes(setup: Setup, state: TrainState) -> None:
     if state.step % EVERY or names is None or not (bound := size_bound_of(setup)):
         return
     positions, scales, _ = (state.tensors[each].detach() for each in names)
-    largest = scales.amax(dim=1)
+    largest, cameras = scales.amax(dim=1), _Cameras.of(setup.scene, positions)
     rows = (largest > log(LEAST)).nonzero().squeeze(1)
-    # Most Gaussians are small for their distance to whatever camera.
-    for shown_counts in (True, False):
-        distances = _nearest(setup.scene, positions[rows], shown_counts=shown_counts)
-        most = torch.log(bound * distances)
-        above = largest[rows] > most
-        rows, most = rows[above], most[above]
-    scales[rows] = torch.minimum(scales[rows], most[:, None])
+    rows = rows[cameras.may_be_near(positions[rows], torch.exp(largest[rows]) / bound)]
+    most = torch.log(bound * cameras.nearest_beside(positions[rows])).clamp_min(log(LEAST))
+    # What has diverged is for the checks to find.
+    above = (largest[rows] > most) & largest[rows].isfinite()
+    rows, most = rows[above], most[above]
+    scales[rows] = torch.minimum(scales[rows], most[:, None].to(scales))
 
 
-def _nearest(scene: Scene, positions: Tensor, *, shown_counts: bool) -> Tensor:
-    """[N] distance of each position to the nearest training camera; never 0.
+@dataclass(frozen=True)
+class _Cameras:
+    """The V training cameras as tensors.
 
-    Args:
-        scene: The scene.
-        positions: [N, 3], local frame.
-        shown_counts: Whether cameras count in whose photo the position lies. Where these are all
-            cameras, and do not count, the distance is infinite.
+    Attributes:
+        centers: [V, 3], local frame.
+        poses: [V, 3, 4], world to camera.
+        inner: [V, 6] focal lengths, principal point and size, pixels.
     """
-    centers = torch.from_numpy(scene.centers).to(positions)
-    found = [positions.new_zeros(0)]
-    for some in torch.split(positions, max(1, _AT_ONCE // len(centers))):
-        # Without products, which lose what is small of two large positions.
-        apart = torch.cdist(some, centers, compute_mode="donot_use_mm_for_euclid_dist")
-        if not shown_counts:
-            apart[_shown(scene, some)] = torch.inf
-        found.append(apart.amin(dim=1))
-    # Nearer than that the positions themselves are rounded.
-    return torch.cat(found).clamp_min(torch.finfo(positions.dtype).eps)
 
+    centers: Tensor
+    poses: Tensor
+    inner: Tensor
 
-def _shown(scene: Scene, positions: Tensor) -> Tensor:
-    """[N, V] bool, whether each position [N, 3] lies in each training photo."""
-    cameras = [view.camera for view in scene.train_views]
-    poses = torch.stack([each.world_to_camera for each in cameras]).to(positions)
-    inner = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for each in cameras]
-    fx, fy, cx, cy, width, height = positions.new_tensor(inner).unbind(1)
-    local = torch.einsum("vij,nj->nvi", poses[:, :3, :3], positions) + poses[:, :3, 3]
-    x, y, depth = local.unbind(2)
-    across, down = fx * x + cx * depth, fy * y + cy * depth
-    within = (across >= 0) & (across <= width * depth) & (down >= 0) & (down <= height * depth)
-    return within & (depth > 0)
+    @classmethod
+    def of(cls, scene: Scene, like: Tensor) -> "_Cameras":
+        """Those of a scene, of the type and on the device of a tensor."""
+        cameras = [view.camera for view in scene.train_views]
+        inner = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for each in cameras]
+        return cls(
+            torch.from_numpy(scene.centers).to(like),
+            torch.stack([each.world_to_camera[:3] for each in cameras]).to(like),
+            like.new_tensor(inner),
+        )
+
+    def may_be_near(self, positions: Tensor, distances: Tensor) -> Tensor:
+        """[N] bool: all positions [N, 3] that are nearer to any camera, and few others.
+
+        Products tell that fastest. They lose what is small of two large positions, so that as much
+        is taken off.
+        """
+        squares, of_centers = (each.square().sum(dim=1) for each in (positions, self.centers))
+        nearest = [
+            torch.addmm(of_centers, some, self.centers.T, alpha=-2.0).amin(dim=1)
+            for some in torch.split(positions, max(1, _AT_ONCE // len(self.centers)))
+        ]
+        lost = 16.0 * torch.finfo(positions.dtype).eps * (squares + of_centers.amax())
+        return distances.square() > squares + torch.cat(nearest) - lost
+
+    def nearest_beside(self, positions: Tensor) -> Tensor:
+        """[N] distance to the nearest camera that has a position [N, 3] at its side, or behind it.
+
+        Infinite for what all photos show.
+        """
+        found = [positions.new_zeros(0)]
+        for some in torch.split(positions, max(1, _AT_ONCE // (8 * len(self.centers)))):
+            apart = torch.cdist(some, self.centers, compute_mode="donot_use_mm_for_euclid_dist")
+            found.append(apart.masked_fill(self._show(some), torch.inf).amin(dim=1))
+        return torch.cat(found)
+
+    def _show(self, positions: Tensor) -> Tensor:
+        """[N, V] bool, whether each position [N, 3] lies in each photo."""
+        fx, fy, cx, cy, width, height = self.inner.unbind(1)
+        turned = torch.einsum("vij,nj->nvi", self.poses[:, :, :3], positions)
+        x, y, depth = (turned + self.poses[:, :, 3]).unbind(2)
+        across, down = fx * x + cx * depth, fy * y + cy * depth
+        within = (across >= 0) & (across <= width * depth) & (down >= 0) & (down <= height * depth)
+        return within & (depth > 0)

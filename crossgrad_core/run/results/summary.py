@@ -42,7 +42,7 @@ class Summary:
         environment: Machine and versions.
         ply: What is in the PLY; None where none was written.
         notes: What was chosen or left out, and why.
-        plan: What a planner decided and on what evidence; None where none was asked.
+        plan: What a planner decided and on what evidence; None where nothing was.
         error: Why the run failed; None otherwise.
     """
 

@@ -88,10 +88,15 @@ def count(evidence: Evidence) -> Decision:
     )
 
 
+def most_views(evidence: Evidence) -> int:
+    """After how many views more of them stop to pay."""
+    return max(FEWEST_VIEWS, PASSES * len(evidence.scene.train_views))
+
+
 def length(evidence: Evidence) -> Decision:
     """How long the run is."""
     part, config, photos = "length", evidence.config, len(evidence.scene.train_views)
-    most, seconds = max(FEWEST_VIEWS, PASSES * photos), config.seconds
+    most, seconds = most_views(evidence), config.seconds
     within = "" if seconds is None else f" within {seconds:g} s"
     asked = f"{DEFAULT_STEPS:,} steps" if seconds is None else f"{seconds:g} s"
     if config.steps is not None:

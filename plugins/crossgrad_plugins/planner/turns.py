@@ -11,6 +11,7 @@ from crossgrad_plugins.groupings.split import FAR
 from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.groups import EVEN, pairs, settings_of
+from crossgrad_plugins.planner.sizes import most_views
 
 #: Far views to a near one in the first part of a run; what that part is, sampler `horizon` knows.
 FAR_TO_NEAR: Final = 5
@@ -57,11 +58,15 @@ def turns(evidence: Evidence) -> Decision:
     rule = (
         f"far : near = {FAR_TO_NEAR} : 1 at first where far views look in one direction (median "
         f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more), drone and "
-        f"street, and {EVEN:.0%} of the views or more on each side; in runs of fewer than "
-        f"{REFERENCE:,} views"
+        f"street, and {EVEN:.0%} of the views or more on each side; in runs within seconds or of "
+        f"fewer than {REFERENCE:,} views"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
     plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
+    if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
+        return plain.found("measured with our rules and single views only")
+    if not _is_short(evidence):
+        return plain.found("measured in shorter runs only")
     if not evidence.modes.two:
         return plain.found("no two modes", decided=evidence.modes.one)
     return _turns_of_two_modes(evidence, plain)
@@ -71,10 +76,6 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     """Whether far views come more often, by where both look."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
-    if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
-        return plain.found("measured with our rules and single views only")
-    if not _is_short(evidence):
-        return plain.found("measured in shorter runs only")
     cut = evidence.modes.cut
     if cut.share < EVEN:
         return plain.found(f"the smaller mode has {cut.share:.0%} of the views")
@@ -95,11 +96,11 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
 
 
 def _is_short(evidence: Evidence) -> bool:
-    """Whether the run is shorter than published ones, as far as that is known."""
-    config, length = evidence.config, evidence.config.max_views or evidence.config.steps
+    """Whether the run is shorter than published ones, or ends within seconds."""
+    config, planned = evidence.config, evidence.config.plan == "auto"
     if config.schedule == "absolute":
         return False
-    if length is None:
-        # A plan of all parts ends a run that names no length after some passes over the photos.
-        return config.seconds is not None or config.plan == "auto"
-    return length < REFERENCE
+    known = config.max_views or config.steps
+    if known is None and config.seconds is None and planned:
+        known = most_views(evidence)
+    return config.seconds is not None if known is None else known < REFERENCE

@@ -594,9 +594,10 @@ def test_no_scene_breaks_the_planner(centers, points, asked, notes):
         for i, center in enumerate(centers)
     ]
     scene = replace(posed_scene(views, points), notes=tuple(notes))
-    config = configured(layered([{"scene": "nowhere", "plan": "auto", **asked}]))
-    decided, plan = planned(config, scene)
-    json.dumps(plan, allow_nan=False)
-    assert len(plan["decisions"]) == len(PARTS)
-    for name in config.model_fields_set - {"backbone", "scene"}:
-        assert getattr(decided, name) == getattr(config, name)
+    for kind, parts in (("auto", len(PARTS)), ("turns", 1)):
+        config = configured(layered([{"scene": "nowhere", "plan": kind, **asked}]))
+        decided, plan = planned(config, scene)
+        json.dumps(plan, allow_nan=False)
+        assert len(plan["decisions"]) == parts
+        for name in config.model_fields_set - {"backbone", "scene"}:
+            assert getattr(decided, name) == getattr(config, name)

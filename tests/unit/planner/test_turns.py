@@ -1,11 +1,12 @@
 """When the planner lets far views come more often: drone and street, not two flight levels."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from crossgrad_core.commands import ComponentChoice, configured
+from crossgrad_core.commands import ComponentChoice, UserError, configured
 from crossgrad_core.run import planning
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.posed import posed_scene, posed_view
@@ -98,10 +99,41 @@ def test_other_scenes_draw_epochs_without_a_plan():
     assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
 
 
-def test_without_a_planner_runs_draw_epochs(monkeypatch):
-    monkeypatch.setattr(planning, "offers", lambda _slot: ())
+def broken(*_arguments):
+    raise RuntimeError("worn out")
+
+
+def missing(*_arguments):
+    raise UserError("there is no planner called scene")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
+)
+def test_a_planner_that_fails_ends_no_run_that_asked_for_nothing(name, value, monkeypatch, caplog):
+    monkeypatch.setattr(planning, name, value)
     run = assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
-    assert (run.selection.names["sampler"], run.config.plan) == ("epoch", "off")
+    assert (run.selection.names["sampler"], run.config.plan, run.plan) == ("epoch", "off", None)
+    assert "nothing is planned" in caplog.text
+    asked = configured({"scene": "x", "steps": 100, "plan": "turns"})
+    with pytest.raises((RuntimeError, UserError)):
+        assemble(asked, scene_of(AROUND), "colmap")
+
+
+def test_a_plan_that_was_asked_for_is_told_where_it_changes_nothing():
+    asked = configured({"scene": "x", "steps": 30_000, "plan": "turns"})
+    run = assemble(asked, scene_of(AROUND), "colmap")
+    assert run.selection.names["sampler"] == "epoch"
+    (found,) = run.plan["decisions"]
+    assert found["evidence"] == "measured in shorter runs only"
+
+
+@pytest.mark.parametrize(("photos", "short"), [(100, True), (400, False)])
+def test_a_whole_plan_of_many_photos_is_no_short_run(photos, short):
+    views = scene_of(AROUND).views
+    scene = posed_scene([replace(views[i % 24], name=f"{i}.png") for i in range(photos)], CLOUD)
+    found = turns(Evidence(configured({"scene": "x", "plan": "auto"}), scene))
+    assert bool(found.settings) == short
 
 
 @pytest.mark.parametrize("height", [20.0, 30.0])

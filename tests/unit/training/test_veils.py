@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from support.commands import ended
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
@@ -64,11 +65,11 @@ def expected(setup, state, bound):
         beside = [view.camera for view in setup.scene.train_views if not shows(view.camera, mean)]
         distance = min((np.linalg.norm(mean - c.center.numpy()) for c in beside), default=np.inf)
         if np.exp(scales[i].max()) > LEAST:
-            wanted[i] = np.minimum(scales[i], np.log(max(bound * distance, 1e-38)))
+            wanted[i] = np.minimum(scales[i], np.log(max(bound * distance, LEAST)))
     return wanted
 
 
-@pytest.mark.parametrize("at_once", [1, 2**22])
+@pytest.mark.parametrize("at_once", [1, 2**20])
 @pytest.mark.parametrize("bound", [None, 0.2, 3.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_axes_are_as_long_as_they_may_be(seed, bound, at_once, monkeypatch):
@@ -79,16 +80,42 @@ def test_axes_are_as_long_as_they_may_be(seed, bound, at_once, monkeypatch):
     wanted = expected(setup, state, bound or BOUND)
     bound_sizes(setup, state)
     after = state.parameters["scales"].detach()
-    # Positions in float32 lie some 1e-7 of an extent beside those that the distances are of.
-    means = state.parameters["means"].detach().double().numpy()
-    apart = np.linalg.norm(means[:, None] - setup.scene.centers, axis=2).min(axis=1)
-    near = apart < 1e-4
-    assert np.abs(after.numpy() - wanted)[~near].max() < 2e-3
-    assert torch.isfinite(after).all()
+    # The one that stands in a camera, to rounding, may lie in its photo or not.
+    assert np.abs(after.numpy() - wanted)[1:].max() < 1e-4
     changed = (after != before["scales"]).any(dim=1)
     assert 0 < int(changed.sum()) < len(changed)
     assert (after <= before["scales"]).all()
     assert all(torch.equal(state.parameters[n], before[n]) for n in before if n != "scales")
+
+
+def test_what_has_diverged_and_what_is_small_stay():
+    setup = setup_of()
+    state = at_random(setup, 0)
+    scales = state.parameters["scales"].detach()
+    state.parameters["means"].detach()[:4] = torch.from_numpy(setup.scene.centers[0])
+    scales[:4] = torch.tensor([np.inf, np.nan, np.log(LEAST) - 1e-3, np.log(LEAST) + 1e-3])[:, None]
+    before = scales[:3].clone()
+    bound_sizes(setup, state)
+    assert torch.equal(scales[:3].nan_to_num(nan=-99.0), before.nan_to_num(nan=-99.0))
+    assert scales[3, 0] >= np.log(np.float32(LEAST)) - 1e-6
+
+
+def test_nothing_is_too_long():
+    """None is large, and all are large and far away: the first and the second look leave nothing."""
+    setup = setup_of()
+    state = at_random(setup, 0)
+    scales = state.parameters["scales"].detach()
+    for size in (-9.0, 9.0):
+        state.parameters["means"].detach()[:] = 1e4  # 17,321 away; the larger size is 8,103.
+        scales[:] = size
+        bound_sizes(setup, state)
+        assert torch.equal(scales, torch.full_like(scales, size))
+
+
+def test_a_run_within_seconds_is_told_once_its_length_is_planned(tmp_path, capsys):
+    command = ("run", "--seconds", 1, "--max-size", 48, "--threads", 1, "--out", tmp_path / "run")
+    assert ended(*command) == 0
+    assert "size_bound=0" in capsys.readouterr().out + (tmp_path / "run/log.txt").read_text()
 
 
 def test_sizes_are_looked_at_once_in_so_many_steps():
