@@ -101,7 +101,7 @@ def test_what_has_diverged_and_what_is_small_stay():
 
 
 def test_nothing_is_too_long():
-    """None is large, and all are large and far away: the first and the second look leave nothing."""
+    """No Gaussian is large, or all are large and far away."""
     setup = setup_of()
     state = at_random(setup, 0)
     scales = state.parameters["scales"].detach()
