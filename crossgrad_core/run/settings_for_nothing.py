@@ -183,7 +183,7 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             "grouping",
             f"sampler {selection.names['sampler']} draws from all views alike, and operator "
             f"{selection.names['operator']} reads no labels; --sampler {GROUP_SAMPLER} "
-            "draws from groups",
+            "draws from groups, --set grouping=null leaves a file's out",
         )
 
 
