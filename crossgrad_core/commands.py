@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
+    from crossgrad_core.run.usual_resolution import counts_as_short
     from crossgrad_core.run.usual_views import view_plan_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.dropout import photos_per_point, usual_dropout
@@ -100,6 +101,7 @@ __all__ = [
     "configured",
     "count",
     "counting_of",
+    "counts_as_short",
     "did_you_mean",
     "disk_errors",
     "disk_full",
@@ -169,6 +171,7 @@ _LATE: Final = {
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
     "counting_of": "training.schedules",
+    "counts_as_short": "run.usual_resolution",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",
     "layered": "run.settings",

@@ -31,23 +31,20 @@ def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan | None]:
         UserError: One was asked for, and there is no planner, it cannot be imported, or a photo
             cannot be decoded.
     """
-    if "plan" in config.model_fields_set:
+    asked = "plan" in config.model_fields_set
+    if asked:
         _LOG.info("looking at what the scene needs")
-        decided, plan = _answer(config, scene)
-    else:
-        try:
-            decided, plan = _answer(config, scene)
-        except Exception as error:  # Who asked for nothing is not to be stopped by it.
-            why = getattr(error, "what", in_one_line(error))
-            _LOG.warning("nothing is planned: %s", why)
-            decided, plan = config, None
-        if decided is config:
-            plan = None
+    plan: Plan | None
+    try:
+        decided, plan = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))(config, scene)
+    except Exception as error:
+        if asked:
+            raise
+        _LOG.warning("nothing is planned: %s", getattr(error, "what", in_one_line(error)))
+        decided, plan = config, None
+    if decided is config and not asked:
+        plan = None
     return decided.model_copy(update={"plan": "off"}), plan
-
-
-def _answer(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan]:
-    return cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))(config, scene)
 
 
 def notes_of(plan: Plan | None) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from crossgrad_core.training.rates import axes_of
 from crossgrad_core.training.schedules import MOST_DEGREES
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.steady import final_decay_of
-from crossgrad_core.training.veils import bounds_sizes
+from crossgrad_core.training.veils import learns_sizes
 from crossgrad_core.wording import listed, plural
 
 _SLOTS = ("grouping", *ALWAYS)
@@ -236,7 +236,7 @@ def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_sizes(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if config.size_bound and not bounds_sizes(setup):
+    if config.size_bound and not learns_sizes(setup):
         name = setup.selection.names["backbone"]
         yield "size_bound", f"backbone {name} has no Gaussians with axes that learn"
 

@@ -16,8 +16,7 @@ def usual_resolution(
 
     Published schedules, and runs as long as the published ones, have all pixels. So have anchors
     and filters, of which nothing is measured, and growth that no budget leads: of fewer pixels the
-    norms of gradients are larger, which only growth reads. A run within seconds counts as short:
-    its length is not known.
+    norms of gradients are larger, which only growth reads.
 
     Args:
         config: The configuration.
@@ -26,9 +25,21 @@ def usual_resolution(
         densifier: Its densifier.
         device: The type of its device.
     """
-    published = config.preset == "inria" or is_published(config.schedule, config.reference)
-    steps = config.steps if config.max_views is None else views.steps_of(config.max_views)
-    short = config.seconds is not None or (steps or REFERENCE) < REFERENCE
     led = not densifier.edits or growth_by(config, budgeted=densifier.budgeted) == "curve"
     suits = led and bool(backbone.axes) and backbone.response == "plain" and device == "cpu"
-    return SHORT_RESOLUTION if short and suits and not published else RESOLUTION
+    return SHORT_RESOLUTION if suits and counts_as_short(config, views) else RESOLUTION
+
+
+def counts_as_short(config: RunConfig, views: ViewPlan) -> bool:
+    """Whether a run is shorter than published ones, and has not their schedule or rules.
+
+    A run within seconds counts as short: its length is not known.
+
+    Args:
+        config: The configuration.
+        views: K over the run.
+    """
+    if config.preset == "inria" or is_published(config.schedule, config.reference):
+        return False
+    steps = config.steps if config.max_views is None else views.steps_of(config.max_views)
+    return config.seconds is not None or (steps or REFERENCE) < REFERENCE

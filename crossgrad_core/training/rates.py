@@ -228,14 +228,12 @@ def gaussians_of(setup: Setup) -> tuple[str, str, str] | None:
 
 
 def check_axes(setup: Setup, parameters: Parameters) -> None:
-    """Refuses tensors of other shapes than those that `Backbone.axes` promises, where they count.
+    """Refuses tensors of other shapes than those that `Backbone.axes` promises.
 
     Raises:
         UserError: It names the backbone.
     """
-    config = setup.config
-    used = axes_of(setup) or (is_short(config, setup.schedule) and config.size_bound is None)
-    if (names := gaussians_of(setup)) is None or not (used or config.size_bound):
+    if (names := gaussians_of(setup)) is None:
         return
     rows = len(parameters[names[0]]) if names[0] in parameters else 0
     found = [tuple(parameters[each].shape) if each in parameters else None for each in names]

@@ -24,11 +24,12 @@ from crossgrad_core.training.compile_ahead import compiling_beside
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
-from crossgrad_core.training.rates import check_axes
+from crossgrad_core.training.rates import axes_of, check_axes
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.room import bound_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.veils import size_bound_of
 from crossgrad_core.wording import in_one_line, listed
 
 _LOG = logging.getLogger(__name__)
@@ -55,7 +56,8 @@ def first_state(setup: Setup) -> TrainState:
     }
     prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
     parameters = _made(setup, prepared, "prepare")
-    check_axes(setup, parameters)
+    if axes_of(setup) or size_bound_of(setup):
+        check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = photo_parameters.started(setup)
     if photos is not None:

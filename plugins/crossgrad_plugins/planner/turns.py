@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from crossgrad_core.commands import ComponentChoice
+from crossgrad_core.commands import ComponentChoice, counts_as_short
 from crossgrad_core.plugin import REFERENCE, Grouping, Json, Scene, build_component
 from crossgrad_plugins.groupings.split import FAR
 from crossgrad_plugins.planner.decision import Decision, given
@@ -96,11 +96,8 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
 
 
 def _is_short(evidence: Evidence) -> bool:
-    """Whether the run is shorter than published ones, or ends within seconds."""
-    config, planned = evidence.config, evidence.config.plan == "auto"
-    if config.schedule == "absolute":
-        return False
-    known = config.max_views or config.steps
-    if known is None and config.seconds is None and planned:
-        known = most_views(evidence)
-    return config.seconds is not None if known is None else known < REFERENCE
+    """Whether the run counts as short, with the length that a plan of all parts gives it."""
+    config = evidence.config
+    if config.plan == "auto" and config.steps is config.seconds is config.max_views is None:
+        config = config.model_copy(update={"max_views": most_views(evidence)})
+    return counts_as_short(config, evidence.view_plan)
