@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
+    from crossgrad_core.run.usual_densifier import usual_densifier
     from crossgrad_core.run.usual_resolution import counts_as_short
     from crossgrad_core.run.usual_views import view_plan_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
@@ -142,6 +143,7 @@ __all__ = [
     "take_steps",
     "tell",
     "usual_budget",
+    "usual_densifier",
     "usual_dropout",
     "view_gradients",
     "view_plan_of",
@@ -184,6 +186,7 @@ _LATE: Final = {
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
     "usual_budget": "training.room",
+    "usual_densifier": "run.usual_densifier",
     "usual_dropout": "training.dropout",
     "view_plan_of": "run.usual_views",
     "view_gradients": "training.frozen",

@@ -26,6 +26,7 @@ from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.results.metrics_csv import columns_for
+from crossgrad_core.run.usual_densifier import usual_densifier
 from crossgrad_core.run.usual_resolution import usual_resolution
 from crossgrad_core.run.usual_views import operator_of, usual_views
 from crossgrad_core.wording import listed, singular
@@ -51,8 +52,9 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     fitting = backbone.fitted_to(scene)
     backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
-    usual_densifier = backbone.default_densifier
-    densifier, densifier_name = _named_or(usual_densifier, Densifier, config.densifier)
+    views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
+    usual = usual_densifier(config, views, backbone)
+    densifier, densifier_name = _named_or(usual, Densifier, config.densifier)
     wanted = Wanted(
         device=device.type,
         response=backbone.response,
@@ -63,7 +65,6 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes += choosing
     options = _rasterizer_options(config, scene, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, options)
-    views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
     usual = usual_resolution(config, views, backbone, densifier, device.type)
     resolution, resolution_name = _named_or(usual, Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)

@@ -26,8 +26,13 @@ def usual_resolution(
         device: The type of its device.
     """
     led = not densifier.edits or growth_by(config, budgeted=densifier.budgeted) == "curve"
-    suits = led and bool(backbone.axes) and backbone.response == "plain" and device == "cpu"
+    suits = led and is_plain(backbone) and device == "cpu"
     return SHORT_RESOLUTION if suits and counts_as_short(config, views) else RESOLUTION
+
+
+def is_plain(backbone: Backbone) -> bool:
+    """Whether a backbone has Gaussians with axes of their own, drawn as published."""
+    return bool(backbone.axes) and backbone.response == "plain"
 
 
 def counts_as_short(config: RunConfig, views: ViewPlan) -> bool:

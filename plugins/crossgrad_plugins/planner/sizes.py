@@ -8,6 +8,7 @@ from crossgrad_core.commands import (
     counting_of,
     photos_per_point,
     usual_budget,
+    usual_densifier,
     usual_dropout,
 )
 from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
@@ -79,8 +80,8 @@ def count(evidence: Evidence) -> Decision:
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
     views = views_of_steps(evidence).paced(steps).views(steps)
-    pixels = evidence.scene.train_pixels
-    budget = usual_budget(points, views, pixels)
+    pixels, photos = evidence.scene.train_pixels, len(evidence.scene.train_views)
+    budget = usual_budget(points, views, pixels, photos)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
         f"{points:,} points, {views:,} views, photos of {pixels / 1e6:.2f} MP: {shown}",
@@ -131,7 +132,7 @@ def length(evidence: Evidence) -> Decision:
 def densifier(evidence: Evidence) -> Decision:
     """Whether there is density control."""
     part, named = "densifier", evidence.config.densifier
-    usual = evidence.backbone.default_densifier if named is None else named.name
+    usual = _usual_densifier(evidence) if named is None else named.name
     if evidence.is_given("densifier", "backbone"):
         return given(part, usual, "--densifier NAME")
     rule = "none where the schedule has no edit: the run is over before the first transient is"
@@ -151,6 +152,12 @@ def densifier(evidence: Evidence) -> Decision:
         return shown
     saved = "its screen statistics, and its module"
     return shown.changed("none", {"densifier": "none"}, f"--densifier {usual}", saved)
+
+
+def _usual_densifier(evidence: Evidence) -> str:
+    """That of a run that names none and has the length decided on."""
+    config = evidence.config.model_copy(update=dict(length(evidence).settings))
+    return usual_densifier(config, evidence.view_plan, evidence.backbone)
 
 
 def _steps(evidence: Evidence) -> int | None:
