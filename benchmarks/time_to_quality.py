@@ -82,7 +82,9 @@ def run(given: argparse.Namespace) -> None:
         # Compiles the kernels of all that a run needs, so that no timed run does.
         warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
-            code.train(given.scene[0], warm, *kind, "--steps", "700")
+            # A clock that options name is refused without seconds.
+            length = ("--seconds", "20") if "--clock" in code.options else ("--steps", "700")
+            code.train(given.scene[0], warm, *kind, *length)
     for seed, scene, lengths in _cases(given):
         folders = {
             code: given.out / f"{scene.name}-{re.sub('[: ]', '_', lengths)}-{code.name}-{seed}"

@@ -53,7 +53,13 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
-    usual = usual_densifier(config, views, backbone)
+    usual = usual_densifier(config, views, backbone, len(scene.train_views))
+    if config.densifier is None and usual != backbone.default_densifier:
+        published = backbone.default_densifier
+        notes.append(
+            f"densifier {usual}, as in short runs of many photos (--densifier {published}: as "
+            "published)"
+        )
     densifier, densifier_name = _named_or(usual, Densifier, config.densifier)
     wanted = Wanted(
         device=device.type,

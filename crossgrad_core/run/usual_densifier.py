@@ -1,37 +1,48 @@
 """The densifier of a run that names none."""
 
-from crossgrad_core.config import AUTO, RunConfig
+from typing import Final
+
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.defaults import DENSIFIER, SHORT_DENSIFIER
 from crossgrad_core.registry.entries import load
-from crossgrad_core.run.devices import choose_device
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.usual_resolution import counts_as_short, is_plain
 from crossgrad_core.training.schedules import growth_by
 
+#: Training photos from which on it pays in a short run to grow wherever pixels pull; with fewer it
+#: learns these few by heart. Measured by us (docs/schedules.md).
+MANY_PHOTOS: Final = 100
 
-def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone) -> str:
-    """The backbone's; in short runs on a CPU one that asks where pixels pull, whichever way.
+
+def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, photos: int) -> str:
+    """The backbone's; in short runs of many photos one that asks where pixels pull, whichever way.
 
     Where a budget leads growth, what counts is which Gaussians ask the most, not how many ask
-    enough. Measured there, with plain Gaussians (docs/densifiers.md). Options without a name are
-    those of the backbone's.
+    enough. Measured there, on a CPU, with plain Gaussians. Options without a name are those of the
+    backbone's.
 
     Args:
         config: The configuration.
         views: K over the run.
         backbone: Its backbone.
+        photos: Training photos.
     """
     usual = backbone.default_densifier
-    suits = usual == DENSIFIER and config.densifier is None and is_plain(backbone)
+    named = config.densifier is not None
+    suits = usual == DENSIFIER and not named and is_plain(backbone) and photos >= MANY_PHOTOS
     led = suits and growth_by(config, budgeted=True) == "curve" and counts_as_short(config, views)
-    here = led and choose_device(config.device).type == "cpu" and _can_draw(config)
-    return SHORT_DENSIFIER if here else usual
+    here = led and config.device.partition(":")[0] == "cpu"
+    return SHORT_DENSIFIER if here and _is_heard(config, backbone) else usual
 
 
-def _can_draw(config: RunConfig) -> bool:
-    """Whether the rasterizer, where one is named, gives what that densifier needs."""
-    name, needs = config.rasterizer.name, load(Densifier, SHORT_DENSIFIER).needs
-    return name == AUTO or needs <= load(Rasterizer, name).provides
+def _is_heard(config: RunConfig, backbone: Backbone) -> bool:
+    """Whether the rasterizer that would draw says what that densifier asks for.
+
+    None is left out for a densifier that nobody asked for.
+    """
+    name, _ = choose_rasterizer(config.rasterizer.name, Wanted("cpu", backbone.response))
+    return load(Densifier, SHORT_DENSIFIER).needs <= load(Rasterizer, name).provides

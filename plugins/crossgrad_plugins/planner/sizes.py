@@ -157,7 +157,8 @@ def densifier(evidence: Evidence) -> Decision:
 def _usual_densifier(evidence: Evidence) -> str:
     """That of a run that names none and has the length decided on."""
     config = evidence.config.model_copy(update=dict(length(evidence).settings))
-    return usual_densifier(config, evidence.view_plan, evidence.backbone)
+    photos = len(evidence.scene.train_views)
+    return usual_densifier(config, evidence.view_plan, evidence.backbone, photos)
 
 
 def _steps(evidence: Evidence) -> int | None:

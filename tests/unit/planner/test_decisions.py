@@ -515,7 +515,9 @@ def test_steps_and_views_are_exactly_what_was_asked_for(mine):
 
 def test_other_parts_know_the_length_that_was_decided():
     assert sizes.count(Evidence(config_of(), orbit(20))).figures["views"] == 2_000
-    assert sizes.densifier(Evidence(config_of(), orbit(20))).figures["edits"] > 0
+    for photos, usual in ((20, "adc"), (120, "absgrad")):
+        density = sizes.densifier(Evidence(config_of(), orbit(photos)))
+        assert (density.choice, density.figures["edits"] > 0) == (usual, True)
     few = Evidence(config_of(), posed_scene([]))
     assert sizes.length(few).basis == "default"
     assert sizes.count(few).figures["views"] == DEFAULT_STEPS

@@ -294,6 +294,10 @@ def test_budgets_by_length():
     # In longer runs less, by the logarithm of the length.
     finer = [usual_budget(90_000, n, 480_000) / usual_budget(90_000, n) for n in (9_487, 29_999)]
     assert finer == [pytest.approx(4**0.2, rel=1e-4), pytest.approx(1.0, rel=1e-4)]
+    # And more where each of 50 photos is shown fewer than 40 times.
+    hurried, not_hurried = (usual_budget(90_000, n, 480_000, 50) for n in (1_999, 2_000))
+    assert hurried == pytest.approx(90_000 * (1.999**0.5229) * 30 / 28.001 * 4**0.9, rel=1e-3)
+    assert not_hurried == usual_budget(90_000, 2_000, 480_000)
     lengths = range(1_000, 30_001, 500)
     budgets = [usual_budget(0, length) for length in lengths]
     assert budgets == sorted(set(budgets))

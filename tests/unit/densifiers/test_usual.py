@@ -1,0 +1,92 @@
+"""The densifier of a run that names none."""
+
+import pytest
+
+from crossgrad_core.commands import configured
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.registry.entries import build, load
+from crossgrad_core.run import usual_densifier as chosen
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.migration import migrated
+from crossgrad_core.run.usual_views import view_plan_of
+from crossgrad_core.testing.fixtures import sample_scene
+
+USUAL = {
+    "a short run": ({}, "absgrad"),
+    "views": ({"steps": None, "max_views": 2000}, "absgrad"),
+    "seconds": ({"steps": None, "seconds": 60}, "absgrad"),
+    "as long as published": ({"steps": 30_000}, "adc"),
+    "no length": ({"steps": None}, "adc"),
+    "the preset": ({"preset": "inria"}, "adc"),
+    "absolute": ({"schedule": "absolute"}, "adc"),
+    "of another length": ({"schedule": "absolute", "reference": 2000}, "absgrad"),
+    "counted in steps": ({"events": "steps"}, "adc"),
+    "free growth": ({"growth": "free"}, "adc"),
+    "a bound": ({"max_gaussians": 500}, "adc"),
+    "a bound and a curve to it": ({"max_gaussians": 500, "growth": "curve"}, "absgrad"),
+    "anchors": ({"backbone": {"name": "scaffold"}}, "anchor"),
+    "a densifier of its own": ({"backbone": {"name": "pixel"}}, "pixel"),
+    "a filter": ({"backbone": {"name": "mip"}}, "adc"),
+    "means over pixels": ({"backbone": {"name": "analytic"}}, "adc"),
+    "named": ({"densifier": {"name": "mcmc"}}, "mcmc"),
+    "options of the published one": (
+        {"densifier": {"name": "auto", "grad_threshold": 1e-4}},
+        "adc",
+    ),
+    "the processor by number": ({"device": "cpu:0"}, "absgrad"),
+    "a rasterizer that says where pixels pull": ({"rasterizer": {"name": "torch"}}, "absgrad"),
+}
+
+
+@pytest.fixture(autouse=True)
+def few_are_many(monkeypatch):
+    """Scenes of tests have a few photos."""
+    monkeypatch.setattr(chosen, "MANY_PHOTOS", 2)
+
+
+@pytest.mark.parametrize("case", USUAL)
+def test_where_pixels_pull_is_asked_in_short_runs_of_plain_gaussians(case):
+    settings, expected = USUAL[case]
+    given = {"steps": 2000, **settings}
+    setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
+    assert setup.selection.names["densifier"] == expected
+    told = [note for note in setup.notes if note.startswith("densifier absgrad, ")]
+    assert len(told) == (expected == "absgrad")
+
+
+def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
+    scene = sample_scene()
+    for photos, expected in ((0, "absgrad"), (1, "adc")):
+        monkeypatch.setattr(chosen, "MANY_PHOTOS", len(scene.train_views) + photos)
+        setup = assemble(RunConfig(steps=2000), scene, "none")
+        assert setup.selection.names["densifier"] == expected
+
+
+def usual_of(**settings):
+    config = configured(settings)
+    backbone = build("backbones", config.backbone.name, {})
+    return chosen.usual_densifier(config, view_plan_of(config), backbone, photos=2)
+
+
+@pytest.mark.parametrize("name", ["auto", "numba"])
+def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, monkeypatch):
+    given = {"steps": 2000, "rasterizer": {"name": name}}
+    assert usual_of(**given) == "absgrad"
+    numba = load(Rasterizer, "numba")
+    monkeypatch.setattr(numba, "provides", numba.provides - {"abs_gradient"})
+    assert usual_of(**given) == "adc"
+    setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
+    assert (setup.selection.names["rasterizer"], setup.selection.names["densifier"]) == (
+        "numba",
+        "adc",
+    )
+
+
+def test_a_gpu_has_the_published_one_also_where_there_is_none():
+    assert usual_of(steps=2000, device="cuda") == "adc"
+
+
+def test_what_earlier_versions_wrote_has_the_published_one(tmp_path):
+    written = {"steps": 2000, "revisions": []}
+    assert usual_of(**migrated(written, tmp_path / "config.yaml")) == "adc"
