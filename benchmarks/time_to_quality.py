@@ -83,7 +83,8 @@ def run(given: argparse.Namespace) -> None:
         warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
             # A clock that options name is refused without seconds.
-            length = ("--seconds", "20") if "--clock" in code.options else ("--steps", "700")
+            timed = any(option.partition("=")[0] == "--clock" for option in code.options)
+            length = ("--seconds", "60") if timed else ("--steps", "700")
             code.train(given.scene[0], warm, *kind, *length)
     for seed, scene, lengths in _cases(given):
         folders = {

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.frozen import view_gradients
     from crossgrad_core.training.model import model_of
+    from crossgrad_core.training.rates import shows_few_times
     from crossgrad_core.training.room import usual_budget
     from crossgrad_core.training.schedules import counting_of
     from crossgrad_core.training.setup import Setup
@@ -136,6 +137,7 @@ __all__ = [
     "read_settings",
     "resolved",
     "sentences",
+    "shows_few_times",
     "singular",
     "summary",
     "summary_of",
@@ -185,6 +187,7 @@ _LATE: Final = {
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
+    "shows_few_times": "training.rates",
     "usual_budget": "training.room",
     "usual_densifier": "run.usual_densifier",
     "usual_dropout": "training.dropout",

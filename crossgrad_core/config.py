@@ -79,7 +79,7 @@ class RunConfig(BaseModel):
         description=f"How primitives are added and removed; {defaults.NO_DENSIFIER} keeps them. "
         f"Default: the backbone's; {defaults.SHORT_DENSIFIER} in place of {defaults.DENSIFIER} on "
         "a CPU, of 100 training photos or more, in runs within seconds or of fewer than 30,000 "
-        "steps whose growth follows a curve.",
+        "views whose growth follows a curve, not with filters or --preset inria.",
     )
     rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),

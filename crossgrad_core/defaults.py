@@ -26,7 +26,7 @@ METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 METRICS_OF_0_1: Final = "psnr+ssim+ssim-skimage+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
-#: What stands in for it in short runs on a CPU.
+#: What stands in for it in short runs of many photos on a CPU.
 SHORT_DENSIFIER: Final = "absgrad"
 #: The reader that says what is missing in a folder that no reader accepts.
 READER: Final = "colmap"

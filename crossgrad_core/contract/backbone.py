@@ -22,7 +22,8 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another.
+        default_densifier: Name of the densifier that is used unless the user names another; in
+            short runs of many photos another one stands in for that of the published Gaussians.
         response: How its Gaussians fill a pixel.
         plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
             PLY loses nothing.

@@ -54,13 +54,13 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     notes += left_out
     views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
     usual = usual_densifier(config, views, backbone, len(scene.train_views))
-    if config.densifier is None and usual != backbone.default_densifier:
-        published = backbone.default_densifier
-        notes.append(
-            f"densifier {usual}, as in short runs of many photos (--densifier {published}: as "
-            "published)"
-        )
     densifier, densifier_name = _named_or(usual, Densifier, config.densifier)
+    of_backbone = backbone.default_densifier
+    if usual != of_backbone and (config.densifier is None or config.densifier.name == AUTO):
+        notes.append(
+            f"densifier {usual}, as in short runs of many photos (--densifier {of_backbone}: that "
+            "of the backbone)"
+        )
     wanted = Wanted(
         device=device.type,
         response=backbone.response,

@@ -7,6 +7,7 @@ from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.pace import ViewPlan
 from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.schedule import REFERENCE
 from crossgrad_core.defaults import DENSIFIER, SHORT_DENSIFIER
 from crossgrad_core.registry.entries import load
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
@@ -22,8 +23,7 @@ def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, phot
     """The backbone's; in short runs of many photos one that asks where pixels pull, whichever way.
 
     Where a budget leads growth, what counts is which Gaussians ask the most, not how many ask
-    enough. Measured there, on a CPU, with plain Gaussians. Options without a name are those of the
-    backbone's.
+    enough. Measured there, on a CPU, with plain Gaussians.
 
     Args:
         config: The configuration.
@@ -32,11 +32,19 @@ def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, phot
         photos: Training photos.
     """
     usual = backbone.default_densifier
-    named = config.densifier is not None
-    suits = usual == DENSIFIER and not named and is_plain(backbone) and photos >= MANY_PHOTOS
-    led = suits and growth_by(config, budgeted=True) == "curve" and counts_as_short(config, views)
-    here = led and config.device.partition(":")[0] == "cpu"
+    suits = usual == DENSIFIER and is_plain(backbone) and photos >= MANY_PHOTOS
+    here = suits and config.device.partition(":")[0] == "cpu" and _is_led(config, views)
     return SHORT_DENSIFIER if here and _is_heard(config, backbone) else usual
+
+
+def _is_led(config: RunConfig, views: ViewPlan) -> bool:
+    """Whether a budget leads growth, which the published length has none of; `is_led` by views."""
+    if growth_by(config, budgeted=True) != "curve" or not counts_as_short(config, views):
+        return False
+    # That of a run within seconds is not known.
+    steps = config.steps or 1
+    length = config.max_views or views.paced(steps).views(steps)
+    return max(length, config.reference or 0) < REFERENCE
 
 
 def _is_heard(config: RunConfig, backbone: Backbone) -> bool:

@@ -54,10 +54,13 @@ def in_a_hurry(config: RunConfig, schedule: Schedule, photos: int) -> bool:
         schedule: Its schedule.
         photos: Number of its training photos.
     """
-    if config.beta2 is not None or config.preset == "inria":
-        return False
-    views = schedule.pace.views(_planned(config, schedule))
-    return views < min(REFERENCE, HURRY * photos)
+    return shows_few_times(config, schedule.pace.views(_planned(config, schedule)), photos)
+
+
+def shows_few_times(config: RunConfig, views: int, photos: int) -> bool:
+    """The same of a run that is planned to draw so many views."""
+    usual = config.beta2 is None and config.preset != "inria"
+    return usual and views < min(REFERENCE, HURRY * photos)
 
 
 def factor_of(config: RunConfig, schedule: Schedule, photos: int) -> float:

@@ -8,7 +8,7 @@ from crossgrad_core.config import AUTO
 from crossgrad_core.contract.schedule import REFERENCE, Schedule, shortness
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
-from crossgrad_core.training.rates import HURRY
+from crossgrad_core.training.rates import in_a_hurry
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -24,9 +24,11 @@ SHORT_BUDGET, SHORT_LENGTH, POWER = 30_000, 1_000, log(100 / 30) / log(10)
 #: that: a short run has no time to place more. Measured by us (docs/schedules.md).
 GROWN, LEAST_BUDGET = 2, 10_000
 #: Pixels of the photos with which that was measured (400 x 300), and the power of larger ones with
-#: which more pay in short runs: they show more. The last is that of runs which end long before they
-#: have learnt their photos by heart. Measured by us (docs/schedules.md).
-PIXELS, FINER, FINER_IN_A_HURRY = 120_000, 0.4, 0.9
+#: which more pay in short runs: they show more. Measured by us (docs/schedules.md).
+PIXELS, FINER = 120_000, 0.4
+#: The further power in runs in a hurry, which cannot learn photos by heart, and the largest photos
+#: (800 x 600) with which that was measured.
+HURRIED_FINER, HURRIED_PIXELS = 0.5, 480_000
 
 
 def room_of(setup: Setup, state: TrainState, rendered: Rendered) -> int:
@@ -66,8 +68,9 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
     """
     given = bound_of(setup)
     if given == AUTO:
-        photos, pixels = len(setup.train_views), setup.scene.train_pixels
-        budget = usual_budget(start, schedule.length, pixels, photos)
+        hurried = in_a_hurry(setup.config, schedule, len(setup.train_views))
+        pixels = setup.scene.train_pixels
+        budget = usual_budget(start, schedule.length, pixels, hurried=hurried)
     else:
         budget = given or sys.maxsize
     if growth_of(setup) == "free" or budget == sys.maxsize:
@@ -82,7 +85,7 @@ def bound_of(setup: Setup) -> int | Literal["auto"] | None:
     return AUTO if given is None and growth_of(setup) == "curve" else given
 
 
-def usual_budget(start: int, length: int, pixels: float = PIXELS, photos: int = 0) -> int:
+def usual_budget(start: int, length: int, pixels: float = PIXELS, *, hurried: bool = False) -> int:
     """The budget of a run that began with `start` primitives and has `length` views.
 
     It has no bound any more at the published length, whose rules know none.
@@ -91,15 +94,17 @@ def usual_budget(start: int, length: int, pixels: float = PIXELS, photos: int = 
         start: Primitives at the start.
         length: Views.
         pixels: Of a training photo, mean.
-        photos: Training photos.
+        hurried: Whether the run is in a hurry.
     """
     if length >= REFERENCE:
         return sys.maxsize
     stretch = exp(POWER * log(max(1.0, length / SHORT_LENGTH)))
     enough = min(SHORT_BUDGET, max(LEAST_BUDGET, GROWN * start))
     if enough == SHORT_BUDGET:
-        finer = FINER_IN_A_HURRY if length < HURRY * photos else FINER
-        stretch *= exp(finer * shortness(length) * log(max(1.0, pixels / PIXELS)))
+        finer = FINER * log(max(1.0, pixels / PIXELS))
+        if hurried:
+            finer += HURRIED_FINER * log(max(1.0, min(pixels, HURRIED_PIXELS) / PIXELS))
+        stretch *= exp(shortness(length) * finer)
     return round(max(enough, start) * stretch / (1.0 - length / REFERENCE))
 
 

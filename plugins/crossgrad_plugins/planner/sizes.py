@@ -7,6 +7,7 @@ from crossgrad_core.commands import (
     DEFAULT_STEPS,
     counting_of,
     photos_per_point,
+    shows_few_times,
     usual_budget,
     usual_densifier,
     usual_dropout,
@@ -81,7 +82,8 @@ def count(evidence: Evidence) -> Decision:
         return plain.found(f"{points:,} points; the length follows the clock")
     views = views_of_steps(evidence).paced(steps).views(steps)
     pixels, photos = evidence.scene.train_pixels, len(evidence.scene.train_views)
-    budget = usual_budget(points, views, pixels, photos)
+    hurried = shows_few_times(config, views, photos)
+    budget = usual_budget(points, views, pixels, hurried=hurried)
     shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
     return plain.found(
         f"{points:,} points, {views:,} views, photos of {pixels / 1e6:.2f} MP: {shown}",
@@ -132,7 +134,7 @@ def length(evidence: Evidence) -> Decision:
 def densifier(evidence: Evidence) -> Decision:
     """Whether there is density control."""
     part, named = "densifier", evidence.config.densifier
-    usual = _usual_densifier(evidence) if named is None else named.name
+    usual = _usual_densifier(evidence) if named is None or named.name == "auto" else named.name
     if evidence.is_given("densifier", "backbone"):
         return given(part, usual, "--densifier NAME")
     rule = "none where the schedule has no edit: the run is over before the first transient is"
@@ -158,7 +160,7 @@ def _usual_densifier(evidence: Evidence) -> str:
     """That of a run that names none and has the length decided on."""
     config = evidence.config.model_copy(update=dict(length(evidence).settings))
     photos = len(evidence.scene.train_views)
-    return usual_densifier(config, evidence.view_plan, evidence.backbone, photos)
+    return usual_densifier(config, views_of_steps(evidence), evidence.backbone, photos)
 
 
 def _steps(evidence: Evidence) -> int | None:

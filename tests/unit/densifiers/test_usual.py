@@ -30,8 +30,15 @@ USUAL = {
     "a filter": ({"backbone": {"name": "mip"}}, "adc"),
     "means over pixels": ({"backbone": {"name": "analytic"}}, "adc"),
     "named": ({"densifier": {"name": "mcmc"}}, "mcmc"),
-    "options of the published one": (
-        {"densifier": {"name": "auto", "grad_threshold": 1e-4}},
+    "left open": ({"densifier": {"name": "auto"}}, "absgrad"),
+    "options alone": ({"densifier": {"name": "auto", "abs_threshold": 1e-4}}, "absgrad"),
+    "fewer steps than published, but not views": ({"steps": 20_000, "views_per_step": 2}, "adc"),
+    "as many views in fewer steps": (
+        {"steps": None, "max_views": 40_000, "views_per_step": 2},
+        "adc",
+    ),
+    "of a length without a budget": (
+        {"schedule": "absolute", "reference": 40_000},
         "adc",
     ),
     "the processor by number": ({"device": "cpu:0"}, "absgrad"),
@@ -56,6 +63,8 @@ def test_where_pixels_pull_is_asked_in_short_runs_of_plain_gaussians(case):
 
 
 def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
+    monkeypatch.undo()
+    assert chosen.MANY_PHOTOS == 100
     scene = sample_scene()
     for photos, expected in ((0, "absgrad"), (1, "adc")):
         monkeypatch.setattr(chosen, "MANY_PHOTOS", len(scene.train_views) + photos)

@@ -84,6 +84,7 @@ def test_the_estimate_counts_what_is_there_from_packed_tables(paper, planted, mo
 
     before = left()
     same = {"clock": "cpu", "fewest_edits": 6, "reading": {"max_size": 400}}
+    same |= {"densifier": {"name": "adc"}}
     settings = {
         "one view, 60 s": {**same, "sampler": {"name": "epoch"}},
         "two random views, 60 s": {**same, "sampler": {"name": "random"}, "views_per_step": 2},

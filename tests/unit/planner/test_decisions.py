@@ -523,6 +523,18 @@ def test_other_parts_know_the_length_that_was_decided():
     assert sizes.count(few).figures["views"] == DEFAULT_STEPS
 
 
+@pytest.mark.parametrize(
+    ("settings", "choice"),
+    [
+        ({"densifier": {"name": "auto"}}, "absgrad"),
+        ({"steps": 20_000, "views_per_step": 2}, "adc"),
+        ({"steps": 40_000}, "adc"),
+    ],
+)
+def test_the_density_control_is_that_of_the_run(settings, choice):
+    assert sizes.densifier(Evidence(config_of(**settings), orbit(120))).choice == choice
+
+
 @pytest.mark.parametrize(("steps", "choice"), [(100, "none"), (3_000, "adc")])
 def test_a_run_too_short_for_edits_has_no_density_control(steps, choice):
     assert plan_for(orbit(), steps=steps).of_part("densifier").choice == choice

@@ -24,7 +24,7 @@ from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import room
+from crossgrad_core.training import rates, room
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.room import bound_of, curve, usual_budget
 from crossgrad_core.training.schedules import growth_of
@@ -294,14 +294,28 @@ def test_budgets_by_length():
     # In longer runs less, by the logarithm of the length.
     finer = [usual_budget(90_000, n, 480_000) / usual_budget(90_000, n) for n in (9_487, 29_999)]
     assert finer == [pytest.approx(4**0.2, rel=1e-4), pytest.approx(1.0, rel=1e-4)]
-    # And more where each of 50 photos is shown fewer than 40 times.
-    hurried, not_hurried = (usual_budget(90_000, n, 480_000, 50) for n in (1_999, 2_000))
-    assert hurried == pytest.approx(90_000 * (1.999**0.5229) * 30 / 28.001 * 4**0.9, rel=1e-3)
-    assert not_hurried == usual_budget(90_000, 2_000, 480_000)
+    # And more in a hurry, where large photos count as those that were measured.
+    hurried = [usual_budget(90_000, 1_000, n, hurried=True) for n in (119_000, 240_000, 480_000)]
+    assert hurried == pytest.approx([n * 90_000 * 30 / 29 for n in (1, 2**0.9, 4**0.9)], abs=1)
+    twelve = [usual_budget(90_000, 1_000, 12_000_000, hurried=each) for each in (False, True)]
+    assert twelve[1] == pytest.approx(twelve[0] * 2, abs=2)
     lengths = range(1_000, 30_001, 500)
-    budgets = [usual_budget(0, length) for length in lengths]
-    assert budgets == sorted(set(budgets))
-    assert budgets[-1] == sys.maxsize
+    for hurried in (False, True):
+        budgets = [usual_budget(30_000, length, 480_000, hurried=hurried) for length in lengths]
+        assert budgets == sorted(set(budgets))
+        assert budgets[-1] == sys.maxsize
+
+
+@pytest.mark.parametrize(("settings", "more"), [({}, 2), ({"beta2": 0.999}, 1)])
+def test_a_run_that_shows_photos_a_few_times_has_more_of_large_ones(settings, more, monkeypatch):
+    monkeypatch.setattr(room, "SHORT_BUDGET", 50)
+    setup = setup_of("adc", growth="curve", max_gaussians="auto", **settings)
+    monkeypatch.setattr(room, "PIXELS", setup.scene.train_pixels / 4)
+    monkeypatch.setattr(room, "HURRIED_PIXELS", setup.scene.train_pixels)
+    monkeypatch.setattr(room, "FINER", 0.0)
+    assert room.most_after(setup, setup.schedule, 10, 0) == 50 * more
+    monkeypatch.setattr(rates, "HURRY", 0)
+    assert room.most_after(setup, setup.schedule, 10, 0) == 50
 
 
 @pytest.mark.parametrize("longer", [700, 3_000, 5_000])
