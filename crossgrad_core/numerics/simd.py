@@ -79,7 +79,7 @@ def whole_type(a: Any) -> ir.Type:
 #: Numba type of a vector of sixteen numbers.
 SIXTEEN = _lanes(WIDE)
 _eight = _lanes(LANES)
-_triple = cast("Any", types).UniTuple(_eight, 3)
+_triple, _four = (cast("Any", types).UniTuple(_eight, count) for count in (3, 4))
 
 
 @register_model(_LanesType)
@@ -249,6 +249,13 @@ def _load_triples(at: Site, array: Any, index: Any) -> Any:
     return at.context.make_tuple(at.builder, _triple, picked)
 
 
+def _load_fours(at: Site, array: Any, index: Any) -> Any:
+    a, b, c, d = (at.builder.load(p, align=_ALIGNMENT) for p in _parts(at, array, index, 4))
+    low, high = shuffled(at, a, b, range(WIDE)), shuffled(at, c, d, range(WIDE))
+    picked = [shuffled(at, low, high, range(i, 2 * WIDE, 4)) for i in range(4)]
+    return at.context.make_tuple(at.builder, _four, picked)
+
+
 def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> Any:
     two, third = shuffled(at, x, y, range(WIDE)), shuffled(at, z, z, range(WIDE))
     mixed = [i + LANES * channel for i in range(LANES) for channel in range(3)]
@@ -258,9 +265,9 @@ def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> 
     return at.context.get_dummy_value()
 
 
-def _parts(at: Site, array: Any, index: Any) -> list[Any]:
-    """The addresses of three vectors of eight, one after the other."""
-    places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(3)]
+def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
+    """The addresses of vectors of eight, one after the other."""
+    places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(count)]
     return [_element(at, array, place, _floats(LANES)) for place in places]
 
 
@@ -325,6 +332,7 @@ def _ramp(width: int) -> Callable[..., Any]:
 
 _Array = NDArray[Any]
 _Three = tuple[Lanes, Lanes, Lanes]
+_Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 #: Returns a float32 number in all lanes.
 splat: Callable[[np.float32], Lanes] = emitted(_splat(LANES), _eight, types.float32)
@@ -369,6 +377,8 @@ halves_added: Callable[[Lanes], Lanes] = emitted(_halves_added, _eight, SIXTEEN)
 #: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
 #: vectors, from a flat index on.
 load_triples: Callable[[_Array, int], _Three] = emitted(_load_triples, _triple, None, types.intp)
+#: Returns eight consecutive fours, such as quaternions, likewise.
+load_fours: Callable[[_Array, int], _Four] = emitted(_load_fours, _four, None, types.intp)
 #: Writes eight consecutive triples likewise.
 store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = emitted(
     _store_triples, types.void, None, types.intp, _eight, _eight, _eight

@@ -16,6 +16,7 @@ from crossgrad_core.numerics.simd import (
     joined,
     last_half,
     load,
+    load_fours,
     load_triples,
     load_wide,
     picking,
@@ -35,6 +36,12 @@ turned = picking(ORDER)
 def _turned(source, target):
     x, y, z = load_triples(source, 1)
     store_triples(target, 2, z, x, y)
+
+
+@kernel
+def _apart(source, target):
+    for i, part in enumerate(load_fours(source, 1)):
+        store(target, i * LANES, part)
 
 
 @kernel
@@ -77,6 +84,14 @@ def test_triples_come_apart_and_together_again():
     triples = source[1:].reshape(LANES, 3)
     np.testing.assert_array_equal(target[2:-1].reshape(LANES, 3), triples[:, [2, 0, 1]])
     assert target[[0, 1, -1]].tolist() == [-1, -1, -1]
+
+
+def test_fours_come_apart():
+    source = np.arange(4 * LANES + 1, dtype=np.float32)
+    target = np.full(4 * LANES + 1, -1, np.float32)
+    _apart(source, target)
+    np.testing.assert_array_equal(target[:-1].reshape(4, LANES), source[1:].reshape(LANES, 4).T)
+    assert target[-1] == -1
 
 
 def test_parts_of_vectors():

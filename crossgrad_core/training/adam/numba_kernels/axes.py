@@ -5,70 +5,84 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import device, kernel
 from crossgrad_core.numerics.jobs import Jobs, alone, share, take
+from crossgrad_core.numerics.simd import (
+    LANES,
+    Lanes,
+    fma,
+    larger,
+    load_fours,
+    load_triples,
+    splat,
+    store_triples,
+    where,
+)
 
 #: Rows of one job; fixed, so that the split does not depend on the number of threads.
 _ROWS = 1 << 13
-#: Rows whose numbers are laid side by side, so that the compiler works on many of them at a time.
-_BLOCK = 64
-_ONE, _TWO = np.float32(1), np.float32(2)
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 #: Squares below it have lost their digits.
 _SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]
+_Three = tuple[Lanes, Lanes, Lanes]
+_Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 
 @device
-def _stretch(given: _Floats, moved: _Floats) -> None:
+def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
     """Turns steps into the frames of the Gaussians, stretches them there, and turns them back.
 
-    Args:
-        given: [10, _BLOCK] steps, factors and quaternions; of one that is as good as zero the
-            frame is the world's.
-        moved: [3, _BLOCK] the steps to take.
+    The frame of a quaternion that is as good as zero is the world's.
     """
-    for j in range(_BLOCK):
-        a, b, c = given[0, j], given[1, j], given[2, j]
-        w, x, y, z = given[6, j], given[7, j], given[8, j], given[9, j]
-        square = w * w + x * x + y * y + z * z
-        twice = _TWO * (square > _SMALLEST) / max(square, _SMALLEST)
-        xx, yy, zz = twice * x * x, twice * y * y, twice * z * z
-        xy, xz, yz = twice * x * y, twice * x * z, twice * y * z
-        wx, wy, wz = twice * w * x, twice * w * y, twice * w * z
-        r00, r01, r02 = _ONE - (yy + zz), xy - wz, xz + wy
-        r10, r11, r12 = xy + wz, _ONE - (xx + zz), yz - wx
-        r20, r21, r22 = xz - wy, yz + wx, _ONE - (xx + yy)
-        p = given[3, j] * (r00 * a + r10 * b + r20 * c)
-        q = given[4, j] * (r01 * a + r11 * b + r21 * c)
-        r = given[5, j] * (r02 * a + r12 * b + r22 * c)
-        moved[0, j] = r00 * p + r01 * q + r02 * r
-        moved[1, j] = r10 * p + r11 * q + r12 * r
-        moved[2, j] = r20 * p + r21 * q + r22 * r
+    a, b, c = steps
+    w, x, y, z = quats
+    one, smallest = splat(_ONE), splat(_SMALLEST)
+    square = fma(z, z, fma(y, y, fma(w, w, x * x)))
+    twice = where(smallest < square, splat(_TWO), splat(_ZERO)) / larger(square, smallest)
+    xx, yy, zz = twice * x * x, twice * y * y, twice * z * z
+    xy, xz, yz = twice * x * y, twice * x * z, twice * y * z
+    wx, wy, wz = twice * w * x, twice * w * y, twice * w * z
+    r00, r01, r02 = one - (yy + zz), xy - wz, xz + wy
+    r10, r11, r12 = xy + wz, one - (xx + zz), yz - wx
+    r20, r21, r22 = xz - wy, yz + wx, one - (xx + yy)
+    # The order of these sums decides about last bits: runs are repeated with it.
+    p = factors[0] * fma(r20, c, fma(r10, b, r00 * a))
+    q = factors[1] * fma(r21, c, fma(r01, a, r11 * b))
+    r = factors[2] * fma(r22, c, fma(r02, a, r12 * b))
+    return (
+        fma(r02, r, fma(r00, p, r01 * q)),
+        fma(r12, r, fma(r10, p, r11 * q)),
+        fma(r22, r, fma(r20, p, r21 * q)),
+    )
 
 
 @kernel
 def _move_chunks(
     jobs: Jobs, positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats
 ) -> None:
-    given, moved = np.zeros((10, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
+    # What is left over at the end is worked on here.
+    place, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
+    factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)
     chunks = (rows + _ROWS - 1) // _ROWS
     job = take(jobs, chunks)
     while job < chunks:
-        end = min(rows, (job + 1) * _ROWS)
-        for first in range(job * _ROWS, end, _BLOCK):
-            count = min(_BLOCK, end - first)
-            for j in range(count):
-                i = first + j
-                given[0, j], given[1, j], given[2, j] = steps[i, 0], steps[i, 1], steps[i, 2]
-                given[3, j], given[4, j], given[5, j] = factors[i, 0], factors[i, 1], factors[i, 2]
-                given[6, j], given[7, j] = quats[i, 0], quats[i, 1]
-                given[8, j], given[9, j] = quats[i, 2], quats[i, 3]
-            _stretch(given, moved)
-            for j in range(count):
-                i = first + j
-                positions[i, 0] += moved[0, j]
-                positions[i, 1] += moved[1, j]
-                positions[i, 2] += moved[2, j]
+        first, end = job * _ROWS, min(rows, (job + 1) * _ROWS)
+        whole = first + (end - first) // LANES * LANES
+        for i in range(first, whole, LANES):
+            moved = _stretched(
+                load_triples(steps, 3 * i), load_triples(factors, 3 * i), load_fours(quats, 4 * i)
+            )
+            x, y, z = load_triples(positions, 3 * i)
+            store_triples(positions, 3 * i, x + moved[0], y + moved[1], z + moved[2])
+        left = end - whole
+        if left:
+            place[:left], step[:left] = positions[whole:end], steps[whole:end]
+            factor[:left], quat[:left] = factors[whole:end], quats[whole:end]
+            moved = _stretched(load_triples(step, 0), load_triples(factor, 0), load_fours(quat, 0))
+            x, y, z = load_triples(place, 0)
+            store_triples(place, 0, x + moved[0], y + moved[1], z + moved[2])
+            positions[whole:end] = place[:left]
         job = take(jobs, chunks)
 
 

@@ -27,6 +27,7 @@ from crossgrad_core.numerics.simd import (
     magnitude,
     prefetch_write,
     splat,
+    splat_wide,
     square_root,
     store,
     where,
@@ -50,6 +51,8 @@ _GATHERED = 128
 _AT_ONCE = 768
 #: Long rows that are taken together where they follow one another.
 _SIDE_BY_SIDE = 16
+#: Elements of a row of colours.
+_COLOUR = 3
 #: Elements of a cache line, and rows that memory is asked for ahead of time.
 _LINE, _AHEAD = 16, 6
 #: Steps between two looks at whether a parameter still moves.
@@ -187,20 +190,21 @@ def catch_up(
 def _stepped(
     p: Lanes, m: Lanes, v: Lanes, g: Lanes, numbers: Numbers
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """One step with eight elements and their gradient, operation by operation that of `update`."""
+    """One step with sixteen elements and their gradient, as `update` does it."""
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
-    zero, tiny, most = splat(_ZERO), splat(_TINY), splat(_LARGEST)
-    g = splat(scale) * g
+    zero, tiny, most = splat_wide(_ZERO), splat_wide(_TINY), splat_wide(_LARGEST)
+    least = splat_wide(-_LARGEST)
+    g = splat_wide(scale) * g
     # Comparisons with NaN are false, so that it passes.
-    g = where(most < g, most, where(g < splat(-_LARGEST), splat(-_LARGEST), g))
+    g = where(most < g, most, where(g < least, least, g))
     g = where(magnitude(g) < tiny, zero, g)
-    m = fma(splat(beta1), m, splat(new1) * g)
+    m = fma(splat_wide(beta1), m, splat_wide(new1) * g)
     m = where(magnitude(m) < tiny, zero, m)
-    g = where(magnitude(g) < splat(square_floor), zero, g)
-    v = fma(splat(beta2), v, splat(new2) * g * g)
-    v = where(v < splat(_SMALLEST_NORMAL), zero, v)
-    root = fma(square_root(v), splat(root_scale), splat(eps))
-    return fnma(splat(step_size), m / root, p), m, v
+    g = where(magnitude(g) < splat_wide(square_floor), zero, g)
+    v = fma(splat_wide(beta2), v, splat_wide(new2) * g * g)
+    v = where(v < splat_wide(_SMALLEST_NORMAL), zero, v)
+    root = fma(square_root(v), splat_wide(root_scale), splat_wide(eps))
+    return fnma(splat_wide(step_size), m / root, p), m, v
 
 
 @kernel
@@ -227,10 +231,9 @@ def update_rows(
         numbers: Of the step, as in `fused`.
     """
     # Loops stand here, not in a function: Numba counts references of arrays at each call.
-    wide = width >= LANES
+    wide = width >= WIDE
     room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
     ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
-    end = width - width % LANES
     tasks = (rows.size + _ROWS - 1) // _ROWS
     task = take(jobs, tasks)
     while task < tasks:
@@ -246,13 +249,15 @@ def update_rows(
             for k in range(first, stop if wide else first):
                 _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
                 at, begin = np.intp(rows[k]) * width, k * width
-                # The last eight overlap with others: worked out before these are written.
-                tail, of_tail = at + width - LANES, begin + width - LANES
-                p, m, v = load(param, tail), load(exp_avg, tail), load(exp_avg_sq, tail)
-                p_tail, m_tail, v_tail = _stepped(p, m, v, load(grad, of_tail), numbers)
-                for i in range(0, end, LANES):
-                    p, m, v = load(param, at + i), load(exp_avg, at + i), load(exp_avg_sq, at + i)
-                    p, m, v = _stepped(p, m, v, load(grad, begin + i), numbers)
+                # The last sixteen overlap with others: worked out before these are written.
+                tail, of_tail = at + width - WIDE, begin + width - WIDE
+                p, m = load_wide(param, tail), load_wide(exp_avg, tail)
+                v = load_wide(exp_avg_sq, tail)
+                p_tail, m_tail, v_tail = _stepped(p, m, v, load_wide(grad, of_tail), numbers)
+                for i in range(0, width - WIDE, WIDE):
+                    p, m = load_wide(param, at + i), load_wide(exp_avg, at + i)
+                    v = load_wide(exp_avg_sq, at + i)
+                    p, m, v = _stepped(p, m, v, load_wide(grad, begin + i), numbers)
                     store(param, at + i, p)
                     store(exp_avg, at + i, m)
                     store(exp_avg_sq, at + i, v)
@@ -299,7 +304,7 @@ def update_all(
         numbers: Of the step, as in `fused`.
     """
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
-    pulls = np.empty(together * width, np.float32)
+    pulls, none = np.zeros(together * width, np.float32), splat_wide(_ZERO)
     tasks = (count + _ROWS - 1) // _ROWS
     task = take(jobs, tasks)
     while task < tasks:
@@ -315,25 +320,40 @@ def update_all(
                 own = grad[begin * width : place * width]
                 update(param[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 continue
-            pulls[: b - a] = _ZERO
+            if not drawn and not moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
+                continue
             if width < WIDE:
-                # To look for runs of short rows takes longer than to copy each.
                 for k in range(begin, place):
                     at, to = k * width, (np.intp(rows[k]) - first) * width
+                    if width == _COLOUR:  # A loop of unknown length takes longer than its body.
+                        pulls[to], pulls[to + 1] = grad[at], grad[at + 1]
+                        pulls[to + 2] = grad[at + 2]
+                        continue
                     for i in range(width):
                         pulls[to + i] = grad[at + i]
-                begin = place
-            k = begin
-            while k < place:
-                # Rows that follow one another are copied in one go.
-                run = 1
-                while k + run < place and rows[k + run] - rows[k] == run:
-                    run += 1
-                at, to, size = k * width, (np.intp(rows[k]) - first) * width, run * width
-                for i in range(0, size - WIDE + 1, WIDE):
-                    store(pulls, to + i, load_wide(grad, at + i))
-                store(pulls, to + size - WIDE, load_wide(grad, at + size - WIDE))
-                k += run
-            if drawn or moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
+                pulls[: b - a] = _ZERO
+                continue
+            for row in range(first, stop):
+                at, pulled = row * width, begin < place and rows[begin] == row
+                # As in `update_rows`.
+                tail, g = at + width - WIDE, none
+                if pulled:
+                    g = load_wide(grad, (begin + 1) * width - WIDE)
+                p, m = load_wide(param, tail), load_wide(exp_avg, tail)
+                v = load_wide(exp_avg_sq, tail)
+                p_tail, m_tail, v_tail = _stepped(p, m, v, g, numbers)
+                for i in range(0, width - WIDE, WIDE):
+                    if pulled:
+                        g = load_wide(grad, begin * width + i)
+                    p, m = load_wide(param, at + i), load_wide(exp_avg, at + i)
+                    v = load_wide(exp_avg_sq, at + i)
+                    p, m, v = _stepped(p, m, v, g, numbers)
+                    store(param, at + i, p)
+                    store(exp_avg, at + i, m)
+                    store(exp_avg_sq, at + i, v)
+                store(param, tail, p_tail)
+                store(exp_avg, tail, m_tail)
+                store(exp_avg_sq, tail, v_tail)
+                begin += pulled
         task = take(jobs, tasks)
