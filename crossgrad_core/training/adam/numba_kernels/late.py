@@ -51,8 +51,6 @@ _GATHERED = 128
 _AT_ONCE = 768
 #: Long rows that are taken together where they follow one another.
 _SIDE_BY_SIDE = 16
-#: Elements of a row of colours.
-_COLOUR = 3
 #: Elements of a cache line, and rows that memory is asked for ahead of time.
 _LINE, _AHEAD = 16, 6
 #: Steps between two looks at whether a parameter still moves.
@@ -207,6 +205,43 @@ def _stepped(
     return fnma(splat_wide(step_size), m / root, p), m, v
 
 
+@device
+def _step_row(
+    row: int,
+    width: int,
+    drawn: bool,
+    place: int,
+    param: Floats,
+    grad: Floats,
+    exp_avg: Floats,
+    exp_avg_sq: Floats,
+    numbers: Numbers,
+) -> None:
+    """Takes one step with a row of WIDE elements or more.
+
+    Its gradient is row `place` of `grad` if it is drawn, else zero.
+    """
+    at, begin, g = row * width, place * width, splat_wide(_ZERO)
+    # The last sixteen overlap with others: worked out before these are written.
+    tail = at + width - WIDE
+    if drawn:
+        g = load_wide(grad, begin + width - WIDE)
+    p, m, v = load_wide(param, tail), load_wide(exp_avg, tail), load_wide(exp_avg_sq, tail)
+    p_tail, m_tail, v_tail = _stepped(p, m, v, g, numbers)
+    for i in range(0, width - WIDE, WIDE):
+        here = at + i
+        if drawn:
+            g = load_wide(grad, begin + i)
+        p, m, v = load_wide(param, here), load_wide(exp_avg, here), load_wide(exp_avg_sq, here)
+        p, m, v = _stepped(p, m, v, g, numbers)
+        store(param, here, p)
+        store(exp_avg, here, m)
+        store(exp_avg_sq, here, v)
+    store(param, tail, p_tail)
+    store(exp_avg, tail, m_tail)
+    store(exp_avg_sq, tail, v_tail)
+
+
 @kernel
 def update_rows(
     jobs: Jobs,
@@ -230,7 +265,6 @@ def update_rows(
         exp_avg_sq: [N * width].
         numbers: Of the step, as in `fused`.
     """
-    # Loops stand here, not in a function: Numba counts references of arrays at each call.
     wide = width >= WIDE
     room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
     ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -248,22 +282,8 @@ def update_rows(
                 continue
             for k in range(first, stop if wide else first):
                 _bring_near(rows, k + _AHEAD, width, param, exp_avg, exp_avg_sq)
-                at, begin = np.intp(rows[k]) * width, k * width
-                # The last sixteen overlap with others: worked out before these are written.
-                tail, of_tail = at + width - WIDE, begin + width - WIDE
-                p, m = load_wide(param, tail), load_wide(exp_avg, tail)
-                v = load_wide(exp_avg_sq, tail)
-                p_tail, m_tail, v_tail = _stepped(p, m, v, load_wide(grad, of_tail), numbers)
-                for i in range(0, width - WIDE, WIDE):
-                    p, m = load_wide(param, at + i), load_wide(exp_avg, at + i)
-                    v = load_wide(exp_avg_sq, at + i)
-                    p, m, v = _stepped(p, m, v, load_wide(grad, begin + i), numbers)
-                    store(param, at + i, p)
-                    store(exp_avg, at + i, m)
-                    store(exp_avg_sq, at + i, v)
-                store(param, tail, p_tail)
-                store(exp_avg, tail, m_tail)
-                store(exp_avg_sq, tail, v_tail)
+                row = np.intp(rows[k])
+                _step_row(row, width, True, k, param, grad, exp_avg, exp_avg_sq, numbers)
             if wide:
                 continue
             for k in range(first, stop):
@@ -304,7 +324,7 @@ def update_all(
         numbers: Of the step, as in `fused`.
     """
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
-    pulls, none = np.zeros(together * width, np.float32), splat_wide(_ZERO)
+    pulls = np.zeros(together * width, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
     task = take(jobs, tasks)
     while task < tasks:
@@ -317,43 +337,21 @@ def update_all(
                 place += 1
             drawn = place - begin
             if drawn == stop - first:
-                own = grad[begin * width : place * width]
-                update(param[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], numbers)
+                given = grad[begin * width : place * width]
+                update(param[a:b], given, exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 continue
             if not drawn and not moves(pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b]):
                 continue
             if width < WIDE:
                 for k in range(begin, place):
                     at, to = k * width, (np.intp(rows[k]) - first) * width
-                    if width == _COLOUR:  # A loop of unknown length takes longer than its body.
-                        pulls[to], pulls[to + 1] = grad[at], grad[at + 1]
-                        pulls[to + 2] = grad[at + 2]
-                        continue
                     for i in range(width):
                         pulls[to + i] = grad[at + i]
                 update(param[a:b], pulls[: b - a], exp_avg[a:b], exp_avg_sq[a:b], numbers)
                 pulls[: b - a] = _ZERO
                 continue
             for row in range(first, stop):
-                at, pulled = row * width, begin < place and rows[begin] == row
-                # As in `update_rows`.
-                tail, g = at + width - WIDE, none
-                if pulled:
-                    g = load_wide(grad, (begin + 1) * width - WIDE)
-                p, m = load_wide(param, tail), load_wide(exp_avg, tail)
-                v = load_wide(exp_avg_sq, tail)
-                p_tail, m_tail, v_tail = _stepped(p, m, v, g, numbers)
-                for i in range(0, width - WIDE, WIDE):
-                    if pulled:
-                        g = load_wide(grad, begin * width + i)
-                    p, m = load_wide(param, at + i), load_wide(exp_avg, at + i)
-                    v = load_wide(exp_avg_sq, at + i)
-                    p, m, v = _stepped(p, m, v, g, numbers)
-                    store(param, at + i, p)
-                    store(exp_avg, at + i, m)
-                    store(exp_avg_sq, at + i, v)
-                store(param, tail, p_tail)
-                store(exp_avg, tail, m_tail)
-                store(exp_avg_sq, tail, v_tail)
-                begin += pulled
+                own = begin < place and rows[begin] == row
+                _step_row(row, width, own, begin, param, grad, exp_avg, exp_avg_sq, numbers)
+                begin += own
         task = take(jobs, tasks)
