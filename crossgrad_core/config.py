@@ -89,10 +89,11 @@ class RunConfig(BaseModel):
         ComponentChoice(name=defaults.LOSS),
         description=f"How far a render is from its photo. Default: {defaults.LOSS}.",
     )
-    exposure: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
-        ComponentChoice(name=defaults.EXPOSURE),
+    exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+        None,
         description="What cameras do to light between render and photo. "
-        f"Default: {defaults.EXPOSURE}.",
+        f"Default: {defaults.EXPOSURE}, a gain per photo if the photos differ in exposure; "
+        f"{defaults.NO_EXPOSURE} with --preset inria.",
     )
     exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
         None,
@@ -250,10 +251,10 @@ class RunConfig(BaseModel):
         "(order of a step, 3-sigma footprint and near plane of the original code). Default: fast.",
     )
     plan: Annotated[Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION)] = Field(
-        "turns",
+        "off",
         description="auto: what the scene does not need is left out, on evidence that is shown; "
-        "turns: far views come first where drone and street meet, and nothing else is decided. "
-        "What is set here wins. Default: turns.",
+        "turns: far views come first if drone and street meet, and nothing else is decided. "
+        "What is set here wins. Default: off.",
     )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",

@@ -10,7 +10,9 @@ BACKBONE: Final = "vanilla"
 SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
-EXPOSURE: Final = "none"
+EXPOSURE: Final = "auto"
+#: The exposure of published runs: photos are compared as they are.
+NO_EXPOSURE: Final = "none"
 START: Final = "filled"
 #: The start of published runs, and of those that begin with points of their own: it adds nothing.
 BARE_START: Final = "sfm"

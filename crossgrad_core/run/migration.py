@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crossgrad_core.defaults import BARE_START, METRICS_OF_0_1, RESOLUTION
+from crossgrad_core.defaults import BARE_START, METRICS_OF_0_1, NO_EXPOSURE, RESOLUTION
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import load
 from crossgrad_core.system.version import VERSION
@@ -67,6 +67,7 @@ def migrated(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
         rest.setdefault("growth", "free")
         rest.setdefault("dropout", 0.0)
         rest.setdefault("floaters", "keep")
+        rest.setdefault("exposure", {"name": NO_EXPOSURE})
         rest.setdefault("start", {"name": BARE_START})
         rest.setdefault("resolution", {"name": RESOLUTION})
         rest.setdefault("metrics", [{"name": name} for name in METRICS_OF_0_1.split("+")])

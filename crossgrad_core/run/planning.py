@@ -10,7 +10,6 @@ from crossgrad_core.contract.state import Json
 from crossgrad_core.defaults import PLANNER
 from crossgrad_core.registry.entries import find, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS
-from crossgrad_core.wording import in_one_line
 
 _LOG = logging.getLogger(__name__)
 #: What a planner decided, as plain data: `seconds` that it took, `notes` for the user, and
@@ -22,28 +21,14 @@ Plan: TypeAlias = Mapping[str, Json]
 Planner: TypeAlias = Callable[[RunConfig, Scene], tuple[RunConfig, Plan]]
 
 
-def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan | None]:
-    """The configuration with what the planner decided, which repeats the run without it.
-
-    There is no plan where nothing was asked for and nothing is decided, or nothing can decide it.
+def planned(config: RunConfig, scene: Scene) -> tuple[RunConfig, Plan]:
+    """Return the configuration with the planner's decisions, which repeats the run, and the plan.
 
     Raises:
-        UserError: One was asked for, and there is no planner, it cannot be imported, or a photo
-            cannot be decoded.
+        UserError: There is no planner, it cannot be imported, or a photo cannot be decoded.
     """
-    asked = "plan" in config.model_fields_set
-    if asked:
-        _LOG.info("looking at what the scene needs")
-    plan: Plan | None
-    try:
-        decided, plan = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))(config, scene)
-    except Exception as error:
-        if asked:
-            raise
-        _LOG.warning("nothing is planned: %s", getattr(error, "what", in_one_line(error)))
-        decided, plan = config, None
-    if decided is config and not asked:
-        plan = None
+    _LOG.info("looking at what the scene needs")
+    decided, plan = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))(config, scene)
     return decided.model_copy(update={"plan": "off"}), plan
 
 

@@ -20,7 +20,14 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
-from crossgrad_core.defaults import BARE_START, METRICS, START, START_ALONE
+from crossgrad_core.defaults import (
+    BARE_START,
+    EXPOSURE,
+    METRICS,
+    NO_EXPOSURE,
+    START,
+    START_ALONE,
+)
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
@@ -74,7 +81,8 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     usual = usual_resolution(config, views, backbone, densifier, device.type)
     resolution, resolution_name = _named_or(usual, Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
-    exposure = _built(Exposure, config.exposure)
+    exposure_choice = config.exposure or ComponentChoice(name=usual_exposure(config))
+    exposure = _built(Exposure, exposure_choice)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
     notes += fitted.notes
     names = {
@@ -84,7 +92,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "densifier": densifier_name,
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
-        "exposure": fitted.name or config.exposure.name,
+        "exposure": fitted.name or exposure_choice.name,
         "start": start_name,
         "resolution": resolution_name,
         "exporter": config.exporter.name,
@@ -119,6 +127,11 @@ def _usual_start(config: RunConfig) -> str:
     """The start of a run that names none."""
     bare = config.preset == "inria" or config.reading.init != "points"
     return BARE_START if bare else START
+
+
+def usual_exposure(config: RunConfig) -> str:
+    """The exposure of a run that names none."""
+    return NO_EXPOSURE if config.preset == "inria" else EXPOSURE
 
 
 def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:

@@ -1,13 +1,15 @@
 """The rule for exposure on real photos: the bundled scene, and others where they are there."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from crossgrad_core.commands import configured, read_scene
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_plugins.exposures.tracks.gains import track_gains
+from crossgrad_plugins.exposures.tracks.gains import deciding_gains, track_gains
 
 #: Scene -> standard deviation of the gains in stops, share of the deviation that they take away,
 #: and whether photos differ (docs/exposure.md).
@@ -44,3 +46,21 @@ def test_the_table_of_scenes(name):
     assert gains.differ == differ
     assert gains.spread == pytest.approx(spread, abs=0.02)
     assert gains.fit.reduction == pytest.approx(reduction, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "differ"), [("ochota_kap_hybrid", True), ("ochota_kap_hybrid_gain", False)]
+)
+def test_near_and_far_photos_that_share_thirty_points(name, differ):
+    if not (SCENES / name).is_dir():
+        pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
+    scene, _ = read_scene(configured({"scene": SCENES / name, "threads": 1}))
+    near = [view for view in scene.views if view.regime == "near"]
+    shown = np.zeros((2, len(scene.points)), dtype=bool)
+    for view in scene.views:
+        shown[int(view.regime == "near"), view.seen] = True
+    shared = np.flatnonzero(shown.all(axis=0))
+    lost = np.random.default_rng(0).permutation(shared)[30:]
+    thinned = {view.name: view.seen[~np.isin(view.seen, lost)] for view in near}
+    views = [replace(v, seen=thinned.get(v.name, v.seen)) for v in scene.views]
+    assert deciding_gains(replace(scene, views=tuple(views))).differ == differ

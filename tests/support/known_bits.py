@@ -37,6 +37,7 @@ USUAL: Mapping[str, Any] = {
     "densify_until": 45,
     "eval_every": 50,
     "start": "sfm",
+    "exposure": "none",
     "sampler": "random",
     "views": 2,
     "beta1": 0.9,

@@ -8,7 +8,11 @@ from statistics import median
 from crossgrad_core.plugin import Scene
 from crossgrad_plugins.diagnostics.table import Row
 from crossgrad_plugins.exposures.exif import exposure_values
-from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
+from crossgrad_plugins.exposures.tracks.gains import (
+    TrackGains,
+    deciding_gains,
+    track_gains,
+)
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class SceneExposure:
 
     Attributes:
         rows: A row for each photo, in the order of their names.
-        evidence: What the rule for `--exposure auto` goes by, over all photos.
+        evidence: What `--exposure auto` decides by: the gains of the training photos.
         differ: Whether it calls for a gain per photo.
         spread: Standard deviation of the gains, stops.
         before: Deviation of the observations, stops.
@@ -47,9 +51,9 @@ def exposure_of(scene: Scene) -> SceneExposure:
     Raises:
         UserError: A photo cannot be decoded.
     """
-    gains = track_gains(scene, scene.views)
+    rows = _rows(scene, track_gains(scene, scene.views))
+    gains = deciding_gains(scene)
     fit = gains.fit
-    rows = _rows(scene, gains)
     return SceneExposure(rows, gains.evidence, gains.differ, gains.spread, fit.before, fit.after)
 
 

@@ -6,25 +6,36 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, Fitted, Scene
-from crossgrad_plugins.exposures.gain import Gain
 from crossgrad_plugins.exposures.none import NoExposure
-from crossgrad_plugins.exposures.tracks.gains import LEAST_REDUCTION, LEAST_SPREAD, training_gains
+from crossgrad_plugins.exposures.tracks.gains import (
+    LEAST_RATIO,
+    LEAST_REDUCTION,
+    LEAST_SPREAD,
+    deciding_gains,
+)
 
 
 class Auto(Exposure):
     """Takes `gain` where the brightness of SfM tracks calls for it, and `none` elsewhere.
 
-    On where the gains that explain the brightness of the training photos at SfM points have a
-    standard deviation of at least 0.2 stops, and take at least 15 % off the deviation.
+    The gains are those that explain the brightness of the training photos at SfM points. `gain` is
+    taken if their standard deviation is at least 0.2 stops and at least four times its standard
+    error, and if they take at least 15 % off the deviation of points that join different photos.
     """
 
     @override
     def fitted_to(self, scene: Scene) -> Fitted:
-        gains = training_gains(scene)
+        gains = deciding_gains(scene)
         if gains.differ:
+            # Not before: a run without exposure does not import it.
+            from crossgrad_plugins.exposures.gain import Gain
+
             # Its remarks have the evidence.
             return Fitted(Gain(), "gain", ("exposure auto: gain",))
-        rule = f"less than {LEAST_SPREAD} stops or {100 * LEAST_REDUCTION:.0f} %"
+        rule = (
+            f"less than {LEAST_SPREAD} stops, {LEAST_RATIO:.0f} standard errors or "
+            f"{100 * LEAST_REDUCTION:.0f} %"
+        )
         why = gains.evidence if not gains.known.any() else f"{gains.evidence}; {rule}"
         return Fitted(NoExposure(), "none", (f"exposure auto: none; {why}",))
 

@@ -7,9 +7,6 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, Scene
 
-#: Photos that are looked at for the remark; evenly spaced among more.
-_MOST = 48
-
 
 class NoExposure(Exposure):
     """Compares renders with photos as they are: all are taken to have the same exposure."""
@@ -21,14 +18,12 @@ class NoExposure(Exposure):
     @override
     def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
         """Names the option that helps where SfM tracks say that photos differ in exposure."""
-        views = scene.train_views
-        if not any(len(view.seen) for view in views):
+        if not any(len(view.seen) for view in scene.train_views):
             return ()
-        from crossgrad_plugins.exposures.tracks.gains import track_gains
+        from crossgrad_plugins.exposures.tracks.gains import deciding_gains
 
-        chosen = views[:: -(-len(views) // _MOST)]
         try:
-            gains = track_gains(scene, chosen)
+            gains = deciding_gains(scene)
         except Exception:
             return ()
         if not gains.differ:

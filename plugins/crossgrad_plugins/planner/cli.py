@@ -95,7 +95,7 @@ def plan(  # noqa: PLR0913, PLR0917 - one parameter per option of the command li
     Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
     stands in a table with the decision, the figure it rests on, what it saves, and the option that
     overrules it. Where evidence is missing the default stays. `crossgrad run --plan auto` decides
-    likewise and trains; `crossgrad run` by itself decides how often far and near views come.
+    likewise and trains; `--plan turns` only decides how often far and near views come.
     """
     announce(quiet=as_json)
     from crossgrad_plugins.planner import app

@@ -16,29 +16,38 @@ ONE_SCALE: Final = 2.0
 
 def exposure(evidence: Evidence) -> Decision:
     """Whether photos get an exposure each."""
-    part, usual = "exposure", evidence.config.exposure.name
-    if evidence.is_given("exposure", "exposure_from"):
-        return given(part, usual, "--exposure NAME")
+    part, config = "exposure", evidence.config
+    if evidence.is_given("exposure", "exposure_from") or config.preset == "inria":
+        chosen = config.exposure.name if config.exposure else "as a run has it"
+        return given(part, chosen, "--exposure NAME")
     from crossgrad_plugins.exposures.tracks.gains import (
+        LEAST_RATIO,
         LEAST_REDUCTION,
         LEAST_SPREAD,
-        training_gains,
+        deciding_gains,
     )
 
-    rule = f"gain from {LEAST_SPREAD} stops and {LEAST_REDUCTION:.0%} less deviation on"
-    plain = Decision(
-        part, usual, "default", "", rule, "docs/exposure.md, six scenes", "--exposure gain"
+    rule = (
+        f"gain from {LEAST_SPREAD} stops, {LEAST_RATIO:.0f} standard errors and "
+        f"{LEAST_REDUCTION:.0%} less deviation on"
     )
+    source = "docs/exposure.md, six scenes"
+    plain = Decision(part, "none", "default", "", rule, source, "--exposure gain")
     if not any(len(view.seen) for view in evidence.scene.train_views):
         return plain.found("no SfM tracks tell how bright photos are beside each other")
-    gains = training_gains(evidence.scene)
+    gains = deciding_gains(evidence.scene)
     photos = int(gains.known.sum())
     if not photos:
         return plain.found(gains.evidence)
-    figures = {"spread_stops": gains.spread, "reduction": gains.fit.reduction, "photos": photos}
+    figures = {
+        "spread_stops": gains.spread,
+        "error_stops": gains.error,
+        "reduction": gains.fit.reduction,
+        "photos": photos,
+    }
     shown = plain.found(
-        f"gains of {photos} photos: {gains.spread:.2f} stops standard deviation, "
-        f"{gains.fit.reduction:.0%} off the deviation of tracks",
+        f"gains of {photos} photos: {gains.spread:.2f} stops standard deviation (standard error "
+        f"{gains.error:.2f}), {gains.fit.reduction:.0%} off the deviation of tracks",
         decided=True,
         saved="a gain and its step per photo",
         figures=figures,

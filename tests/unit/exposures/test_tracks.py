@@ -13,7 +13,13 @@ from crossgrad_plugins.exposures import srgb
 from crossgrad_plugins.exposures.auto import Auto
 from crossgrad_plugins.exposures.none import NoExposure
 from crossgrad_plugins.exposures.tracks.fit import fitted
-from crossgrad_plugins.exposures.tracks.gains import track_gains, training_gains
+from crossgrad_plugins.exposures.tracks.gains import (
+    MOST_DECIDING,
+    TrackGains,
+    deciding_gains,
+    track_gains,
+    training_gains,
+)
 from crossgrad_plugins.exposures.tracks.light import light_at
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
@@ -30,6 +36,72 @@ def observed(gains, points, per_photo, noise=0.1, seed=0):
     stops = gains[photos] + brightness[numbers] + rng.normal(0, noise, len(photos))
     stops += (rng.random(len(photos)) < 0.05) * rng.normal(3, 2, len(photos))
     return Observations(photos, numbers, stops, np.arange(points))
+
+
+#: Photos of two groups of which few points join both, as near and far photos of one place.
+NEAR, FAR = 18, 22
+
+
+def two_groups(joining, offset=0.0, noise=0.2, outliers=0.05, lobes=0.0, seed=0):
+    """Observations of two groups of photos that so many points join.
+
+    Args:
+        joining: Points that a photo of each group shows.
+        offset: Stops by which near photos are brighter.
+        noise: Standard deviation of each observation, stops.
+        outliers: Share of observations that are off by far.
+        lobes: Stops by which a point is brighter than its mean from the side to which it shines.
+        seed: Of all random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    shown = []
+    for first, last in ((0, NEAR), (NEAR, NEAR + FAR)):
+        for _ in range(400):
+            around = rng.integers(first, last) + rng.integers(-3, 4, 4)
+            shown.append(np.unique(np.clip(around, first, last - 1)))
+    for _ in range(joining):
+        far = NEAR + rng.choice(FAR, rng.integers(1, 3), replace=False)
+        shown.append(np.concatenate([[rng.integers(NEAR)], far]))
+    photos = np.concatenate(shown)
+    points = np.repeat(np.arange(len(shown)), [len(each) for each in shown])
+    sides, angles = rng.uniform(0, 2 * np.pi, len(shown)), np.linspace(0, 6, NEAR + FAR)
+    stops = rng.normal(-2, 1, len(shown))[points] + offset * (photos < NEAR)
+    stops += rng.normal(0, noise, len(photos)) + lobes * np.cos(sides[points] - angles[photos])
+    stops += (rng.random(len(photos)) < outliers) * rng.normal(1, 2, len(photos))
+    return Observations(photos, points, stops, np.arange(len(shown)))
+
+
+def judged(seen, photos=NEAR + FAR):
+    fit = fitted(seen, photos)
+    return TrackGains(fit.gains, np.bincount(seen.photos, minlength=photos), fit)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("joining", [16, 40, 200])
+def test_groups_of_other_exposure_are_told_apart_by_few_points_that_join_them(joining, seed):
+    gains = judged(two_groups(joining, offset=1.49, seed=seed))
+    assert gains.gains[:NEAR].mean() - gains.gains[NEAR:].mean() == pytest.approx(1.49, abs=0.4)
+    assert gains.differ
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("joining", [0, 2, 4, 16, 200])
+@pytest.mark.parametrize(
+    "errors",
+    [{}, {"noise": 0.5, "outliers": 0.15}, {"lobes": 0.4}],
+    ids=["noise", "outliers", "dependence on the view"],
+)
+def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joining, errors, seed):
+    assert not judged(two_groups(joining, **errors, seed=seed)).differ
+
+
+def test_the_error_of_gains_grows_where_few_points_join_photos():
+    many, few = (judged(two_groups(joining, seed=1)).error for joining in (1_000, 10))
+    assert few > 2 * many
+    pair = Observations(np.tile([0, 1], 50), np.repeat(np.arange(50), 2), np.zeros(100), np.arange(50))
+    noise = np.random.default_rng(3).normal(0, 0.3, 100)
+    # The difference of two photos has the error sqrt(2) 0.3 / sqrt(50), each from their mean half.
+    assert judged(replace(pair, stops=noise), 2).error == pytest.approx(0.03, rel=0.3)
 
 
 def test_planted_gains_are_found_among_outliers():
@@ -159,6 +231,20 @@ def test_the_rule_asks_for_both_a_spread_and_a_reduction():
     assert not weak.differ
 
 
+def test_of_many_photos_some_neighbours_decide():
+    count = 5 * MOST_DECIDING // 2
+    lights = np.tile([0.1, 0.1, 0.4, 0.4], count)[:count]
+    # Each photo shows points of its own and those of its neighbours.
+    seen = [range(8 * row, 8 * row + 16) for row in range(count)]
+    scene = grey_scene(lights, points=8 * count + 8, seen=seen)
+    gains = deciding_gains(scene)
+    assert MOST_DECIDING // 2 <= len(gains.gains) <= MOST_DECIDING
+    assert gains.differ
+    assert deciding_gains(scene) is gains
+    few = grey_scene([0.1, 0.4])
+    assert deciding_gains(few) is training_gains(few)
+
+
 def test_of_many_observations_a_part_is_looked_at(monkeypatch):
     scene = grey_scene([0.1, 0.2, 0.4])
     module = "crossgrad_plugins.exposures.tracks.observations._MOST"
@@ -184,7 +270,7 @@ def test_auto_takes_a_gain_where_the_rule_says_so_and_says_why():
     assert fitted_on.name == "gain"
     off = Auto().fitted_to(grey_scene([0.2, 0.2, 0.2]))
     assert off.name == "none"
-    assert "less than 0.2 stops or 15 %" in off.notes[0]
+    assert "less than 0.2 stops, 4 standard errors or 15 %" in off.notes[0]
     blind = Auto().fitted_to(grey_scene([0.2, 0.4], seen=[(), ()]))
     assert blind.name == "none"
     assert "no SfM tracks" in blind.notes[0]

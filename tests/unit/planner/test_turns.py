@@ -68,8 +68,9 @@ def test_what_is_decided_is_a_run_that_draws_so():
 @pytest.mark.parametrize(
     "length", [{"steps": 100}, {"seconds": 5.0}, {"max_views": 100}, {"steps": 29_999}], ids=str
 )
-def test_a_short_run_without_a_plan_draws_so(length):
-    run = assemble(configured({"scene": "x", **length}), scene_of(AROUND), "colmap")
+def test_a_short_run_with_this_plan_draws_so(length):
+    asked = configured({"scene": "x", "plan": "turns", **length})
+    run = assemble(asked, scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "horizon"
     assert run.selection.names["grouping"] == run.config.grouping.name
     assert (run.sampler.coarse, run.config.plan) == ((5, 1), "off")
@@ -77,26 +78,22 @@ def test_a_short_run_without_a_plan_draws_so(length):
     assert any("--sampler epoch overrules it" in note for note in run.notes)
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"steps": 100, "plan": "off"},
-        {"steps": 100, "sampler": {"name": "epoch"}},
-        {"steps": 100, "schedule": "absolute"},
-        {"steps": 30_000},
-        {},
-    ],
-    ids=str,
-)
-def test_other_runs_without_a_plan_draw_epochs(given):
+@pytest.mark.parametrize("given", [{"steps": 100}, {"seconds": 5.0}, {"steps": 30_000}], ids=str)
+def test_runs_without_a_plan_draw_epochs(given):
     run = assemble(configured({"scene": "x", **given}), scene_of(AROUND), "colmap")
     assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
     assert not [note for note in run.notes if note.startswith("plan:")]
 
 
-def test_other_scenes_draw_epochs_without_a_plan():
-    run = assemble(configured({"scene": "x", "steps": 100}), scene_of(DOWN, 20.0), "colmap")
-    assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
+@pytest.mark.parametrize(
+    "given",
+    [{"steps": 100, "sampler": {"name": "epoch"}}, {"steps": 100, "schedule": "absolute"}],
+    ids=str,
+)
+def test_what_the_user_set_draws_epochs_with_this_plan(given):
+    asked = configured({"scene": "x", "plan": "turns", **given})
+    run = assemble(asked, scene_of(AROUND), "colmap")
+    assert run.selection.names["sampler"] == "epoch"
 
 
 def broken(*_arguments):
@@ -110,11 +107,9 @@ def missing(*_arguments):
 @pytest.mark.parametrize(
     ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
 )
-def test_a_planner_that_fails_ends_no_run_that_asked_for_nothing(name, value, monkeypatch, caplog):
+def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeypatch):
     monkeypatch.setattr(planning, name, value)
-    run = assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
-    assert (run.selection.names["sampler"], run.config.plan, run.plan) == ("epoch", "off", None)
-    assert "nothing is planned" in caplog.text
+    assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
     asked = configured({"scene": "x", "steps": 100, "plan": "turns"})
     with pytest.raises((RuntimeError, UserError)):
         assemble(asked, scene_of(AROUND), "colmap")

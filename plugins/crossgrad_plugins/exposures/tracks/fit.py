@@ -9,11 +9,15 @@ point, each part has a mean of 0.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.exposures.tracks.observations import Observations
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
 
 #: Huber's constant, in standard deviations: 95 % efficient where errors are normal.
 _HUBER = 1.345
@@ -25,6 +29,8 @@ _ROUNDS = 12
 _FEW, _SHORT = 64, 64
 #: What gains may be off by after iterations, in stops; rounding allows less.
 _TOLERANCE = 1e-5
+#: Photos up to which standard errors are worked out: their matrix is dense.
+_DENSE = 512
 #: Residuals below it, in stops, are rounding of 8-bit values.
 _SMALLEST = 1e-3
 
@@ -37,13 +43,17 @@ class Fit:
 
     Attributes:
         gains: [V] stops of each photo above their mean; 0 where it has no observation.
-        before: Standard deviation of the observations around the means of their points, stops.
+        before: Mean distance of the observations from the means of their points, stops. A point
+            counts by the variance of the gains of the photos that show it, because only points
+            that join photos of different gains test these.
         after: The same once the gains are taken out.
+        errors: [V] standard errors of the gains, stops; NaN for more photos than `_DENSE`.
     """
 
     gains: _Floats
     before: float
     after: float
+    errors: _Floats
 
     @property
     def reduction(self) -> float:
@@ -55,7 +65,7 @@ def fitted(observations: Observations, photos: int) -> Fit:
     """The gains of `photos` photos."""
     o = observations
     if not o.count:
-        return Fit(np.zeros(photos), 0.0, 0.0)
+        return Fit(np.zeros(photos), 0.0, 0.0, np.zeros(photos))
     gains, parts = np.zeros(photos), _parts(o, photos)
     few = photos > _SHORT and _neighbours(o, photos) <= _FEW
     before = o.stops - _means(o.points, o.stops, np.ones(o.count))[o.points]
@@ -67,7 +77,36 @@ def fitted(observations: Observations, photos: int) -> Fit:
         rest = o.stops - gains[o.photos]
         residuals = rest - _means(o.points, rest, weights)[o.points]
     means = np.bincount(parts, gains) / np.maximum(np.bincount(parts), 1)
-    return Fit(gains - means[parts], float(before.std()), float(residuals.std()))
+    variances = _variances(o, gains)
+    distances = [float(np.average(np.abs(r), weights=variances)) for r in (before, residuals)]
+    return Fit(gains - means[parts], *distances, _errors(o, weights, residuals, parts))
+
+
+def _variances(o: Observations, gains: _Floats) -> _Floats:
+    """[N] variance of the gains of the photos that show the point of each observation.
+
+    All are 1 if no point joins photos of different gains.
+    """
+    even = np.ones(o.count)
+    above = gains[o.photos] - _means(o.points, gains[o.photos], even)[o.points]
+    variances = _means(o.points, above**2, even)[o.points]
+    return variances if variances.any() else even
+
+
+def _errors(
+    o: Observations, weights: _Floats, residuals: _Floats, parts: NDArray[np.int64]
+) -> _Floats:
+    """[V] standard errors of the gains by weighted least squares.
+
+    Groups of photos that few points join have large ones, however many observations there are.
+    """
+    photos = len(parts)
+    if photos > _DENSE:
+        return np.full(photos, np.nan)
+    free = o.count - int(o.points.max()) - 1 - photos + len(np.unique(parts))
+    variance = float(residuals @ residuals) / max(free, 1)
+    inverse = np.linalg.pinv(_normal_matrix(o, weights, photos).toarray(), hermitian=True)
+    return np.sqrt(variance * np.diag(inverse))
 
 
 def _parts(o: Observations, photos: int) -> NDArray[np.int64]:
@@ -98,7 +137,6 @@ def _neighbours(o: Observations, photos: int) -> float:
 
 def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
     """The gains that minimise the weighted squares; 0 of the first photo of each part."""
-    from scipy.sparse import coo_array
     from scipy.sparse.linalg import spsolve
 
     gains, count = np.zeros(len(parts)), len(parts)
@@ -106,15 +144,22 @@ def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Flo
     free[np.unique(parts, return_index=True)[1]] = False
     if not free.any():
         return gains
-    of_points = np.bincount(o.points, weights)
-    weight = coo_array((weights, (o.photos, o.points)), shape=(count, len(of_points))).tocsr()
-    every = np.arange(count)
-    own = coo_array((np.bincount(o.photos, weights, count), (every, every)))
-    coupled = (own.tocsr() - (weight * (1.0 / of_points)) @ weight.T).tocsc()
+    coupled = _normal_matrix(o, weights, count)
     above = o.stops - _means(o.points, o.stops, weights)[o.points]
     wanted = np.bincount(o.photos, weights * above, count)
     gains[free] = spsolve(coupled[free][:, free], wanted[free], permc_spec="MMD_AT_PLUS_A")
     return gains
+
+
+def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array":
+    """[V, V] the matrix of the normal equations of the gains, the points eliminated."""
+    from scipy.sparse import coo_array
+
+    of_points = np.bincount(o.points, weights)
+    weight = coo_array((weights, (o.photos, o.points)), shape=(count, len(of_points))).tocsr()
+    every = np.arange(count)
+    own = coo_array((np.bincount(o.photos, weights, count), (every, every)))
+    return (own.tocsr() - (weight * (1.0 / of_points)) @ weight.T).tocsc()
 
 
 def _iterated(o: Observations, weights: _Floats, start: _Floats) -> _Floats:

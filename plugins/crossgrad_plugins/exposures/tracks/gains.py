@@ -14,12 +14,15 @@ from crossgrad_plugins.exposures.tracks.observations import observations_of
 #: Usable observations without which tracks tell nothing about a photo.
 LEAST = 8
 #: Rule by which tracks say that photos differ in exposure: standard deviation of the gains in
-#: stops, and share of the observations' deviation that the gains take away. Measured on scenes
-#: with and without (docs/exposure.md).
-LEAST_SPREAD, LEAST_REDUCTION = 0.2, 0.15
+#: stops, that deviation over its own standard error, and share of the distance of observations from
+#: their points that the gains take away. Measured on scenes with and without (docs/exposure.md).
+LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
+#: Photos that decide. Of more, runs of consecutive ones do, because these show the same points.
+MOST_DECIDING, _CONSECUTIVE = 128, 8
 
 # A run asks more than once, and a scene does not change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
+_DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +50,16 @@ class TrackGains:
         return float(self.gains[self.known].std()) if self.known.any() else 0.0
 
     @property
+    def error(self) -> float:
+        """Standard error of the gains, stops, root mean square over the photos."""
+        errors = self.fit.errors[self.known]
+        return float(np.sqrt(np.square(errors).mean())) if len(errors) else 0.0
+
+    @property
     def differ(self) -> bool:
         """Whether the photos differ in exposure, by the rule."""
-        return self.spread >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
+        sure = self.spread >= LEAST_RATIO * self.error
+        return sure and self.spread >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
 
     @property
     def evidence(self) -> str:
@@ -60,7 +70,8 @@ class TrackGains:
         return (
             f"brightness of {len(known)} photos at {int(self.counts.sum()):,} observations of SfM "
             f"points: gains of {self.spread:.2f} stops standard deviation ({known.min():+.2f} to "
-            f"{known.max():+.2f}); they take {100.0 * self.fit.reduction:.0f} % off the deviation "
+            f"{known.max():+.2f}, standard error {self.error:.2f}); where points join photos "
+            f"of different gains, they take {100.0 * self.fit.reduction:.0f} % off the deviation "
             f"({self.fit.before:.2f} to {self.fit.after:.2f} stops)"
         )
 
@@ -88,4 +99,21 @@ def training_gains(scene: Scene) -> TrackGains:
     found = _OF_TRAINING.get(scene)
     if found is None:
         found = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
+    return found
+
+
+def deciding_gains(scene: Scene) -> TrackGains:
+    """The gains that decide whether the training photos differ, worked out once for a scene.
+
+    Raises:
+        UserError: A photo cannot be decoded.
+    """
+    views = scene.train_views
+    if len(views) <= MOST_DECIDING:
+        return training_gains(scene)
+    found = _DECIDING.get(scene)
+    if found is None:
+        period = _CONSECUTIVE * len(views) // MOST_DECIDING
+        chosen = [view for row, view in enumerate(views) if row % period < _CONSECUTIVE]
+        found = _DECIDING[scene] = track_gains(scene, chosen[:MOST_DECIDING])
     return found
