@@ -1,7 +1,7 @@
 """From what a reader found to a `Scene`: checks, photos, split, local frame, regimes."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -77,6 +77,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
             *split.notes,
             frame.note,
             _note_regimes(regimes, train, "image folder" if by_folder else "footprint"),
+            *_note_unmeasured(regimes, train, options),
         ),
     )
 
@@ -118,3 +119,19 @@ def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str
         for name in sorted(views)
     )
     return f"regimes by {how}: {', '.join(parts)}"
+
+
+def _note_unmeasured(
+    regimes: Sequence[str], train: Sequence[int], options: SceneOptions
+) -> Iterator[str]:
+    """Name the regimes without a held-out photo, where other regimes have one."""
+    held_out = Counter(regimes) - Counter(regimes[i] for i in train)
+    lacking = sorted(set(regimes) - set(held_out))
+    if held_out and lacking:
+        way = "--split stratified holds photos of every regime out"
+        if options.split == "stratified":
+            way = "there are too few photos of it"
+        yield (
+            f"split: no photo of {' and '.join(lacking)} is held out, so no figure tells how good "
+            f"it gets; {way}"
+        )

@@ -14,7 +14,9 @@ from crossgrad_core.commands import (
     read_scene,
     write_settings,
 )
+from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.planner import Plan, plan_of
+from crossgrad_plugins.planner.sizes import length
 from crossgrad_plugins.planner.terminal import lines_of
 
 #: Columns where nothing tells how many there are.
@@ -52,19 +54,37 @@ def plan(
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
         # The bundled scene has a length by itself, which it would lose where the file names it.
-        length = {} if config.seconds is None else {"seconds": config.seconds}
+        seconds = {} if config.seconds is None else {"seconds": config.seconds}
         # Of another folder, too.
-        asked = {**settings, **length, "scene": str(Path(str(config.scene)).resolve())}
+        asked = {**settings, **seconds, "scene": str(Path(str(config.scene)).resolve())}
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:
         return made, "--write FILE keeps this for crossgrad run --config FILE"
-    given = {"plan": "auto", **options, "config": file, "scene": None}
-    words = [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
+    named = None if options.get("scene") is None else config.scene
+    return made, f"run it: {_command(named, {**options, 'config': file}, assignments)}"
+
+
+def advised(scene: Path) -> tuple[str, str]:
+    """Return the length that the planner advises for a scene, and the command that trains it so.
+
+    No photo is decoded.
+
+    Raises:
+        UserError: The scene cannot be read.
+    """
+    config = configured({"scene": str(scene), "plan": "auto"})
+    decision = length(Evidence(config, read_scene(config)[0]))
+    return f"{decision.choice}, {decision.evidence}", _command(scene, {}, [])
+
+
+def _command(scene: Path | None, options: Mapping[str, object], assignments: Sequence[str]) -> str:
+    """The command that trains a scene as planned; the bundled one where none is named."""
+    given = {"plan": "auto", **options, "scene": None}
+    words = ["crossgrad run"] if scene is None else ["crossgrad run", quote(str(scene))]
+    words += [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
     words += [f"--set {quote(each)}" for each in assignments]
-    if options.get("scene") is not None:
-        words.insert(0, quote(str(config.scene)))
-    return made, f"run it: crossgrad run {' '.join(words)}"
+    return " ".join(words)
 
 
 def _word(value: object) -> str:

@@ -17,7 +17,7 @@ PARTS: Final[Parts] = (
     *(groups.modes, groups.pairs, turns.turns, groups.views_per_step, groups.operator),
     *(looks.exposure, looks.degree, looks.scale_filter),
     *(sizes.resolution, sizes.count, sizes.length, sizes.densifier, sizes.dropout),
-    *(reading.start, reading.undistortion, reading.masks, reading.background),
+    *(reading.start, reading.held_out, reading.undistortion, reading.masks, reading.background),
 )
 
 

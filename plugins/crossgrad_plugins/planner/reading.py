@@ -1,6 +1,7 @@
 """Where training starts, and what reading the photos has decided: lenses, masks, background."""
 
 import re
+from collections import Counter
 from typing import Final
 
 from crossgrad_plugins.planner.decision import Decision, given
@@ -35,6 +36,28 @@ def start(evidence: Evidence) -> Decision:
     if views > _ONE_PHOTO:
         return shown.changed("triangulated", {"start": "triangulated"}, "--init random")
     return shown.changed("random points", {"reading.init": "random"}, "--init FILE.ply")
+
+
+def held_out(evidence: Evidence) -> Decision:
+    """Which photos are held out, and whether every regime has some."""
+    part, scene = "held-out photos", evidence.scene
+    photos = Counter(view.regime for view in scene.test_views)
+    chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
+    if evidence.is_given("reading.split", "reading.test_every"):
+        return given(part, chosen, "--split HOW")
+    plain = Decision(
+        part,
+        chosen,
+        "default",
+        "",
+        "the scene's lists, else 1 in 8 of each folder by name",
+        "docs/readers.md",
+        "--split stratified",
+    )
+    lacking = sorted({view.regime for view in scene.train_views} - set(photos))
+    if not lacking:
+        return plain.found("every regime has held-out photos", decided=True)
+    return plain.found(f"no figure tells how good {' and '.join(lacking)} gets: none is held out")
 
 
 def undistortion(evidence: Evidence) -> Decision:

@@ -18,6 +18,7 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+from crossgrad_plugins.planner.app import advised
 from crossgrad_plugins.prepare import mapping, matching
 from crossgrad_plugins.prepare.features import found_features
 from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_damaged, clear_leftovers
@@ -44,7 +45,9 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     for line in summary_lines(report):
         print(line)  # noqa: T201 - the result of the command
     print(f"scene in {scene}; the report is {scene / 'report.md'}")  # noqa: T201
-    print(f"next: crossgrad run {scene}")  # noqa: T201
+    length, command = advised(scene)
+    print(f"planned length: {length}")  # noqa: T201
+    print(f"next: {command}")  # noqa: T201
 
 
 def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 from crossgrad_core.commands import (
@@ -152,8 +153,8 @@ def _check_whole(layout: Layout) -> None:
             where=layout.work,
             expected="what prepare left there",
             found="a part of it" if layout.work.is_dir() else "no such folder",
-            todo=f"train on the scene as it is: crossgrad run {layout.scene}; or choose another "
-            "folder to prepare the photos anew",
+            todo=f"train on the scene as it is: crossgrad run {quote(str(layout.scene))} --plan "
+            "auto; or choose another folder to prepare the photos anew",
         )
     for made in (layout.models, layout.placed, layout.model):
         if not _is_sound(layout, made):

@@ -1,4 +1,4 @@
-"""The picture of a prepared scene: cameras from above and from the side, and what joins them."""
+"""The picture of a prepared scene: its cameras from two sides, and what joins them."""
 
 import io
 from collections.abc import Mapping
@@ -20,6 +20,8 @@ _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
 #: Points beyond these percentiles are not in the picture.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
+#: Titles of both panels of a scene without a place on Earth, and so without a direction up.
+_TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
 def draw(report: Report, model: "pycolmap.Reconstruction") -> bytes:
@@ -40,14 +42,15 @@ def draw(report: Report, model: "pycolmap.Reconstruction") -> bytes:
     flat = {name: axes_of_plane @ center for name, center in centers.items()}
     figure = Figure(figsize=(13, 6.5), layout="constrained")
     FigureCanvasAgg(figure)
-    above, side = figure.subplots(1, 2)
+    first, second = figure.subplots(1, 2)
     unit = "m" if on_earth else "units of the scene"
-    for axes, (across, up) in ((above, (0, 1)), (side, (0, 2))):
+    for axes, (across, up) in ((first, (0, 1)), (second, (0, 2))):
         _panel(axes, report, points @ axes_of_plane.T, flat, (across, up))
     names = ("east", "north", "up") if on_earth else ("first axis", "second axis", "third axis")
-    above.set(title="from above", xlabel=f"{names[0]}, {unit}", ylabel=f"{names[1]}, {unit}")
-    side.set(title="from the side", xlabel=f"{names[0]}, {unit}", ylabel=f"{names[2]}, {unit}")
-    above.legend(fontsize=8, loc="upper right")
+    titles = ("from above", "from the side") if on_earth else _TITLES
+    first.set(title=titles[0], xlabel=f"{names[0]}, {unit}", ylabel=f"{names[1]}, {unit}")
+    second.set(title=titles[1], xlabel=f"{names[0]}, {unit}", ylabel=f"{names[2]}, {unit}")
+    first.legend(fontsize=8, loc="upper right")
     posed, used = len(report.posed), len(report.plan.used)
     figure.suptitle(f"{posed} of {used} photos, and their pairs with verified matches")
     buffer = io.BytesIO()

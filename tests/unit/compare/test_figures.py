@@ -10,7 +10,6 @@ from matplotlib.font_manager import fontManager
 from crossgrad_plugins.compare.figures.fonts import FULL, SMALL, family
 from crossgrad_plugins.compare.figures.style import (
     PAGE,
-    columns_for,
     drawn,
     legend,
     looks,
@@ -77,17 +76,24 @@ def test_a_file_that_is_no_font_is_not_drawn_with(cached, weight):
     assert family() == FULL
 
 
+@pytest.mark.parametrize("share", [1.0, 0.62])
+@pytest.mark.parametrize("letters", ["ochota_kap_hybrid, gain ", "W"])
 @pytest.mark.parametrize("length", [1, 8, 20, 45, 200])
-def test_a_legend_fits_a_page_whatever_its_labels(length):
-    labels = [("ochota_kap_hybrid, gain " * 9)[:length] for _ in range(9)]
-    with styled():
-        figure = new_figure(PAGE, 2.0)
-        lines = [figure.add_subplot().plot([0], [0], label=label)[0] for label in labels]
-        columns = columns_for(labels, 6)
-        legend = figure.legend(handles=lines, loc="upper left", ncols=columns)
-        box = legend.get_window_extent()
-    assert columns == 1 or box.width <= figure.bbox.width
-    assert (columns > 1) == (length <= 45)
+def test_a_legend_fits_its_figure_whatever_its_labels(length, letters, share):
+    labels = [f"{number} {letters * 200}"[:length] for number in range(9)]
+    with styled(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = new_figure(PAGE * share, 2.0)
+        ax = figure.subplots()
+        for label in labels:
+            ax.plot([0], [0], label=label)
+        legend(figure, ax, labels)
+        drawn(figure, "name", "title", "caption")
+        (box,) = (each.get_window_extent() for each in figure.legends)
+        texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert 0.0 <= box.x0 and box.x1 <= figure.bbox.width + 1.0
+    assert box.y1 <= figure.bbox.height + 1.0
+    assert [text.replace("\n", "") for text in texts] == labels
 
 
 @pytest.mark.parametrize("beside", [1, 2, 3, 4])

@@ -11,6 +11,10 @@ from support.run_folders import RunFolder
 from crossgrad_core.cli.main import main
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.cost import ClockChoice
+from crossgrad_plugins.compare.figures import differences
+from crossgrad_plugins.compare.figures.differences import draw_differences
+from crossgrad_plugins.compare.figures.phases import draw_phases, phases_of
 from crossgrad_plugins.compare.page import arm_rows
 from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
@@ -50,6 +54,42 @@ class Reader(HTMLParser):
 
     def handle_data(self, data):
         self.texts.append(data)
+
+
+def compared_in(folder, runs, **options):
+    """What is found of runs that are written into a folder."""
+    for number, run in enumerate(runs):
+        run.write(folder / str(number))
+    return compared(read_runs([folder], skip_broken=False), Options(**options))
+
+
+def test_phases_are_seconds_of_the_clock_and_shown_only_where_these_are_compared(tmp_path):
+    runs = [
+        RunFolder(views_per_step=views, seed=seed, cpu_seconds=50.0)
+        for views in (1, 2)
+        for seed in (0, 1)
+    ]
+    found = compared_in(tmp_path, runs)
+    assert len(phases_of(found)) == 2
+    of_cpu = compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.CPU))
+    assert draw_phases(of_cpu) is None
+    assert tables_of(of_cpu, {})["phases.csv"] == []
+
+
+def test_an_interval_that_goes_on_beyond_the_axis_ends_in_an_arrowhead(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(differences, "drawn", lambda figure, *_: kept.append(figure))
+    finals = {(1, 0): 21.0, (1, 1): 21.0, (2, 0): 20.0, (2, 1): 20.4}
+    runs = [RunFolder(views_per_step=k, seed=s, final=final) for (k, s), final in finals.items()]
+    found = compared_in(tmp_path, runs)
+    draw_differences(found)
+    (ax,) = kept[0].axes
+    low, high = ax.get_xlim()
+    (contrast,) = found.ends
+    first, last = contrast.estimate.wide
+    assert first < low and last > high
+    heads = {line.get_marker(): line.get_xdata()[0] for line in ax.lines}
+    assert (heads["<"], heads[">"]) == (low, high)
 
 
 def write_runs(folder: Path) -> None:

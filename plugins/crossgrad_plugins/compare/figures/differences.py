@@ -12,19 +12,25 @@ from crossgrad_plugins.compare.figures.style import (
     MARKERS,
     PAGE,
     Drawn,
-    columns_for,
     drawn,
+    legend_above,
     literal,
     new_figure,
     styled,
+    wrapped,
 )
 from crossgrad_plugins.compare.statistics.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: More rows than these would not fit on a page.
 MOST_ROWS = 24
+#: How far intervals are above the middle of their row; the signs of pairs are below it.
+_ABOVE = 0.12
+#: Letters of a line of a heading, and the height of each further line in rows.
+_LETTERS, _LINE = 70, 0.6
 _COLORS = {
     Verdict.DIFFERENT: "#D55E00",
     Verdict.EQUIVALENT: "#009E73",
@@ -38,9 +44,12 @@ def draw_differences(comparison: Comparison) -> Drawn | None:
     rows = [*comparison.ends, *comparison.equal, *_by_regime(comparison)][:MOST_ROWS]
     if not rows:
         return None
+    rows = [row for arms in _headings(rows) for row in rows if _arms(row) == arms]
     scenes = comparison.scenes
     with styled():
-        figure = new_figure(PAGE, 0.75 + 0.24 * (len(rows) + len(_headings(rows))))
+        headings = [_heading(*arms) for arms in _headings(rows)]
+        lines = sum(1.0 + _LINE * text.count("\n") for text in headings)
+        figure = new_figure(PAGE, 0.75 + 0.24 * (len(rows) + lines))
         ax = figure.subplots()
         _margin(ax, comparison.quantity.margin)
         ticks = _draw(ax, rows, scenes)
@@ -50,13 +59,16 @@ def draw_differences(comparison: Comparison) -> Drawn | None:
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
         ax.set_xlabel(f"difference in {comparison.quantity.with_unit}, first minus second arm")
-        _key(ax, rows, scenes)
+        _key(figure, rows, scenes)
+        _limit(ax, rows)
+        _mark_cut(ax, rows, [place for place, _ in ticks])
         return drawn(
             figure,
             "differences",
             "Paired differences",
             "Each small sign is a pair of runs on one scene with one seed. The bar is the 95 % "
-            "interval, its thick part the 90 % interval, the large sign the estimate; the grey "
+            "interval, its thick part the 90 % interval, the large sign the estimate; an "
+            "arrowhead says that the interval goes on beyond the axis; the grey "
             f"band is the margin of {comparison.quantity.margin:g} "
             f"{comparison.quantity.unit}.".replace(" .", "."),
         )
@@ -73,7 +85,16 @@ def _by_regime(comparison: Comparison) -> list[Contrast]:
 
 
 def _headings(rows: Sequence[Contrast]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys((row.first, row.second) for row in rows))
+    return list(dict.fromkeys(map(_arms, rows)))
+
+
+def _heading(first: str, second: str) -> str:
+    """Return the names of two arms, on several lines if one line is too short for them."""
+    return wrapped(literal(f"{first}  \u2212  {second}"), _LETTERS)
+
+
+def _arms(row: Contrast) -> tuple[str, str]:
+    return row.first, row.second
 
 
 def _margin(ax: "Axes", margin: float) -> None:
@@ -86,11 +107,13 @@ def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[t
     ticks: list[tuple[float, str]] = []
     place = 0.0
     for first, second in _headings(rows):
-        ax.text(0.0, place + 0.25, literal(f"{first}  \u2212  {second}"), fontweight="bold",
+        text = _heading(first, second)
+        place += _LINE * text.count("\n")
+        ax.text(0.0, place + 0.25, text, fontweight="bold",
                 transform=ax.get_yaxis_transform())  # fmt: skip
         place += 1.0
         for row in rows:
-            if (row.first, row.second) == (first, second):
+            if _arms(row) == (first, second):
                 _row(ax, row, place, scenes)
                 ticks.append((place, f"{literal(where_text(row))}"))
                 place += 1.0
@@ -110,14 +133,27 @@ def _row(ax: "Axes", row: Contrast, place: float, scenes: Sequence[str]) -> None
     if found is None:
         return
     if found.pairs > 1:
-        ax.plot(found.wide, [place - 0.12] * 2, color=color, linewidth=1.1)
-        ax.plot(found.narrow, [place - 0.12] * 2, color=color, linewidth=2.8)
-    ax.plot([found.center], [place - 0.12], "o", color=color, markersize=5, markeredgecolor=INK,
+        ax.plot(found.wide, [place - _ABOVE] * 2, color=color, linewidth=1.1)
+        ax.plot(found.narrow, [place - _ABOVE] * 2, color=color, linewidth=2.8)
+    ax.plot([found.center], [place - _ABOVE], "o", color=color, markersize=5, markeredgecolor=INK,
             markeredgewidth=0.5)  # fmt: skip
 
 
-def _key(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
-    """What colours and signs mean; the axis shows the estimates and the narrow intervals."""
+def _mark_cut(ax: "Axes", rows: Sequence[Contrast], places: Sequence[float]) -> None:
+    """Draw an arrowhead where an interval goes on beyond the axis."""
+    low, high = ax.get_xlim()
+    for row, place in zip(rows, places, strict=True):
+        if row.estimate is None or row.estimate.pairs == 1:
+            continue
+        first, last = row.estimate.wide
+        for end, marker, is_cut in ((low, "<", first < low), (high, ">", last > high)):
+            if is_cut:
+                ax.plot([end], [place - _ABOVE], marker, color=_COLORS[row.verdict],
+                        markersize=5, markeredgewidth=0, clip_on=False)  # fmt: skip
+
+
+def _key(figure: "Figure", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
+    """Put what colours and signs mean above the panel."""
     from matplotlib.lines import Line2D
 
     present = [verdict for verdict in Verdict if any(row.verdict == verdict for row in rows)]
@@ -127,9 +163,8 @@ def _key(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
                markersize=3, label=literal(scene))
         for index, scene in enumerate(scenes)
     ]  # fmt: skip
-    columns = columns_for([str(handle.get_label()) for handle in handles], 6)
-    ax.figure.legend(handles=handles, loc="outside upper left", ncols=columns, borderaxespad=0.0)
-    _limit(ax, rows)
+    labels = [str(handle.get_label()) for handle in handles]
+    legend_above(figure, handles, labels, 6)
 
 
 def _limit(ax: "Axes", rows: Sequence[Contrast]) -> None:

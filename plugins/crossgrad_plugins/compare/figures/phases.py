@@ -3,24 +3,34 @@
 import numpy as np
 
 from crossgrad_plugins.compare.comparison import Comparison
+from crossgrad_plugins.compare.cost import SECONDS
 from crossgrad_plugins.compare.figures.style import (
     COLORS,
     FAINT,
     PAGE,
     Drawn,
     drawn,
+    legend_above,
     literal,
     new_figure,
     styled,
+    wrapped,
 )
 
 _OTHER = "other"
+#: Letters of a line of an arm's name beside its bar.
+_LETTERS = 40
 _HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
 
 
 def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
-    """Arm -> phase -> milliseconds of a step, in the mean over its runs that recorded them."""
+    """Arm -> phase -> milliseconds of a step, in the mean over its runs that recorded them.
+
+    Phases are seconds of the clock: empty where these do not compare, or are not wanted.
+    """
     found: dict[str, dict[str, float]] = {}
+    if SECONDS not in comparison.costs:
+        return found
     for arm, by in comparison.main.items():
         runs = [run for run in by.values() if run.number("step")]
         recorded = [run.summary.get("seconds", {}).get("phases") or {} for run in runs]
@@ -36,7 +46,7 @@ def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
 
 
 def draw_phases(comparison: Comparison) -> Drawn | None:
-    """Milliseconds of a step by phase, a bar for each arm; None where no run recorded them."""
+    """Milliseconds of a step by phase, a bar for each arm; None where none is comparable."""
     found = phases_of(comparison)
     if not found:
         return None
@@ -56,11 +66,11 @@ def draw_phases(comparison: Comparison) -> Drawn | None:
                         hatch=_HATCHES[index % len(_HATCHES)], edgecolor="white", linewidth=0.4,
                         label=None if place else name.replace("_", " "))  # fmt: skip
                 left += wide
-        ax.set_yticks(range(len(found)), [literal(arm) for arm in found])
+        ax.set_yticks(range(len(found)), [wrapped(literal(arm), _LETTERS) for arm in found])
         ax.invert_yaxis()
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("milliseconds of a training step")
-        figure.legend(loc="outside upper left", ncols=5, borderaxespad=0.0)
+        legend_above(figure, *ax.get_legend_handles_labels(), 5)
         return drawn(
             figure,
             "phases",

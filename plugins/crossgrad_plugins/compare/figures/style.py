@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import ceil
 from typing import TYPE_CHECKING, Any, Final
 
 from crossgrad_plugins.compare.figures.fonts import fall_back, family
@@ -52,9 +51,10 @@ _RC: Final[Any] = {
     "ytick.labelsize": 7.5,
 }
 _DPI: Final = 220
-#: About how many letters a page is wide.
-_LETTERS: Final = 110
-#: Lines of a legend that every figure has room for, and inches that each further one takes.
+#: About how many letters a page is wide, how many the sign and the space of a label take, and by
+#: what share the lines of a label are made shorter at a time.
+_LETTERS, _BESIDE, _LETTERS_AT_ONCE = 110, 8, 10
+#: Lines of a legend that every figure has room for, and inches that each takes.
 _LEGEND_LINES, _LINE = 2, 0.18
 #: A name may go on in the next line behind these signs, and anywhere in a part of this length.
 _PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
@@ -186,40 +186,58 @@ def panel_title(ax: "Axes", scene: str) -> None:
     """Writes a scene's name above its panel, on several lines where the panel is too narrow."""
     place = ax.get_subplotspec()
     beside = 1 if place is None else place.get_gridspec().ncols
-    room = _LETTERS // beside - 8
-    lines = [""]
-    for part in _PARTS.findall(scene):
-        if lines[-1] and len(lines[-1] + part) > room:
-            lines.append("")
-        lines[-1] += part
-    ax.set_title(literal("\n".join(lines)), loc="left")
-
-
-def columns_for(labels: Sequence[str], most: int) -> int:
-    """How many columns of a legend with these labels a page is wide enough for."""
-    longest = max((len(label) for label in labels), default=1)
-    return max(1, min(most, len(labels), _LETTERS // (longest + 8)))
-
-
-def _with_room(figure: "Figure", labels: int, columns: int) -> None:
-    """Makes a figure higher by what a legend takes beyond the lines that it has room for."""
-    lines = ceil(labels / columns) - _LEGEND_LINES
-    figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE)
+    ax.set_title(wrapped(literal(scene), _LETTERS // beside - _BESIDE), loc="left")
 
 
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
-    """The arms above all panels, as they are called in `axes`."""
+    """Put the arms above all panels, as they are called in `axes`."""
     handles, labels = axes.get_legend_handles_labels()
     known = dict(zip(labels, handles, strict=True))
     shown = [literal(arm) for arm in arms if literal(arm) in known]
-    fitting = columns_for(shown, columns)
-    _with_room(figure, len(shown), fitting)
-    figure.legend(
-        [known[label] for label in shown],
-        shown,
-        loc="outside upper left",
-        ncols=fitting,
-        handlelength=2.6,
-        columnspacing=1.4,
-        borderaxespad=0.0,
-    )
+    legend_above(figure, [known[label] for label in shown], shown, columns)
+
+
+def legend_above(
+    figure: "Figure", handles: Sequence[Any], labels: Sequence[str], columns: int
+) -> None:
+    """Put a legend above all panels; no label leaves the figure, which grows by further lines.
+
+    Args:
+        figure: The figure.
+        handles: A sign for each label.
+        labels: The labels; longer ones than the figure is wide go on in further lines.
+        columns: Columns at most.
+    """
+    letters = int(_LETTERS * figure.get_figwidth() / PAGE)
+    longest = max((len(label) for label in labels), default=1)
+    columns = max(1, min(columns, len(labels), letters // (longest + _BESIDE)))
+    while True:
+        made = figure.legend(
+            handles,
+            [wrapped(label, max(1, letters - _BESIDE)) for label in labels],
+            loc="outside upper left",
+            ncols=columns,
+            handlelength=2.6,
+            columnspacing=1.4,
+            borderaxespad=0.0,
+        )
+        box = made.get_window_extent()
+        if box.width <= figure.bbox.width or letters <= _BESIDE:
+            break
+        made.remove()  # Letters that are wider than usual.
+        if columns > 1:
+            columns -= 1
+        else:
+            letters -= 1 + letters // _LETTERS_AT_ONCE
+    height = box.height / figure.dpi
+    figure.set_figheight(figure.get_figheight() + max(0.0, height - _LEGEND_LINES * _LINE))
+
+
+def wrapped(text: str, room: int) -> str:
+    """The text on lines of at most so many letters, as far as its parts allow."""
+    lines = [""]
+    for part in _PARTS.findall(text):
+        if lines[-1] and len(lines[-1] + part) > room:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
