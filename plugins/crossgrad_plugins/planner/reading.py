@@ -40,7 +40,7 @@ def start(evidence: Evidence) -> Decision:
 
 def held_out(evidence: Evidence) -> Decision:
     """Which photos are held out, and whether every regime has some."""
-    part, scene = "held-out photos", evidence.scene
+    part, scene = "held out", evidence.scene
     photos = Counter(view.regime for view in scene.test_views)
     chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
     if evidence.is_given("reading.split", "reading.test_every"):

@@ -61,7 +61,7 @@ PARTS_OF_THE_TABLE = [
     *("modes", "pairs of views", "turns of views", "views per step", "operator"),
     *("exposure", "SH degree"),
     *("scale filter", "resolution", "primitives", "length", "densifier", "dropout"),
-    *("start", "held-out photos", "undistortion", "masks", "background"),
+    *("start", "held out", "undistortion", "masks", "background"),
 ]
 
 

@@ -39,6 +39,6 @@ def test_other_splits_hold_out_photos_of_both_regimes_or_none_at_all(scene, spli
 def test_the_plan_names_it_too(scene, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert ended("plan", scene) == 0
-    (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("held-out photos")]
+    (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("held out")]
     assert "how good aerial gets" in row
     assert "--split stratified" in row
