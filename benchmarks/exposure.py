@@ -7,7 +7,6 @@ of the process, without reading the scene and decoding its photos.
 """
 
 import argparse
-from math import log
 from pathlib import Path
 from time import process_time
 
@@ -16,8 +15,8 @@ from crossgrad_plugins.exposures.photo_headers import exposure_value
 from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
 
 HEADER = (
-    "| scene | photos | EXIF | std of gains, stops | range | deviation (natural logarithm) "
-    "| auto | seconds |\n|---|---|---|---|---|---|---|---|"
+    "| scene | photos | EXIF | std of gains, stops | standard error | range | deviation, stops "
+    "| auto | seconds |\n|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -25,11 +24,10 @@ def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
     """The line of one scene; `told` photos have an EXIF header that tells their exposure."""
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
-    before, after = (log(2.0) * each for each in (gains.fit.before, gains.fit.after))
     auto = "gain" if gains.differ else "none"
     return (
-        f"| {name} | {len(known)} of {len(gains.gains)} | {told} | {gains.spread:.2f} | {ends} "
-        f"| {before:.2f} -> {after:.2f} | {auto} | {seconds:.1f} |"
+        f"| {name} | {len(known)} of {len(gains.gains)} | {told} | {gains.spread:.2f} "
+        f"| {gains.error:.3f} | {ends} | {gains.fit.before:.2f} -> {gains.fit.after:.2f} | {auto} | {seconds:.1f} |"
     )
 
 
