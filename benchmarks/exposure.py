@@ -25,9 +25,10 @@ def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
     auto = "gain" if gains.differ else "none"
+    deviation = f"{gains.fit.before:.2f} -> {gains.fit.after:.2f}"
     return (
         f"| {name} | {len(known)} of {len(gains.gains)} | {told} | {gains.spread:.2f} "
-        f"| {gains.error:.3f} | {ends} | {gains.fit.before:.2f} -> {gains.fit.after:.2f} | {auto} | {seconds:.1f} |"
+        f"| {gains.error:.3f} | {ends} | {deviation} | {auto} | {seconds:.1f} |"
     )
 
 

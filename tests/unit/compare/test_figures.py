@@ -91,7 +91,7 @@ def test_a_legend_fits_its_figure_whatever_its_labels(length, letters, share):
         drawn(figure, "name", "title", "caption")
         (box,) = (each.get_window_extent() for each in figure.legends)
         texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert 0.0 <= box.x0 and box.x1 <= figure.bbox.width + 1.0
+    assert box.x0 >= 0.0 and box.x1 <= figure.bbox.width + 1.0
     assert box.y1 <= figure.bbox.height + 1.0
     assert [text.replace("\n", "") for text in texts] == labels
 

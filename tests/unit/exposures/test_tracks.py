@@ -1,15 +1,13 @@
 """Gains of photos from SfM tracks: planted ones are found, and the rule tells scenes apart."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from support.grey_scene import grey_scene
 
 from crossgrad_core.plugin import Camera
-from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_plugins.exposures import srgb
 from crossgrad_plugins.exposures.auto import Auto
 from crossgrad_plugins.exposures.none import NoExposure
 from crossgrad_plugins.exposures.tracks.fit import fitted
@@ -24,7 +22,6 @@ from crossgrad_plugins.exposures.tracks.light import light_at
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
 RNG = np.random.default_rng(0)
-SIZE = 64
 
 
 def observed(gains, points, per_photo, noise=0.1, seed=0):
@@ -98,7 +95,9 @@ def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joini
 def test_the_error_of_gains_grows_where_few_points_join_photos():
     many, few = (judged(two_groups(joining, seed=1)).error for joining in (1_000, 10))
     assert few > 2 * many
-    pair = Observations(np.tile([0, 1], 50), np.repeat(np.arange(50), 2), np.zeros(100), np.arange(50))
+    pair = Observations(
+        np.tile([0, 1], 50), np.repeat(np.arange(50), 2), np.zeros(100), np.arange(50)
+    )
     noise = np.random.default_rng(3).normal(0, 0.3, 100)
     # The difference of two photos has the error sqrt(2) 0.3 / sqrt(50), each from their mean half.
     assert judged(replace(pair, stops=noise), 2).error == pytest.approx(0.03, rel=0.3)
@@ -160,34 +159,6 @@ def test_without_observations_there_is_nothing_to_tell():
     fit = fitted(Observations(none, none, np.zeros(0), none), 3)
     assert fit.gains.tolist() == [0.0] * 3
     assert fit.reduction == 0.0
-
-
-@dataclass(frozen=True)
-class Grey:
-    """A photo of one brightness in linear light, with a wall of noise around its middle."""
-
-    light: float
-
-    def image(self) -> Tensor:
-        value = float(srgb.encoded(torch.tensor(self.light, dtype=torch.float64)))
-        return torch.full((SIZE, SIZE, 3), round(255 * min(value, 1.0)), dtype=torch.uint8)
-
-    def mask(self) -> Tensor | None:
-        return None
-
-
-def grey_scene(lights, points=60, seen=None):
-    """Cameras side by side that look at a cloud; each photo has its own brightness."""
-    rng = np.random.default_rng(1)
-    cloud = np.column_stack([rng.uniform(-0.3, 0.3, points), np.full(points, 2.0),
-                             rng.uniform(-0.3, 0.3, points)])  # fmt: skip
-    views = []
-    for number, light in enumerate(lights):
-        shows = range(points) if seen is None else seen[number]
-        view = posed_view((0.05 * number, 0, 0), f"{number:02}.png", seen=shows)
-        camera = replace(view.camera, width=SIZE, height=SIZE, fx=80.0, fy=80.0, cx=32.0, cy=32.0)
-        views.append(replace(view, camera=camera, photo=Grey(light)))
-    return posed_scene(views, cloud)
 
 
 def test_light_is_taken_where_the_camera_sees_the_point():

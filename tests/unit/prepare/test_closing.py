@@ -43,7 +43,9 @@ def test_a_picture_says_from_above_only_where_up_is_known(georef, known, monkeyp
     )
     titles = []
     monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *_, **__: titles.extend(a.get_title() for a in figure.axes)
+        Figure,
+        "savefig",
+        lambda figure, *_, **__: titles.extend(a.get_title() for a in figure.axes),
     )
     draw(report, model)
     assert len(titles) == 2
