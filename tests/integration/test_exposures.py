@@ -70,8 +70,8 @@ def notes(out):
 
 
 def test_auto_is_off_where_photos_agree_and_changes_no_bit(scene, tmp_path):
-    assert run(scene, tmp_path / "none") == 0
-    assert run(scene, tmp_path / "auto", exposure={"name": "auto"}) == 0
+    assert run(scene, tmp_path / "none", exposure={"name": "none"}) == 0
+    assert run(scene, tmp_path / "auto") == 0
     assert same(tmp_path / "none", tmp_path / "auto")
     assert read_run(tmp_path / "auto").config["exposure"]["name"] == "none"
     assert "exposure auto: none" in notes(tmp_path / "auto")
@@ -80,9 +80,9 @@ def test_auto_is_off_where_photos_agree_and_changes_no_bit(scene, tmp_path):
 
 
 def test_auto_is_a_gain_where_photos_differ_and_none_names_it(varied, tmp_path):
-    assert run(varied, tmp_path / "auto", exposure={"name": "auto"}) == 0
+    assert run(varied, tmp_path / "auto") == 0
     assert run(varied, tmp_path / "gain", exposure={"name": "gain"}) == 0
-    assert run(varied, tmp_path / "none") == 0
+    assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
     assert same(tmp_path / "auto", tmp_path / "gain")
     assert read_run(tmp_path / "auto").config["exposure"]["name"] == "gain"
     assert "stops standard deviation" in notes(tmp_path / "auto")

@@ -95,12 +95,12 @@ def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joini
 def test_the_error_of_gains_grows_where_few_points_join_photos():
     many, few = (judged(two_groups(joining, seed=1)).error for joining in (1_000, 10))
     assert few > 2 * many
-    pair = Observations(
-        np.tile([0, 1], 50), np.repeat(np.arange(50), 2), np.zeros(100), np.arange(50)
-    )
+    photos, points = np.tile([0, 1], 50), np.repeat(np.arange(50), 2)
     noise = np.random.default_rng(3).normal(0, 0.3, 100)
     # The difference of two photos has the error sqrt(2) 0.3 / sqrt(50), each from their mean half.
-    assert judged(replace(pair, stops=noise), 2).error == pytest.approx(0.03, rel=0.3)
+    assert judged(Observations(photos, points, noise, np.arange(50)), 2).error == pytest.approx(
+        0.03, rel=0.3
+    )
 
 
 def test_planted_gains_are_found_among_outliers():

@@ -1,4 +1,4 @@
-"""What `crossgrad prepare` says at its end: the planner's command, and a picture of what is known."""
+"""The end of `crossgrad prepare`: the planner's command, and a picture of what is known."""
 
 import shlex
 from types import SimpleNamespace
@@ -42,11 +42,11 @@ def test_a_picture_says_from_above_only_where_up_is_known(georef, known, monkeyp
         posed=[each.name for each in photos],
     )
     titles = []
-    monkeypatch.setattr(
-        Figure,
-        "savefig",
-        lambda figure, *_, **__: titles.extend(a.get_title() for a in figure.axes),
-    )
+
+    def save(figure, *_, **__):
+        titles.extend(axes.get_title() for axes in figure.axes)
+
+    monkeypatch.setattr(Figure, "savefig", save)
     draw(report, model)
     assert len(titles) == 2
     assert ("from above" in titles) == known
