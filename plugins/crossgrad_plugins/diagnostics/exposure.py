@@ -38,7 +38,7 @@ class SceneExposure:
     def lines(self) -> list[str]:
         """For a terminal."""
         verdict = (
-            "the photos differ in exposure; --exposure gain (or auto) models that"
+            "the photos differ in exposure; a run models that by itself (--exposure auto)"
             if self.differ
             else "no exposure needs a model (--exposure none)"
         )
