@@ -81,7 +81,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     usual = usual_resolution(config, views, backbone, densifier, device.type)
     resolution, resolution_name = _named_or(usual, Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
-    exposure_choice = config.exposure or ComponentChoice(name=usual_exposure(config))
+    exposure_choice = config.exposure or ComponentChoice(name=_usual_exposure(config))
     exposure = _built(Exposure, exposure_choice)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
     notes += fitted.notes
@@ -129,7 +129,7 @@ def _usual_start(config: RunConfig) -> str:
     return BARE_START if bare else START
 
 
-def usual_exposure(config: RunConfig) -> str:
+def _usual_exposure(config: RunConfig) -> str:
     """The exposure of a run that names none."""
     return NO_EXPOSURE if config.preset == "inria" else EXPOSURE
 

@@ -106,7 +106,7 @@ def _errors(
     free = o.count - int(o.points.max()) - 1 - photos + len(np.unique(parts))
     variance = float(residuals @ residuals) / max(free, 1)
     inverse = np.linalg.pinv(_normal_matrix(o, weights, photos).toarray(), hermitian=True)
-    return np.sqrt(variance * np.diag(inverse))
+    return np.sqrt(variance * np.maximum(np.diag(inverse), 0.0))
 
 
 def _parts(o: Observations, photos: int) -> NDArray[np.int64]:

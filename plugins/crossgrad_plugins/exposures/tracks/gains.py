@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -67,10 +68,11 @@ class TrackGains:
         known = self.gains[self.known]
         if not len(known):
             return "no SfM tracks tell how bright the photos are beside each other"
+        error = f", standard error {self.error:.2f}" if isfinite(self.error) else ""
         return (
             f"brightness of {len(known)} photos at {int(self.counts.sum()):,} observations of SfM "
             f"points: gains of {self.spread:.2f} stops standard deviation ({known.min():+.2f} to "
-            f"{known.max():+.2f}, standard error {self.error:.2f}); where points join photos "
+            f"{known.max():+.2f}{error}); where points join photos "
             f"of different gains, they take {100.0 * self.fit.reduction:.0f} % off the deviation "
             f"({self.fit.before:.2f} to {self.fit.after:.2f} stops)"
         )
