@@ -87,7 +87,7 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     # without `rate_factor` when rates did not follow the length, one without `final_decay` when
     # they did not fade, without `beta1` and `beta2` when they were the same for all lengths,
     # without `growth`, `start`, `dropout` and `floaters` when nothing led growth, filled the start,
-    # was left out or removed, without `resolution` when all pixels were drawn, and one without
+    # was left out or removed, without `exposure` when there was none, without `resolution` when all pixels were drawn, and one without
     # `metrics` by 0.1.
     metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
@@ -99,6 +99,7 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
         "sh_after": 0.0,
         "size_bound": 0.0,
         "resolution": {"name": "full"},
+        "exposure": {"name": "none"},
     }
     expected = {"seconds": 5.0, "seed": 1, **then}
     assert merged(path, options, assignments) == expected

@@ -92,6 +92,15 @@ def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joini
     assert not judged(two_groups(joining, **errors, seed=seed)).differ
 
 
+def test_a_single_photo_that_is_off_decides_nothing():
+    seen = two_groups(joining=200)
+    off = seen.stops - 1.3 * (seen.photos == NEAR)
+    gains = judged(replace(seen, stops=off))
+    assert gains.spread == pytest.approx(0.2, abs=0.03)
+    assert gains.spread > 4 * gains.error and not gains.differ
+    assert judged(replace(seen, stops=seen.stops - 1.3 * (seen.photos % 5 == 0))).differ
+
+
 def test_the_error_of_gains_grows_where_few_points_join_photos():
     many, few = (judged(two_groups(joining, seed=1)).error for joining in (1_000, 10))
     assert few > 2 * many

@@ -176,6 +176,8 @@ class TestReading:
             "local frame: 1 unit = 2.64818 input units, the extent of the training cameras "
             "(1.1 x largest distance from their mean)",
             "regimes by footprint: far 4 views (3 train, 1 test), near 4 views (4 train, 0 test)",
+            "split: no photo of near is held out, so no figure tells how good it gets; --split "
+            "stratified holds photos of every regime out",
         )
 
     @pytest.mark.parametrize("scale", [1.0, 1000.0])

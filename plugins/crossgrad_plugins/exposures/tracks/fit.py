@@ -31,6 +31,8 @@ _FEW, _SHORT = 64, 64
 _TOLERANCE = 1e-5
 #: Photos up to which standard errors are worked out: their matrix is dense.
 _DENSE = 512
+#: Eigenvalues below this share of the largest one belong to the level of a part, which is free.
+_RANK = 1e-9
 #: Residuals below it, in stops, are rounding of 8-bit values.
 _SMALLEST = 1e-3
 
@@ -105,7 +107,8 @@ def _errors(
         return np.full(photos, np.nan)
     free = o.count - int(o.points.max()) - 1 - photos + len(np.unique(parts))
     variance = float(residuals @ residuals) / max(free, 1)
-    inverse = np.linalg.pinv(_normal_matrix(o, weights, photos).toarray(), hermitian=True)
+    normal = _normal_matrix(o, weights, photos).toarray()
+    inverse = np.linalg.pinv(normal, rcond=_RANK, hermitian=True)
     return np.sqrt(variance * np.maximum(np.diag(inverse), 0.0))
 
 

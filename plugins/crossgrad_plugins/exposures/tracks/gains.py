@@ -18,6 +18,8 @@ LEAST = 8
 #: stops, that deviation over its own standard error, and share of the distance of observations from
 #: their points that the gains take away. Measured on scenes with and without (docs/exposure.md).
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
+#: Photos from which on no single one decides: all points of one may lie on what others hide.
+_ENOUGH = 5
 #: Photos that decide. Of more, runs of consecutive ones do, because these show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
 
@@ -60,7 +62,15 @@ class TrackGains:
     def differ(self) -> bool:
         """Whether the photos differ in exposure, by the rule."""
         sure = self.spread >= LEAST_RATIO * self.error
-        return sure and self.spread >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
+        return sure and self._lasting >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
+
+    @property
+    def _lasting(self) -> float:
+        """The spread without the photo farthest from the mean, if there are photos enough."""
+        known = self.gains[self.known]
+        if len(known) < _ENOUGH:
+            return self.spread
+        return float(np.delete(known, np.argmax(np.abs(known - known.mean()))).std())
 
     @property
     def evidence(self) -> str:
