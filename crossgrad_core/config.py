@@ -92,8 +92,8 @@ class RunConfig(BaseModel):
     exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
         description="What cameras do to light between render and photo. "
-        f"Default: {defaults.EXPOSURE}, a gain per photo if the photos differ in exposure; "
-        f"{defaults.NO_EXPOSURE} with --preset inria.",
+        f"Default: {defaults.EXPOSURE}, a brightness for each photo if the photos differ in "
+        f"exposure; {defaults.NO_EXPOSURE} with --preset inria.",
     )
     exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
         None,

@@ -87,8 +87,8 @@ def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     # without `rate_factor` when rates did not follow the length, one without `final_decay` when
     # they did not fade, without `beta1` and `beta2` when they were the same for all lengths,
     # without `growth`, `start`, `dropout` and `floaters` when nothing led growth, filled the start,
-    # was left out or removed, without `exposure` when there was none, without `resolution` when all pixels were drawn, and one without
-    # `metrics` by 0.1.
+    # was left out or removed, without `exposure` when there was none, without `resolution` when all
+    # pixels were drawn, and one without `metrics` by 0.1.
     metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
     then = {"events": "steps", "rate_factor": 1.0, "final_decay": 0.0, "metrics": metrics}
     then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0}

@@ -93,7 +93,7 @@ def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joini
 
 
 def test_a_single_photo_that_is_off_decides_nothing():
-    seen = two_groups(joining=200)
+    seen = two_groups(joining=1_000, outliers=0.0)
     off = seen.stops - 1.3 * (seen.photos == NEAR)
     gains = judged(replace(seen, stops=off))
     assert gains.spread == pytest.approx(0.2, abs=0.03)

@@ -80,8 +80,12 @@ def fitted(observations: Observations, photos: int) -> Fit:
         residuals = rest - _means(o.points, rest, weights)[o.points]
     means = np.bincount(parts, gains) / np.maximum(np.bincount(parts), 1)
     variances = _variances(o, gains)
-    distances = [float(np.average(np.abs(r), weights=variances)) for r in (before, residuals)]
-    return Fit(gains - means[parts], *distances, _errors(o, weights, residuals, parts))
+    return Fit(
+        gains=gains - means[parts],
+        before=float(np.average(np.abs(before), weights=variances)),
+        after=float(np.average(np.abs(residuals), weights=variances)),
+        errors=_errors(o, weights, residuals, parts),
+    )
 
 
 def _variances(o: Observations, gains: _Floats) -> _Floats:
