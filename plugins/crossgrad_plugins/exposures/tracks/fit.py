@@ -113,7 +113,7 @@ def _errors(
     variance = float(residuals @ residuals) / max(free, 1)
     normal = _normal_matrix(o, weights, photos).toarray()
     inverse = np.linalg.pinv(normal, rcond=_RANK, hermitian=True)
-    return np.sqrt(variance * np.maximum(np.diag(inverse), 0.0))
+    return np.asarray(np.sqrt(variance * np.maximum(np.diag(inverse), 0.0)))
 
 
 def _parts(o: Observations, photos: int) -> NDArray[np.int64]:
