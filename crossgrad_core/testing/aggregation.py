@@ -11,10 +11,12 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.testing.contract import (
     Check,
     Make,
     admitted,
+    cannot_tell,
     global_randomness_untouched,
     require,
     revived,
@@ -50,13 +52,20 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     return found
 
 
-def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> AggregateContext:
-    """What the seam offers for these gradients."""
+def aggregate_context(
+    gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
+) -> AggregateContext:
+    """What the seam offers for these gradients.
+
+    Args:
+        gradients: The gradients of each view.
+        summed: Whether only their sum is known, as in a run in which nobody needs them apart.
+    """
     views = len(gradients)
     rng = np.random.default_rng(views)
     return AggregateContext(
         **step_fields(),
-        gradients=DenseGradients(gradients, BLOCKS),
+        gradients=_summed(gradients) if summed else DenseGradients(gradients, BLOCKS),
         losses=rng.uniform(0.05, 0.3, views),
         labels=tuple(("near", "far")[view % 2] for view in range(views)),
         distances=rng.uniform(0.2, 1.0, views),
@@ -65,9 +74,20 @@ def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggre
     )
 
 
-def aggregated(operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggregated:
-    """What the operator answers at the seam."""
-    answer: object = operator.crossgrad_aggregate_gradients(aggregate_context(gradients))
+def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients:
+    total = SummedGradients.empty(BLOCKS, len(gradients))
+    for view in gradients:
+        # The sum takes them over and writes to them.
+        total.add({name: None if each is None else each.clone() for name, each in view.items()})
+    return total
+
+
+def aggregated(
+    operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
+) -> Aggregated:
+    """What the operator answers at the seam; see `aggregate_context`."""
+    context = aggregate_context(gradients, summed=summed)
+    answer: object = operator.crossgrad_aggregate_gradients(context)
     if not isinstance(answer, Aggregated):
         require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
         raise TypeError
@@ -85,6 +105,19 @@ def every_tensor_is_answered(make: Make[Operator]) -> None:
             _require_gradient(f"K = {views}: the gradient of {name}", answer.gradients[name], shape)
         good = all(type(count) is int and count >= 0 for count in answer.counts.values())
         require(good, f"the counts {answer.counts} are not plain numbers")
+
+
+def the_sum_is_enough_where_separate_is_false(make: Make[Operator]) -> None:
+    """Of the sum alone an operator that does not say `separate = True` makes the same gradients."""
+    operator = make()
+    if operator.separate:
+        raise cannot_tell("the operator needs the views' gradients apart")
+    for views in admitted(operator.views):
+        gradients = sample_gradients(views)
+        found = aggregated(operator, gradients, summed=True).gradients
+        for name, gradient in aggregated(operator, gradients).gradients.items():
+            what = f"K = {views}: the gradient of {name}, of the sum and of single views,"
+            _require_same(what, found.get(name), gradient)
 
 
 def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]) -> None:
@@ -159,6 +192,7 @@ def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
 
 AGGREGATION_CHECKS: tuple[Check[Operator], ...] = (
     every_tensor_is_answered,
+    the_sum_is_enough_where_separate_is_false,
     equal_gradients_have_a_scale,
     absent_views_have_no_weight,
     gradients_stay_untouched,
