@@ -230,12 +230,25 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         ) from None
 
 
+def installed_name(kind: "type[Component]") -> str | None:
+    """The name under which a class is installed; None where no package offers it."""
+    for name, entry in entries(kind.slot).items():
+        module, _, attribute = entry.value.partition(":")
+        # Another package's module is not imported for a class of the same name.
+        if attribute.strip() == kind.__qualname__ and entry.package == _package_of(kind):
+            if module.strip() == kind.__module__ or resolve_entry(entry) is kind:
+                return name
+    return None
+
+
+def _package_of(kind: type) -> str:
+    return kind.__module__.partition(".")[0]
+
+
 def name_of(component: "Component") -> str:
     """The name under which a component is installed, else that of its class."""
     kind = type(component)
-    value = f"{kind.__module__}:{kind.__qualname__}"
-    names = (name for name, entry in entries(kind.slot).items() if entry.value == value)
-    return next(names, kind.__name__)
+    return installed_name(kind) or kind.__name__
 
 
 def plain(component: "Component") -> dict[str, Any]:
