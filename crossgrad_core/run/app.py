@@ -13,7 +13,7 @@ from typing import Any, cast
 from crossgrad_core.config import RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import failed_plugin
+from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
@@ -240,7 +240,7 @@ def _tried_out() -> Iterator[None]:
             raise
         raise UserError(
             "a step that was tried out before the training failed",
-            found=reason_of(error),
+            found=": ".join([*notes_on(error), reason_of(error)]),
             todo="look at settings, such as --rate-factor and --loss, and at the photos",
         ) from error
 

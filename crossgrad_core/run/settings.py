@@ -14,7 +14,7 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import installed_name
+from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.options import OPTIONS
@@ -221,8 +221,8 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
             found=", ".join(base.__name__ for base in kind.__bases__),
             todo=f"`crossgrad plugins list --slot {slot}` shows what there is",
         )
-    name = installed_name(kind)
-    if name is None:
+    entry = installed_as(kind)
+    if entry is None:
         raise UserError(
             f"{singular(slot)} {kind.__name__} is not installed as a plugin",
             where=where,
@@ -231,7 +231,7 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
             todo=f"`crossgrad plugins new NAME --slot {slot}` writes a package for it",
         )
     options = value.model_dump(mode="json", exclude_unset=True) if value is not kind else {}
-    return {"name": name, **options}
+    return {"name": entry.name, **options}
 
 
 def _plain(value: object) -> object:
