@@ -241,17 +241,14 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
 
 def installed_as(kind: "type[Component]") -> Entry | None:
     """The entry of a class; None where no package offers it."""
+    package = kind.__module__.partition(".")[0]
     for entry in entries(kind.slot).values():
         module, _, attribute = entry.value.partition(":")
         # Another package's module is not imported for a class of the same name.
-        if attribute.strip() == kind.__qualname__ and entry.package == _package_of(kind):
-            if module.strip() == kind.__module__ or resolve_entry(entry) is kind:
-                return entry
+        alike = attribute.strip() == kind.__qualname__ and entry.package == package
+        if alike and (module.strip() == kind.__module__ or resolve_entry(entry) is kind):
+            return entry
     return None
-
-
-def _package_of(kind: type) -> str:
-    return kind.__module__.partition(".")[0]
 
 
 def name_of(component: "Component") -> str:

@@ -50,7 +50,7 @@ def _may_be_ours(line: str) -> bool:
 
 
 def _refusing(line: str) -> str:
-    """The requirement in a line of metadata, if it is about crossgrad and this version misses it."""
+    """The requirement in a line of metadata, if it excludes this version of crossgrad."""
     from packaging.requirements import InvalidRequirement, Requirement
 
     try:

@@ -53,6 +53,7 @@ def resume(
     folder: Path | str,
     *,
     accept_scene: bool = False,
+    accept_plugins: bool = False,
     quiet: bool = False,
     verbose: bool = False,
     **options: object,
@@ -62,20 +63,22 @@ def resume(
     Args:
         folder: The run's folder.
         accept_scene: Go on although photos, masks or points of the scene have changed.
+        accept_plugins: Go on with other versions of the packages that train the run.
         quiet: Shows no progress.
         verbose: Shows every decision and event.
         options: `device`, `threads` and `stop_after`; everything else stays as it was.
 
     Raises:
         UserError: It is no run, it is finished or in use, an option would change the training, or
-            the scene is another one.
+            the scene or a package is another one.
         RunFailedError: Training failed; what there is was kept.
         KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())
     with _speaking(quiet=quiet), as_in_a_command():
         way = _way(quiet=quiet, verbose=verbose)
-        outcome = app.resumed(Path(folder), settings, way, accept_scene=accept_scene)
+        accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
+        outcome = app.resumed(Path(folder), settings, way, **accepted)
     return _result(outcome)
 
 

@@ -262,7 +262,7 @@ def test_what_is_no_component_is_refused_after_set(assignment):
 
 @pytest.mark.parametrize("slot", sorted(GROUPS))
 def test_every_slot_takes_a_name_a_mapping_a_class_or_an_instance(slot):
-    name = "cagrad" if slot == "operators" else sorted(entries(slot))[-1]
+    name = "cagrad" if slot == "operators" else max(entries(slot))
     kind = load(slot, name)
     for given in (name, {"name": name}, kind, kind()):
         chosen = getattr(

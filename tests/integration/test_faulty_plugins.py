@@ -116,7 +116,10 @@ PLUGINS = {
     "samplers": {"numpy": "NumpySampler", "behind": "Behind", "before": "Before"},
     "groupings": {"fewer": "Fewer", "failing": "Failing"},
     "observers": {
-        "words": "Words", "objecting": "Objecting", "steps": "Steps", "around": "Around",
+        "words": "Words",
+        "objecting": "Objecting",
+        "steps": "Steps",
+        "around": "Around",
         "asks": "Asks",
     },
     "resolutions": {"unfit": "Unfit"},
@@ -205,7 +208,7 @@ def test_it_is_one_message_before_anything_is_written(
 
 
 @pytest.mark.parametrize(
-    ("observer", "hook", "words"),
+    "case",
     [
         ("steps", "step_end", "ZeroDivisionError: nothing to divide"),
         ("around", "densify", "LookupError: nothing to look up"),
@@ -213,8 +216,9 @@ def test_it_is_one_message_before_anything_is_written(
     ],
 )
 def test_a_hook_that_fails_in_training_is_named_with_its_plugin(
-    scene, tmp_path, monkeypatch, capsys, observer, hook, words
+    scene, tmp_path, monkeypatch, capsys, case
 ):
+    observer, hook, words = case
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--observe", observer) == 1
     error = json.loads((tmp_path / "run" / "summary.json").read_text())["error"]

@@ -224,7 +224,8 @@ def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers
         hook.crossgrad_densify(context=None)
     (note,) = caught.value.__notes__
     assert note.startswith("in hook crossgrad_densify of plugin failing, ")
-    hook = make_manager({"one": Densifier(Densified(NO_EDIT)), "after": After(), "around": Around()}).hook
+    answering = Densifier(Densified(NO_EDIT))
+    hook = make_manager({"one": answering, "after": After(), "around": Around()}).hook
     with pytest.raises(LookupError) as caught:
         hook.crossgrad_densify(context=None)
     (note,) = caught.value.__notes__
