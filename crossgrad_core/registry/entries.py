@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
-from crossgrad_core.registry.requirements import refuse_other_version
+from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
 from crossgrad_core.registry.strays import strays
@@ -166,6 +166,23 @@ def resolve_entry(entry: Entry) -> object:
                 f"repair or uninstall {entry.distribution}; other {others} are not affected",
             ),
         ) from error
+
+
+def refuse_other_version(entry: Entry) -> None:
+    """Refuses a plugin whose package requires another version of crossgrad than this one.
+
+    Raises:
+        UserError: It does; names the package and what it requires.
+    """
+    if required := unmet_requirement(entry.distribution):
+        raise UserError(
+            f"{singular(entry.slot)} {entry.name} is written for another version of crossgrad",
+            where=entry.origin,
+            expected=f"{required}, which {entry.distribution} {entry.version} requires",
+            found=f"{OURS} {VERSION}",
+            todo=f"install a version of {entry.distribution} for {OURS} {VERSION}, or install "
+            f"'{required}'",
+        )
 
 
 def notes_on(error: BaseException) -> list[str]:

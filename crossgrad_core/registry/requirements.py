@@ -1,44 +1,21 @@
 """Which versions of crossgrad the package of a plugin says that it works with."""
 
-from typing import TYPE_CHECKING
+from typing import Final
 
-from crossgrad_core.errors import UserError
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.wording import singular
-
-if TYPE_CHECKING:
-    from crossgrad_core.registry.entries import Entry
 
 #: The name of the distribution that packages require.
-CROSSGRAD = "crossgrad"
+CROSSGRAD: Final = "crossgrad"
 
 
-def refuse_other_version(entry: "Entry") -> None:
-    """Refuses a plugin whose package requires another version of crossgrad than this one.
-
-    Raises:
-        UserError: It does; names the package and what it requires.
-    """
-    required = unmet_requirement(entry)
-    if required:
-        raise UserError(
-            f"{singular(entry.slot)} {entry.name} is written for another version of crossgrad",
-            where=entry.origin,
-            expected=f"{required}, which {entry.distribution} {entry.version} requires",
-            found=f"{CROSSGRAD} {VERSION}",
-            todo=f"install a version of {entry.distribution} for {CROSSGRAD} {VERSION}, or install "
-            f"'{required}'",
-        )
-
-
-def unmet_requirement(entry: "Entry") -> str:
-    """What a plugin's package requires of crossgrad, if this version is another; else empty."""
+def unmet_requirement(distribution: str) -> str:
+    """What a distribution requires of crossgrad, if this version is another; else empty."""
+    if distribution == CROSSGRAD:
+        return ""
     from importlib.metadata import PackageNotFoundError, requires
 
-    if entry.distribution == CROSSGRAD:
-        return ""
     try:
-        lines = requires(entry.distribution) or []
+        lines = requires(distribution) or []
     except (PackageNotFoundError, ValueError):
         return ""
     # Packages have many requirements, and few of them begin like this one.

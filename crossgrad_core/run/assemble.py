@@ -17,9 +17,14 @@ from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.registry.entries import build, entries, find, from_elsewhere
+from crossgrad_core.registry.entries import (
+    build,
+    entries,
+    find,
+    from_elsewhere,
+    refuse_other_version,
+)
 from crossgrad_core.registry.manager import make_manager
-from crossgrad_core.registry.requirements import refuse_other_version
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.idle import idle_note

@@ -230,8 +230,9 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
             "writes the name of each component into config.yaml, and is continued from there",
             todo=f"`crossgrad plugins new NAME --slot {slot}` writes a package for it",
         )
-    options = value.model_dump(mode="json", exclude_unset=True) if value is not kind else {}
-    return {"name": entry.name, **options}
+    if not isinstance(value, Component):
+        return {"name": entry.name}
+    return {"name": entry.name, **value.model_dump(mode="json", exclude_unset=True)}
 
 
 def _plain(value: object) -> object:
@@ -330,11 +331,14 @@ def _extended(old: list[object], new: object) -> list[object]:
     What is no choice, and a name that is new twice, is left for the validation.
     """
     extended, names = list(old), [link.get("name") for link in _links(new)]
+    named = [(row, each) for row, each in enumerate(old) if isinstance(each, dict)]
     for choice in _in_list(new):
-        name = choice.get("name") if isinstance(choice, dict) else None
-        same = [row for row, link in enumerate(old) if link in _links(old) and link["name"] == name]
+        options: Settings = choice if isinstance(choice, dict) else {}
+        name = options.get("name")
+        same = [(row, link) for row, link in named if name and link.get("name") == name]
         if same and names.count(name) == 1:
-            extended[same[0]] = {**extended[same[0]], **choice}
+            row, link = same[0]
+            extended[row] = {**link, **options}
         elif choice not in extended:
             extended.append(choice)
     return extended

@@ -146,7 +146,7 @@ def _rows(found: tuple[Entry, ...]) -> list[str]:
             note = "  offered twice: it is refused where it is asked for"
         if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
             note = "  never called: the core has a command of that name"
-        if required := unmet_requirement(entry):
+        if required := unmet_requirement(entry.distribution):
             note = f"  refused where it is asked for: it requires {required}"
         rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
     return rows

@@ -1020,7 +1020,7 @@ RAISING = [
     (observers.seams_stay_answered, LooksAtSingleViews, TypeError),
     (observers.survives_every_event, RemembersNoLabels, TypeError),
     (observers.survives_every_event, LooksBackAtStepsAsTuples, TypeError),
-    (aggregation.the_sum_is_enough_where_separate_is_false, CountsSingleViews, TypeError),
+    (aggregation.every_tensor_is_answered, CountsSingleViews, TypeError),
 ]
 
 
