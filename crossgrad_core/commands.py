@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
+from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
+from crossgrad_core.registry.strays import Stray, strays
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
@@ -83,6 +85,7 @@ __all__ = [
     "RunConfig",
     "RunResults",
     "Setup",
+    "Stray",
     "TrainState",
     "TrainingFailedError",
     "UserError",
@@ -139,11 +142,13 @@ __all__ = [
     "sentences",
     "shows_few_times",
     "singular",
+    "strays",
     "summary",
     "summary_of",
     "table_bytes",
     "take_steps",
     "tell",
+    "unmet_requirement",
     "usual_budget",
     "usual_densifier",
     "usual_dropout",

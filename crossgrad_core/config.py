@@ -33,6 +33,13 @@ class ComponentChoice(BaseModel):
 
     name: str
 
+    @model_validator(mode="before")
+    @classmethod
+    def _choice(cls, value: object) -> object:
+        if isinstance(value, Mapping | ComponentChoice):
+            return value
+        raise ValueError("the name of a component, or a mapping with its name and options")
+
     @property
     def options(self) -> dict[str, Any]:
         """The options as given."""
@@ -358,6 +365,15 @@ class RunConfig(BaseModel):
     @classmethod
     def _chain(cls, value: object) -> object:
         return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("metrics", "observers")
+    @classmethod
+    def _each_once(cls, value: tuple[ComponentChoice, ...]) -> tuple[ComponentChoice, ...]:
+        names = [choice.name for choice in value]
+        twice = dict.fromkeys(name for name in names if names.count(name) > 1)
+        if twice:
+            raise ValueError(f"each one once, with all its options; {', '.join(twice)} comes twice")
+        return value
 
     @field_validator("views_per_step")
     @classmethod

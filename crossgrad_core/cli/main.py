@@ -12,7 +12,7 @@ from crossgrad_core.cli.plugin_commands import WithPlugins
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import failed_plugin
+from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.startup import finish
 from crossgrad_core.system.version import VERSION
@@ -76,6 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         finish()
         typer.echo(f"error: {told}", err=True)
+        for note in notes_on(told):
+            typer.echo(f"  {note}", err=True)
         sys.exit(BAD_INPUT)
     finally:
         finish()

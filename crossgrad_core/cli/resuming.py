@@ -9,7 +9,9 @@ from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.wording import listed
 
 #: What only this start of the command is asked.
-_OF_THE_COMMAND: Final = frozenset({"resume", "accept_scene", "check", "quiet", "verbose"})
+_OF_THE_COMMAND: Final = frozenset(
+    {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose"}
+)
 
 
 def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
@@ -27,8 +29,8 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
         raise UserError(
             "a resumed run keeps its settings and its scene",
             where=listed(typed),
-            expected="--device, --threads, --stop-after, --accept-scene, --check, -q and -v, and "
-            "nothing else",
+            expected="--device, --threads, --stop-after, --accept-scene, --accept-plugins, "
+            "--check, -q and -v, and nothing else",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )

@@ -62,6 +62,12 @@ _RESUMING: Final = (
         "--accept-scene",
         help="With --resume: go on although photos, masks or points of the scene have changed.",
     ),
+    _own(
+        "accept_plugins",
+        bool,
+        "--accept-plugins",
+        help="With --resume: go on with other versions of the packages that train the run.",
+    ),
 )
 _LAST: Final = (
     _own(
@@ -156,6 +162,7 @@ def run(**given: Any) -> None:  # noqa: ANN401 - typed by the schema
             dry_run=given["dry_run"],
             verbosity=-1 if given["quiet"] else int(given["verbose"]),
             accept_scene=given["accept_scene"],
+            accept_plugins=given["accept_plugins"],
             check=given["check"],
         )
     except UserError as error:

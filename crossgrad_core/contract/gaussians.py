@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -118,16 +118,29 @@ class Gaussians:
 
 
 class _Whole(Gaussians):
-    """Gaussians that bring all rows of a tensor up to date when it is read."""
+    """Gaussians that bring all rows of a tensor up to date when it is read.
+
+    A copy of them, however it is made, is plain Gaussians whose rows are all up to date.
+    """
 
     @override
     def __getattribute__(self, name: str) -> Any:
-        if name == "on_demand":
-            return None
-        demand: OnDemand = super().__getattribute__("on_demand")
+        stored: dict[str, Any] = super().__getattribute__("__dict__")
+        demand: OnDemand = stored["on_demand"]
+        match name:
+            case "on_demand":
+                return None
+            case "__class__":
+                return Gaussians
+            case "__dict__":
+                return {field: getattr(self, field) for field in stored}
         if name in demand.fields:
             demand.bring(None)
         return super().__getattribute__(name)
+
+    @override
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[type[Gaussians], tuple[Any, ...]]:
+        return Gaussians, tuple(vars(self).values())
 
 
 @dataclass

@@ -19,8 +19,9 @@ class MorePoints:
         positions: [N, 3] float64, local frame.
         colors: [N, 3] uint8 RGB.
         sizes: [N] float64, local units: standard deviation of the Gaussian that a point becomes,
-            where a backbone makes Gaussians of points.
-        opacities: [N] float64 in (0, 1): its opacity, likewise.
+            where a backbone makes Gaussians of points. NaN takes it from the distance to the
+            neighbours, as for the points of the scene.
+        opacities: [N] float64 in (0, 1): its opacity, likewise. NaN takes the backbone's own.
     """
 
     positions: NDArray[np.float64]

@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
+from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
+from crossgrad_core.registry.strays import strays
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
     did_you_mean,
@@ -145,8 +147,9 @@ def resolve_entry(entry: Entry) -> object:
     """Whatever an entry points at; imports its module.
 
     Raises:
-        UserError: It cannot be imported.
+        UserError: It cannot be imported, or its package requires another version of crossgrad.
     """
+    refuse_other_version(entry)
     try:
         return _resolve(entry.value)
     except UserError:
@@ -165,6 +168,29 @@ def resolve_entry(entry: Entry) -> object:
         ) from error
 
 
+def refuse_other_version(entry: Entry) -> None:
+    """Refuses a plugin whose package requires another version of crossgrad than this one.
+
+    Raises:
+        UserError: It does; names the package and what it requires.
+    """
+    if required := unmet_requirement(entry.distribution):
+        raise UserError(
+            f"{singular(entry.slot)} {entry.name} is written for another version of crossgrad",
+            where=entry.origin,
+            expected=f"{required}, which {entry.distribution} {entry.version} requires",
+            found=f"{OURS} {VERSION}",
+            todo=f"install a version of {entry.distribution} for {OURS} {VERSION}, or install "
+            f"'{required}'",
+        )
+
+
+def notes_on(error: BaseException) -> list[str]:
+    """In which step, and in which hook of which plugin, an exception was raised, if noted."""
+    # The hook notes it first.
+    return list(reversed(getattr(error, "__notes__", ())))
+
+
 def failed_plugin(error: Exception) -> UserError | None:
     """What to say of an exception that came out of another package's code; None of our own."""
     others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
@@ -175,7 +201,7 @@ def failed_plugin(error: Exception) -> UserError | None:
     entry, place = next((one for one in found if one[1].startswith(f"{one[0].file}:")), found[0])
     return UserError(
         f"a plugin of {entry.distribution} {entry.version} failed",
-        where=place,
+        where=sentences(*notes_on(error), place),
         found=in_one_line(error),
         todo=f"repair or uninstall {entry.distribution}, or choose other components",
     )
@@ -230,12 +256,23 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         ) from None
 
 
+def installed_as(kind: "type[Component]") -> Entry | None:
+    """The entry of a class; None where no package offers it."""
+    package = kind.__module__.partition(".")[0]
+    for entry in entries(kind.slot).values():
+        module, _, attribute = entry.value.partition(":")
+        # Another package's module is not imported for a class of the same name.
+        alike = attribute.strip() == kind.__qualname__ and entry.package == package
+        if alike and (module.strip() == kind.__module__ or resolve_entry(entry) is kind):
+            return entry
+    return None
+
+
 def name_of(component: "Component") -> str:
     """The name under which a component is installed, else that of its class."""
     kind = type(component)
-    value = f"{kind.__module__}:{kind.__qualname__}"
-    names = (name for name, entry in entries(kind.slot).items() if entry.value == value)
-    return next(names, kind.__name__)
+    entry = installed_as(kind)
+    return kind.__name__ if entry is None else entry.name
 
 
 def plain(component: "Component") -> dict[str, Any]:
@@ -273,6 +310,9 @@ def _unknown(slot: str, name: str) -> UserError:
     names = list(entries(slot))
     elsewhere = [other for other in GROUPS if other != slot and name in entries(other)]
     hint = f"{name} is a {singular(elsewhere[0])}" if elsewhere else did_you_mean(name, names)
+    for stray in strays():
+        if stray.name == name:
+            hint = f"{stray.origin} offers {name}, but {stray.reason}"
     return UserError(
         f"there is no {singular(slot)} named {name!r}",
         where=singular(slot),

@@ -5,7 +5,7 @@ plugin that answers first. All three are errors here, with the plugin's name.
 """
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from types import FunctionType, MemberDescriptorType, MethodType
 from typing import Any, TypeVar, cast
 
@@ -13,6 +13,7 @@ import pluggy
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import (
     Answer,
     Densified,
@@ -24,7 +25,8 @@ from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.marks import PROJECT
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
-from crossgrad_core.wording import did_you_mean, listed, sentences
+from crossgrad_core.registry.entries import installed_as
+from crossgrad_core.wording import did_you_mean, listed, sentences, singular
 
 A = TypeVar("A", bound=Answer)
 
@@ -74,6 +76,7 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
                 found=" ".join(str(error).split()),
                 todo="docs/hooks.md lists every hook with its arguments",
             ) from error
+        _note_failures(manager, name, plugin)
     _refuse_second_answers(manager)
     return manager
 
@@ -124,6 +127,49 @@ def call_question(hook: pluggy.HookCaller, context: StepContext, answer: type[A]
                 todo="repair the plugin (docs/hooks.md), or leave it out",
             )
     return cast("list[A]", results)
+
+
+def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
+    """Lets exceptions that hooks of a plugin raise say whose hook it was."""
+    whose = _described(name, plugin)
+    for caller in manager.get_hookcallers(plugin) or ():
+        for implementation in caller.get_hookimpls():
+            if implementation.plugin is plugin:
+                noted = _noted(implementation.function, f"in hook {caller.name} of {whose}")
+                implementation.function = noted  # type: ignore[misc]
+
+
+def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
+    """The function, which may be a wrapper; the note is on every exception that it raises first."""
+
+    def call(*arguments: object) -> object:
+        try:
+            return function(*arguments)
+        except (Exception, SystemExit) as error:
+            _add_note(error, note)
+            raise
+
+    def wrap(*arguments: object) -> Generator[None, object, object]:
+        try:
+            return (yield from function(*arguments))
+        except (Exception, SystemExit) as error:
+            _add_note(error, note)
+            raise
+
+    return wrap if inspect.isgeneratorfunction(function) else call
+
+
+def _add_note(error: BaseException, note: str) -> None:
+    # What a wrapper passes on is another plugin's, and was noted there.
+    if not any(each.startswith("in hook ") for each in getattr(error, "__notes__", ())):
+        error.add_note(note)
+
+
+def _described(name: str, plugin: object) -> str:
+    entry = installed_as(type(plugin)) if isinstance(plugin, Component) else None
+    if entry is None:
+        return f"plugin {name}, {_class_of(plugin)}"
+    return f"{singular(entry.slot)} {entry.name}, from {entry.distribution} {entry.version}"
 
 
 def _complete(answer: Answer) -> bool:

@@ -13,7 +13,7 @@ from typing import Any, cast
 from crossgrad_core.config import RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import failed_plugin
+from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
 from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
@@ -36,6 +36,12 @@ from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.plan_file import write_plan
+from crossgrad_core.run.results.plugins_file import (
+    packages_of,
+    read_plugins,
+    with_present,
+    write_plugins,
+)
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
@@ -94,13 +100,14 @@ class Outcome:
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
-def run(
+def run(  # noqa: PLR0913 - one parameter per option of the command line
     settings: Mapping[str, Any],
     *,
     resume: Path | None = None,
     dry_run: bool = False,
     verbosity: int = 0,
     accept_scene: bool = False,
+    accept_plugins: bool = False,
     check: bool = False,
 ) -> int:
     """Trains, evaluates, exports, and prints the results: what `crossgrad run` does.
@@ -111,6 +118,7 @@ def run(
         dry_run: Of a new run, check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
         accept_scene: Continue although photos, masks or points of the scene have changed.
+        accept_plugins: Continue with other versions of the packages that train the run.
         check: Decode all photos before training.
 
     Returns:
@@ -122,11 +130,12 @@ def run(
     """
     way = Way(verbosity, _print_results, check)
     if resume is not None:
-        return resumed(resume, settings, way, accept_scene=accept_scene).exit_code
-    if accept_scene:
+        accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
+        return resumed(resume, settings, way, **accepted).exit_code
+    if accept_scene or accept_plugins:
         raise UserError(
-            "only a run that is continued has a scene to compare with",
-            where="--accept-scene",
+            "only a run that is continued has something to compare with",
+            where="--accept-scene" if accept_scene else "--accept-plugins",
             todo="leave it out, or name the run with --resume",
         )
     if dry_run:
@@ -173,6 +182,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config, setup.notes)
         write_plan(folder, setup.plan)
+        write_plugins(folder, packages_of(setup))
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         with way_on(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
@@ -240,7 +250,7 @@ def _tried_out() -> Iterator[None]:
             raise
         raise UserError(
             "a step that was tried out before the training failed",
-            found=reason_of(error),
+            found=": ".join([*notes_on(error), reason_of(error)]),
             todo="look at settings, such as --rate-factor and --loss, and at the photos",
         ) from error
 
@@ -326,7 +336,12 @@ def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
 
 
 def resumed(
-    folder: Path, settings: Mapping[str, Any], way: Way, *, accept_scene: bool = False
+    folder: Path,
+    settings: Mapping[str, Any],
+    way: Way,
+    *,
+    accept_scene: bool = False,
+    accept_plugins: bool = False,
 ) -> Outcome:
     """Continues a run.
 
@@ -335,14 +350,16 @@ def resumed(
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
         way: How it speaks.
         accept_scene: Continue although photos, masks or points of the scene have changed.
+        accept_plugins: Continue with other versions of the packages that train the run.
 
     Raises:
         UserError: It is no run, it is finished or in use, a setting would change the training, or
-            the scene is another one.
+            the scene or a package is another one.
     """
+    accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
     with way_on(resume_line(folder)), _held(folder):
-        setup, state = continued(folder, settings, way.verbosity, accept_scene=accept_scene)
+        setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
@@ -369,6 +386,8 @@ def resumed(
             with _tried_out():
                 state.clock.compile += warm_up(setup, state)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
+        known = read_plugins(folder, quiet=True) if step else None
+        write_plugins(folder, with_present(known, packages_of(setup)))
         session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))
         return _train(setup, state, session, length, way.tell)

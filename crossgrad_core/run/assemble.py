@@ -17,7 +17,13 @@ from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.registry.entries import build, entries, find, from_elsewhere
+from crossgrad_core.registry.entries import (
+    build,
+    entries,
+    find,
+    from_elsewhere,
+    refuse_other_version,
+)
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.devices import choose_device
@@ -77,7 +83,8 @@ def check_names(config: RunConfig) -> None:
     """Looks up every component and the device, before a large scene is read for nothing.
 
     Raises:
-        UserError: A name does not exist, with the closest one that does.
+        UserError: A name does not exist, with the closest one that does, or its package requires
+            another version of crossgrad.
     """
     choose_device(config.device)
     named = [("operators", link) for link in config.operators]
@@ -86,7 +93,7 @@ def check_names(config: RunConfig) -> None:
     named += [(slot, getattr(config, singular(slot))) for slot in single]
     for slot, choice in named:
         if choice is not None and choice.name != AUTO:
-            find(slot, choice.name)
+            refuse_other_version(find(slot, choice.name))
 
 
 def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:

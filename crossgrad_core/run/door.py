@@ -3,7 +3,6 @@
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 
 from crossgrad_core.errors import RunFailedError
@@ -32,7 +31,8 @@ def run(
         options: What the options of `crossgrad run` and the keys of config.yaml are called:
             `backbone="scaffold"`, `seconds=60`, `max_size=800`, `out="runs/mine"`. A component's
             own options go with its name, `operator={"name": "cagrad", "c": 0.4}`, or stand for
-            themselves, `**{"operator.c": 0.4}`. None leaves an option out.
+            themselves, `**{"operator.c": 0.4}`. An installed component may also be given as its
+            class, or as an instance, of which the run takes the options. None leaves an option out.
 
     Returns:
         The run, finished or stopped (`stop_after`).
@@ -43,9 +43,7 @@ def run(
         KeyboardInterrupt: The user interrupted it. In the main thread of Python that happens after
             the step, and the run can be resumed.
     """
-    settings = merged(
-        None if config is None else Path(config), deepcopy({"scene": scene, **options}), ()
-    )
+    settings = merged(None if config is None else Path(config), {"scene": scene, **options}, ())
     with _speaking(quiet=quiet), as_in_a_command():
         outcome = app.new(settings, _way(quiet=quiet, verbose=verbose))
     return _result(outcome)
@@ -55,6 +53,7 @@ def resume(
     folder: Path | str,
     *,
     accept_scene: bool = False,
+    accept_plugins: bool = False,
     quiet: bool = False,
     verbose: bool = False,
     **options: object,
@@ -64,20 +63,22 @@ def resume(
     Args:
         folder: The run's folder.
         accept_scene: Go on although photos, masks or points of the scene have changed.
+        accept_plugins: Go on with other versions of the packages that train the run.
         quiet: Shows no progress.
         verbose: Shows every decision and event.
         options: `device`, `threads` and `stop_after`; everything else stays as it was.
 
     Raises:
         UserError: It is no run, it is finished or in use, an option would change the training, or
-            the scene is another one.
+            the scene or a package is another one.
         RunFailedError: Training failed; what there is was kept.
         KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())
     with _speaking(quiet=quiet), as_in_a_command():
         way = _way(quiet=quiet, verbose=verbose)
-        outcome = app.resumed(Path(folder), settings, way, accept_scene=accept_scene)
+        accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
+        outcome = app.resumed(Path(folder), settings, way, **accepted)
     return _result(outcome)
 
 

@@ -8,8 +8,9 @@ from shlex import quote
 from typing import Final, TypeVar
 
 from crossgrad_core.contract.contexts import RunInfo
+from crossgrad_core.registry.entries import notes_on
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
-from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
+from crossgrad_core.run.reason import is_unexpected, reason_of, traceback_of
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
@@ -186,7 +187,7 @@ class Course:
             self.log.write(traceback_of(error))
         known = self.ending.error
         if known is None or reason not in known:
-            parts = [known, ": ".join(part for part in (missing, *steps_of(error), reason) if part)]
+            parts = [known, ": ".join(part for part in (missing, *notes_on(error), reason) if part)]
             known = "\n".join(part for part in parts if part)
         before = self.ending
         self.ending = Ending("failed", known, before.traced or traced, before.cause or error)

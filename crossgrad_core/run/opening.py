@@ -22,10 +22,21 @@ from crossgrad_core.run.rasterizers import drawn_elsewhere
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
 from crossgrad_core.run.results.lock import writer_of
+from crossgrad_core.run.results.plugins_file import (
+    Packages,
+    history,
+    packages_of,
+    read_plugins,
+    refuse_changed,
+    refuse_missing,
+    report_changed,
+    with_present,
+    without_outdated,
+)
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
 from crossgrad_core.run.resumable import CHANGEABLE
-from crossgrad_core.run.stand_ins import as_it_was, without_missing
+from crossgrad_core.run.stand_ins import REPLACEABLE, as_it_was, without_missing
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
 from crossgrad_core.training.budget import caught_up
@@ -138,7 +149,10 @@ def opened(
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
-    return _from(folder, {"threads": None, **settings}, -1, check, looks=True)
+    packages = read_plugins(folder)
+    refuse_missing(folder, packages, optional=REPLACEABLE)
+    report_changed(packages)
+    return _from(folder, {"threads": None, **settings}, -1, check, packages, looks=True)
 
 
 def continued(
@@ -147,6 +161,7 @@ def continued(
     verbosity: int,
     *,
     accept_scene: bool = False,
+    accept_plugins: bool = False,
 ) -> tuple[Setup, TrainState]:
     """A run's setup and the state that it goes on from.
 
@@ -157,18 +172,24 @@ def continued(
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
         verbosity: -1 quiet, 0 normal, 1 verbose.
         accept_scene: Take a scene of which photos, masks or points have changed.
+        accept_plugins: Take other versions of the packages that train the run.
 
     Raises:
-        UserError: It is no run, a setting would change the training, or the scene is another one.
+        UserError: It is no run, a setting would change the training, or the scene or a package is
+            another one.
     """
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
+    packages = read_plugins(folder)
+    refuse_missing(folder, packages)
     if complete_checkpoints(folder / CHECKPOINTS):
-        return _from(folder, settings, verbosity, check)
+        if not accept_plugins:
+            refuse_changed(folder, packages)
+        return _from(folder, settings, verbosity, check, packages)
     _refuse_lost_checkpoints(folder)
     setup, seconds = set_up(_config(folder, settings), verbosity)
     state = first_state(setup)
     state.clock.load = seconds
-    return replace(setup, notes=(BEGINS_AGAIN, *_noted(folder, setup))), state
+    return replace(setup, notes=(BEGINS_AGAIN, *_noted(folder, setup, None))), state
 
 
 def _from(
@@ -176,6 +197,7 @@ def _from(
     settings: Mapping[str, Any],
     verbosity: int,
     check: Callable[[Fingerprint], tuple[str, ...]],
+    packages: Packages | None,
     *,
     looks: bool = False,
 ) -> tuple[Setup, TrainState]:
@@ -186,13 +208,16 @@ def _from(
     check_settings(as_it_was(setup.config, config), checkpoint)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
-    return caught_up(replace(setup, notes=_noted(folder, setup)), state.step), state
+    packages = packages if looks else with_present(packages, packages_of(setup))
+    notes = _noted(folder, setup, packages)
+    return caught_up(replace(setup, notes=notes), state.step), state
 
 
-def _noted(folder: Path, setup: Setup) -> tuple[str, ...]:
+def _noted(folder: Path, setup: Setup, packages: Packages | None) -> tuple[str, ...]:
     """What the scene says now, and what the run noted when it decided what is a setting now."""
-    stored = read_notes(folder)
-    return tuple(dict.fromkeys((*setup.scene.notes, *stored))) if stored else setup.notes
+    packages = packages or {}
+    stored = without_outdated(read_notes(folder) or setup.notes, packages)
+    return tuple(dict.fromkeys((*setup.scene.notes, *stored, *history(packages))))
 
 
 def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:

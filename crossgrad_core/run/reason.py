@@ -20,11 +20,6 @@ def reason_of(error: BaseException) -> str:
     return f"{text}{_place(error)}"
 
 
-def steps_of(error: BaseException) -> list[str]:
-    """The step in which the error was raised, where training noted one."""
-    return list(getattr(error, "__notes__", ()))
-
-
 def is_unexpected(error: BaseException) -> bool:
     """Whether the error is none that crossgrad words for its users."""
     return not isinstance(error, UserError | TrainingFailedError)

@@ -5,20 +5,21 @@ it: unknown keys and values out of bounds are found there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import yaml
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
+from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
-from crossgrad_core.wording import listed, singular
+from crossgrad_core.wording import listed, plural, singular, with_article
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -93,7 +94,7 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
     """
     settings: Settings = {}
     for layer in layers:
-        settings = _overlaid(settings, _places(_flat(deepcopy(layer))), [])
+        settings = _overlaid(settings, _places(_flat(layer)), [])
     settings = _overlaid(settings, {}, list(map(_parsed, assignments)))
     return _named_by_default(settings)
 
@@ -164,16 +165,16 @@ def _normalized(settings: Settings) -> Settings:
 
 def _long_form(key: str, value: object) -> object:
     if key in CHOICES and value is not None:
-        return _choice(value)
+        return _choice(key, value)
     if key in LISTS and value is not None:
-        return [_named(each) for each in _items(value)]
+        return [_named(key, each) for each in _items(value)]
     return value
 
 
-def _choice(value: object) -> object:
+def _choice(key: str, value: object) -> object:
     """`a` -> one choice, `a+b` or a list -> a list of choices."""
     chain = isinstance(value, list | tuple) or (isinstance(value, str) and "+" in value)
-    return [_named(each) for each in _items(value)] if chain else _named(value)
+    return [_named(key, each) for each in _items(value)] if chain else _named(key, value)
 
 
 def _items(value: object) -> Iterable[object]:
@@ -196,15 +197,53 @@ def _with_name(name: str, options: object) -> object:
     return {"name": name, **options} if isinstance(options, dict) else {name: options}
 
 
-def _named(value: object) -> object:
+def _named(key: str, value: object) -> object:
     """A choice `{"name": ..., option: ...}`; what is no choice is left for the validation."""
-    return {"name": value.strip()} if isinstance(value, str) else value
+    if isinstance(value, str):
+        return {"name": value.strip()}
+    kind = value if isinstance(value, type) else type(value)
+    return _component(key, kind, value) if issubclass(kind, Component) else value
+
+
+def _component(key: str, kind: type[Component], value: object) -> Settings:
+    """The choice of a component that is given as a class, or as an instance with its options.
+
+    Raises:
+        UserError: It fills another slot, or no installed package offers it.
+    """
+    slot = key if key in LISTS else plural(key)
+    where = f"{key}, {kind.__module__}:{kind.__qualname__}"
+    if getattr(kind, "slot", None) != slot:
+        raise UserError(
+            f"{kind.__name__} cannot be chosen as {with_article(singular(slot))}",
+            where=where,
+            expected=f"a class of crossgrad_core.plugin.{singular(slot).capitalize()}",
+            found=", ".join(base.__name__ for base in kind.__bases__),
+            todo=f"`crossgrad plugins list --slot {slot}` shows what there is",
+        )
+    entry = installed_as(kind)
+    if entry is None:
+        raise UserError(
+            f"{singular(slot)} {kind.__name__} is not installed as a plugin",
+            where=where,
+            expected=f"a class that an installed package offers in the group {GROUPS[slot]}: a run "
+            "writes the name of each component into config.yaml, and is continued from there",
+            todo=f"`crossgrad plugins new NAME --slot {slot}` writes a package for it",
+        )
+    if not isinstance(value, Component):
+        return {"name": entry.name}
+    return {"name": entry.name, **value.model_dump(mode="json", exclude_unset=True)}
 
 
 def _plain(value: object) -> object:
-    """A value as YAML would give it: numbers of numpy become Python's."""
-    if isinstance(value, Path):
-        return str(value)
+    """A copy of a value as YAML would give it: numbers of numpy become Python's."""
+    match value:
+        case Path():
+            return str(value)
+        case Mapping():
+            return {name: _plain(each) for name, each in value.items()}
+        case list() | tuple():
+            return type(value)(map(_plain, value))
     to_python = getattr(value, "item", None)
     return to_python() if callable(to_python) and getattr(value, "ndim", None) == 0 else value
 
@@ -240,10 +279,10 @@ def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
     """Puts a value in its place; a newly chosen component keeps none of the old one's options."""
     path = (current_name(path[0]), *path[1:])
     key, *rest = path
-    if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str):
-        settings[key] = _renamed(settings.get(key), _choice(value))
+    if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str | type):
+        settings[key] = _renamed(settings.get(key), _choice(key, value))
     elif key in LISTS and not rest and value is not None:
-        settings[key] = _extended(_links(_listed(settings, key)), _links(_long_form(key, value)))
+        settings[key] = _extended(_in_list(_listed(settings, key)), _long_form(key, value))
     elif not rest:
         settings[key] = _long_form(key, value)
     else:
@@ -260,16 +299,21 @@ def _listed(settings: Settings, key: str) -> object:
     return [choice.model_dump() for choice in RunConfig.model_fields[key].default]
 
 
+def _in_list(value: object) -> list[object]:
+    return value if isinstance(value, list) else [value]
+
+
 def _links(value: object) -> list[Settings]:
     """The choices in a setting: of one component, of a chain, of observers."""
-    return [
-        each for each in (value if isinstance(value, list) else [value]) if isinstance(each, dict)
-    ]
+    return [each for each in _in_list(value) if isinstance(each, dict)]
 
 
 def _renamed(old: object, new: object) -> object:
     """The new choice; a link that was chosen before under the same name keeps its options."""
-    renamed = [_with_options(_links(old), each) for each in _links(new)]
+    renamed = [
+        _with_options(_links(old), each) if isinstance(each, dict) else each
+        for each in _in_list(new)
+    ]
     return renamed if isinstance(new, list) else renamed[0]
 
 
@@ -281,9 +325,23 @@ def _with_options(old: list[Settings], new: Settings) -> Settings:
     return new
 
 
-def _extended(old: list[Settings], new: list[Settings]) -> list[Settings]:
-    have = [each.get("name") for each in old]
-    return [*old, *(each for each in new if each.get("name") not in have)]
+def _extended(old: list[object], new: object) -> list[object]:
+    """The old list and the new choices; options of a choice that is in both are put together.
+
+    What is no choice, and a name that is new twice, is left for the validation.
+    """
+    extended, names = list(old), [link.get("name") for link in _links(new)]
+    named = [(row, each) for row, each in enumerate(old) if isinstance(each, dict)]
+    for choice in _in_list(new):
+        options: Settings = choice if isinstance(choice, dict) else {}
+        name = options.get("name")
+        same = [(row, link) for row, link in named if name and link.get("name") == name]
+        if same and names.count(name) == 1:
+            row, link = same[0]
+            extended[row] = {**link, **options}
+        elif choice not in extended:
+            extended.append(choice)
+    return extended
 
 
 def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:

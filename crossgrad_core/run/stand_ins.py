@@ -11,7 +11,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.slots import LISTS
-from crossgrad_core.wording import listed, plural
+from crossgrad_core.wording import listed, plural, singular
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,6 +25,8 @@ _PLAIN: Final = {
     "start": defaults.START_ALONE,
     "resolution": defaults.RESOLUTION,
 }
+#: Slots (singular words) whose components a run can be looked at without.
+REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, LISTS)})
 
 
 def without_missing(config: RunConfig) -> RunConfig:

@@ -11,6 +11,7 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.testing.contract import (
     Check,
     Make,
@@ -50,13 +51,20 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     return found
 
 
-def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> AggregateContext:
-    """What the seam offers for these gradients."""
+def aggregate_context(
+    gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
+) -> AggregateContext:
+    """What the seam offers for these gradients.
+
+    Args:
+        gradients: The gradients of each view.
+        summed: Whether only their sum is known, as in a run in which nobody needs them apart.
+    """
     views = len(gradients)
     rng = np.random.default_rng(views)
     return AggregateContext(
         **step_fields(),
-        gradients=DenseGradients(gradients, BLOCKS),
+        gradients=_summed(gradients) if summed else DenseGradients(gradients, BLOCKS),
         losses=rng.uniform(0.05, 0.3, views),
         labels=tuple(("near", "far")[view % 2] for view in range(views)),
         distances=rng.uniform(0.2, 1.0, views),
@@ -65,9 +73,20 @@ def aggregate_context(gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggre
     )
 
 
-def aggregated(operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]]) -> Aggregated:
-    """What the operator answers at the seam."""
-    answer: object = operator.crossgrad_aggregate_gradients(aggregate_context(gradients))
+def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients:
+    total = SummedGradients.empty(BLOCKS, len(gradients))
+    for view in gradients:
+        # The sum takes them over and writes to them.
+        total.add({name: None if each is None else each.clone() for name, each in view.items()})
+    return total
+
+
+def aggregated(
+    operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
+) -> Aggregated:
+    """What the operator answers at the seam; see `aggregate_context`."""
+    context = aggregate_context(gradients, summed=summed)
+    answer: object = operator.crossgrad_aggregate_gradients(context)
     if not isinstance(answer, Aggregated):
         require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
         raise TypeError
@@ -75,7 +94,10 @@ def aggregated(operator: Operator, gradients: Sequence[Mapping[str, Tensor | Non
 
 
 def every_tensor_is_answered(make: Make[Operator]) -> None:
-    """The answer holds a finite gradient of the right shape for every tensor."""
+    """The answer holds a finite gradient of the right shape for every tensor.
+
+    An operator that does not say `separate = True` makes the same gradients of the sum alone.
+    """
     operator = make()
     for views in admitted(operator.views):
         answer = aggregated(operator, sample_gradients(views))
@@ -85,6 +107,11 @@ def every_tensor_is_answered(make: Make[Operator]) -> None:
             _require_gradient(f"K = {views}: the gradient of {name}", answer.gradients[name], shape)
         good = all(type(count) is int and count >= 0 for count in answer.counts.values())
         require(good, f"the counts {answer.counts} are not plain numbers")
+        if not operator.separate:
+            alone = aggregated(operator, sample_gradients(views), summed=True).gradients
+            for name, gradient in answer.gradients.items():
+                what = f"K = {views}: the gradient of {name}, of the sum and of single views,"
+                _require_same(what, alone.get(name), gradient)
 
 
 def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]) -> None:

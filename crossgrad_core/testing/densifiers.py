@@ -28,6 +28,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
 from crossgrad_core.testing.records import view_record
 from crossgrad_core.testing.renders import renders_of
 from crossgrad_core.wording import listed
@@ -80,7 +81,7 @@ class DensifierRun:
         rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
         return DensifyContext(
             **fields,
-            parameters=self.parameters,
+            parameters=parameters_in_a_run(self.parameters),
             backbone=self.backbone,
             rasterizer=rasterizer,
             views=tuple(self._rendered(index, step) for index in (step % 4, 4 + step % 5)),
@@ -106,7 +107,7 @@ class DensifierRun:
         with torch.no_grad():
             gaussians = self.backbone.decode(self.parameters, view.camera, sample_phase(step))
         screen = _screen(len(gaussians), self.densifier.needs, (index, step))
-        return view_record(view, gaussians, screen, index)
+        return view_record(view, gaussians_in_a_run(gaussians, self.backbone), screen, index)
 
     def _require_rows(self, state: PluginState) -> None:
         for name, tensor in state.per_primitive.items():

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -57,6 +58,7 @@ from crossgrad_core.testing.contract import (
 )
 from crossgrad_core.testing.densifiers import DensifierRun, require_good
 from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
 from crossgrad_core.testing.renders import renders_of
 
 #: The hooks of one run's manager; pluggy gives them no types.
@@ -106,23 +108,27 @@ def _start(hooks: Hooks, folder: Path | None) -> None:
     )
 
 
-def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
+def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> StepRecord:
     counts = {"zero": 1, "cloned": 2, "pruned": 1, "reset": 0}
     names = tuple(sample_scene().train_views[view].name for view in _VIEWS)
     record = StepRecord(step, _VIEWS, names, None, (0.2, 0.1), 40, counts, 0.01 * step)
     hooks.crossgrad_step_end(record=record)
     for answer in answers:
         _require_answer(answer, Answer)
+    return record
 
 
 def survives_every_event(make: Make[Observer]) -> None:
     """A whole run's events raise nothing, with a folder to write to and without one."""
     with TemporaryDirectory() as folder:
         for place in (Path(folder), None):
-            with _hooks(make()) as hooks:
+            observer = make()
+            with _hooks(observer) as hooks:
                 _start(hooks, place)
+                last = None
                 for step in (1, 2):
-                    _step_end(hooks, step, _seams(hooks, step))
+                    answers = _seams(hooks, observer, step, last)
+                    last = _step_end(hooks, step, answers)
                     hooks.crossgrad_model(model=_model(step))
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
@@ -156,9 +162,10 @@ def survives_an_early_end(make: Make[Observer]) -> None:
 
 def seams_stay_answered(make: Make[Observer]) -> None:
     """Around each seam the observer returns an answer of the right kind and shape."""
-    with _hooks(make()) as hooks:
+    observer = make()
+    with _hooks(observer) as hooks:
         _start(hooks, None)
-        sampled, scaled, aggregated, _ = _seams(hooks, 1)
+        sampled, scaled, aggregated, _ = _seams(hooks, observer, 1)
     draw, scales = cast("Sampled", sampled).draw, cast("Scaled", scaled).scales
     require(len(draw.views) == len(_VIEWS), f"{len(_VIEWS)} views became {len(draw.views)}")
     good = len(scales) == len(_VIEWS) and all(0.0 < scale <= 1.0 for scale in scales)
@@ -205,8 +212,9 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
         good = fits and ((weights >= 0.0) & weights.isfinite()).all()
         wanted = f"finite numbers of 0 or more, floating point, {list(size)}"
         require(good, f"crossgrad_pixel_weights answers {weights!r:.60}; expected {wanted}")
-    fields |= {"parameters": run.parameters, "backbone": run.backbone}
-    for gaussians, view in ((shown.gaussians, shown.view), (None, None)):
+    fields |= {"parameters": parameters_in_a_run(run.parameters), "backbone": run.backbone}
+    drawn = gaussians_in_a_run(shown.gaussians, run.backbone)
+    for gaussians, view in ((drawn, shown.view), (None, None)):
         context = RegularizeContext(**fields, gaussians=gaussians, view=view)
         for answer in hooks.crossgrad_regularize(context=context):
             _require_answer(answer, Regularized)
@@ -250,22 +258,28 @@ def _model(step: int) -> Model:
     )
 
 
-def _seams(hooks: Hooks, step: int) -> list[Answer]:
-    """The answers of the seams of a step, as the training loop asks for them."""
+def _seams(
+    hooks: Hooks, observer: Observer, step: int, last: StepRecord | None = None
+) -> list[Answer]:
+    """The answers of the seams of a step, as the training loop asks for them.
+
+    Gradients of single views are there only if the observer asks for them, and the views of the
+    first step have no labels.
+    """
     centers = sample_scene().centers
     sample = SampleContext(
-        **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=None
+        **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=last
     )
     quiet = build(Densifier, NO_DENSIFIER, {})
-    scale = ScaleContext(**step_fields(step), draw=Draw(_VIEWS), last=None)
+    scale = ScaleContext(**step_fields(step), draw=Draw(_VIEWS), last=last)
+    summed = not observer.needs_separate_gradients
+    aggregate = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
+    if last is None:
+        aggregate = replace(aggregate, labels=None)
     return [
         call_seam(hooks.crossgrad_sample_views, sample, Sampled),
         call_seam(hooks.crossgrad_choose_scales, scale, Scaled),
-        call_seam(
-            hooks.crossgrad_aggregate_gradients,
-            aggregate_context(sample_gradients(len(_VIEWS))),
-            Aggregated,
-        ),
+        call_seam(hooks.crossgrad_aggregate_gradients, aggregate, Aggregated),
         call_seam(hooks.crossgrad_densify, DensifierRun.of(quiet).context(step), Densified),
     ]
 

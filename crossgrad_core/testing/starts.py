@@ -1,22 +1,42 @@
 """Contract checks of starts."""
 
+from contextlib import suppress
 from dataclasses import fields
 
 import numpy as np
 
 from crossgrad_core.contract.start import MorePoints, Start
+from crossgrad_core.errors import UserError
 from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
+from crossgrad_core.testing.contract import (
+    Check,
+    ContractError,
+    Make,
+    global_randomness_untouched,
+    require,
+)
 from crossgrad_core.testing.fixtures import sample_scene
 
 
 def adds_points(make: Make[Start]) -> None:
-    """Positions and colours, sizes above 0 and opacities between 0 and 1, one of each a point."""
-    more = make().more_points(sample_scene())
+    """Positions and colours, sizes above 0 and opacities between 0 and 1, one of each a point.
+
+    A size or an opacity may be NaN. A start that works alone is also asked about a scene without
+    points; it may find none there, and says so by an error.
+    """
+    start = make()
+    _require_points(start.more_points(sample_scene()))
+    if start.alone:
+        bare = sample_scene().with_points(np.zeros(0, np.int64))
+        with suppress(UserError):
+            _require_points(start.more_points(bare))
+
+
+def _require_points(more: object) -> None:
     if more is None:
         return
-    good = isinstance(more, MorePoints)
-    require(good, f"more_points() answers {type(more).__name__}, not MorePoints")
+    if not isinstance(more, MorePoints):
+        raise ContractError(f"more_points() answers {type(more).__name__}, not MorePoints")
     count = len(more.positions)
     shapes = {"positions": (count, 3), "colors": (count, 3), "sizes": (count,)}
     for name, shape in {**shapes, "opacities": (count,)}.items():
@@ -25,9 +45,10 @@ def adds_points(make: Make[Start]) -> None:
     require(more.colors.dtype == np.uint8, f"colors are {more.colors.dtype}, not uint8")
     require(bool(np.isfinite(more.positions).all()), "a position is not finite")
     sizes, opacities = more.sizes, more.opacities
-    require(bool((np.isfinite(sizes) & (sizes > 0.0)).all()), "a size is not a number above 0")
-    inside = bool(((opacities > 0.0) & (opacities < 1.0)).all())
-    require(inside, "an opacity does not lie between 0 and 1")
+    good = (np.isfinite(sizes) & (sizes > 0.0)) | np.isnan(sizes)
+    require(good.all(), "a size is neither a number above 0 nor NaN")
+    inside = ((opacities > 0.0) & (opacities < 1.0)) | np.isnan(opacities)
+    require(inside.all(), "an opacity is neither between 0 and 1 nor NaN")
 
 
 def answers_alike(make: Make[Start]) -> None:

@@ -117,8 +117,8 @@ def _begun(setup: Setup) -> Scene:
     raise UserError(
         f"start {setup.selection.names['start']} adds what cannot be points",
         where=f"{type(start).__name__}.more_points",
-        expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0, opacities [N] in "
-        "(0, 1)",
+        expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0 or NaN, opacities [N] "
+        "in (0, 1) or NaN",
         found=wrong,
         todo="choose another --start, or repair the plugin",
     )
@@ -135,9 +135,11 @@ def _misfit(begun: Scene, known: int) -> str:
             return f"{len(points)} positions, {count - known} {name}"
     if not np.isfinite(points).all():
         return "a position that is not finite"
-    if not ((sizes[known:] > 0.0) & np.isfinite(sizes[known:])).all():
+    sizes, opacities = sizes[known:], opacities[known:]
+    # NaN leaves the size or the opacity to the backbone.
+    if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
         return "a size that is no number above 0"
-    inside = (opacities[known:] > 0.0) & (opacities[known:] < 1.0)
+    inside = (opacities > 0.0) & (opacities < 1.0) | np.isnan(opacities)
     return "" if inside.all() else "an opacity that is not between 0 and 1"
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
@@ -200,8 +200,14 @@ def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> Use
 
 
 class _Current(Mapping[str, Tensor]):
+    """Tensor name -> parameter; what is read has taken all steps of Adam. A copy is a dict."""
+
     def __init__(self, state: TrainState) -> None:
         self._state = state
+
+    @override
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[type[Parameters], tuple[Parameters]]:
+        return dict, (dict(self),)
 
     @override
     def __getitem__(self, name: str) -> Tensor:

@@ -130,6 +130,38 @@ def test_a_name_offered_twice_is_marked_in_the_list(ran, third_party, monkeypatc
     assert all("offered twice" in row for row in rows)
 
 
+def test_what_is_never_read_is_in_the_list_and_in_the_check(ran, tmp_path, monkeypatch, capsys):
+    lost = {"operator": {"lost": "made_up_cli:Halving"}}
+    write_distribution(tmp_path / "site", "lost-package", lost)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    out = ran("plugins")[1]
+    assert (
+        "never read\n  lost  lost-package 1.0: there is no entry-point group crossgrad.operator"
+        in out
+    )
+    assert "write crossgrad.operators" in out
+    code, _, err = ran("plugins", "check", "lost-package")
+    assert code == 2 and "there is no entry-point group crossgrad.operator" in err
+
+
+def test_a_check_of_a_package_counts_what_is_never_read(ran, third_party, monkeypatch):
+    both = {"operators": {"halving": "made_up_cli:Halving"}, "operator": {"lost": "made_up_cli:A"}}
+    write_distribution(third_party, "both-package", both)
+    monkeypatch.syspath_prepend(third_party)
+    code, out, _ = ran("plugins", "check", "both-package")
+    assert (
+        code == 1 and "lost  FAIL" in out and "write crossgrad.operators" in " ".join(out.split())
+    )
+
+
+def test_a_package_for_another_version_is_marked_in_the_list(ran, tmp_path, monkeypatch):
+    dated = {"operators": {"dated": "made_up_cli:Halving"}}
+    write_distribution(tmp_path, "dated-package", dated, requires="crossgrad<0.2")
+    monkeypatch.syspath_prepend(tmp_path)
+    words = "refused where it is asked for: it requires crossgrad<0.2"
+    assert f"dated dated-package 1.0 {words}" in " ".join(ran("plugins", "list")[1].split())
+
+
 def test_an_unknown_slot_is_refused(ran):
     code, out, err = ran("plugins", "list", "--slot", "oprators")
     assert (code, out) == (2, "")

@@ -2,9 +2,15 @@
 
 import pytest
 
+from crossgrad_core.config import ComponentChoice
 from crossgrad_core.defaults import METRICS_OF_0_1
 from crossgrad_core.errors import UserError
+from crossgrad_core.plugin import Observer
+from crossgrad_core.registry.entries import entries, load
+from crossgrad_core.registry.slots import GROUPS, LISTS
+from crossgrad_core.run.opening import parsed
 from crossgrad_core.run.settings import merged
+from crossgrad_core.wording import singular
 
 CONFIG = """
 steps: 100
@@ -224,6 +230,79 @@ def test_observers_may_be_written_as_a_mapping(tmp_path):
     path = written(tmp_path, "observers: {clip: {max_norm: 0.1}, rate: }")
     expected = [{"name": "clip", "max_norm": 0.1}, {"name": "rate"}]
     assert merged(path, {}, [])["observers"] == expected
+
+
+class NotInstalled(Observer):
+    """An observer that no package offers."""
+
+
+def settled(**options):
+    """The configuration that options make."""
+    return parsed(merged(None, options, ()))
+
+
+def option_of(slot):
+    return {"metrics": "metrics", "observers": "observe"}.get(slot, singular(slot))
+
+
+@pytest.mark.parametrize("wrong", [42, object(), True, {"name", "other"}, NotInstalled])
+@pytest.mark.parametrize("slot", sorted(GROUPS))
+def test_what_is_no_component_is_refused_in_every_slot(slot, wrong):
+    for value in (wrong, [wrong], ["first", wrong]):
+        with pytest.raises(UserError) as caught:
+            settled(**{option_of(slot): value})
+        assert caught.value.where.startswith(slot if slot in LISTS else singular(slot))
+        assert caught.value.expected and caught.value.todo
+
+
+@pytest.mark.parametrize("assignment", ["metrics=[42]", "observers=7", "operator=[1.5]"])
+def test_what_is_no_component_is_refused_after_set(assignment):
+    with pytest.raises(UserError, match="the name of a component"):
+        parsed(merged(None, {}, [assignment]))
+
+
+@pytest.mark.parametrize("slot", sorted(GROUPS))
+def test_every_slot_takes_a_name_a_mapping_a_class_or_an_instance(slot):
+    name = "cagrad" if slot == "operators" else max(entries(slot))
+    kind = load(slot, name)
+    for given in (name, {"name": name}, kind, kind()):
+        chosen = getattr(
+            settled(**{option_of(slot): given}), slot if slot in LISTS else singular(slot)
+        )
+        assert ComponentChoice(name=name) in (chosen if slot in LISTS else [chosen])
+
+
+def test_the_options_of_an_instance_are_those_that_were_given():
+    given = load("operators", "cagrad")(c=0.4)
+    assert settled(operator=given).operator == ComponentChoice(name="cagrad", c=0.4)
+    chain = settled(operator=[load("operators", "preconditioner"), given, "soft"]).operator
+    assert [link.name for link in chain] == ["preconditioner", "cagrad", "soft"]
+    usual = load("backbones", "vanilla")(sh_degree=3)
+    assert settled(backbone=usual).backbone == ComponentChoice(name="vanilla", sh_degree=3)
+
+
+def test_a_class_of_another_slot_is_refused_though_its_name_is_known():
+    with pytest.raises(UserError, match="Anchors cannot be chosen as a grouping"):
+        settled(grouping=load("operators", "anchors"))
+
+
+def test_options_of_a_component_that_is_there_already_are_not_lost(tmp_path):
+    (metric,) = [each for each in settled(metrics=[{"name": "lpips", "trunk": "x"}]).metrics
+                 if each.name == "lpips"]  # fmt: skip
+    assert metric == ComponentChoice(name="lpips", trunk="x")
+    path = written(tmp_path, "observers: [{name: diagnostics, every: 5, views: 4}]")
+    (observer,) = merged(path, {"observe": [{"name": "diagnostics", "every": 6}]}, [])["observers"]
+    assert observer == {"name": "diagnostics", "every": 6, "views": 4}
+    assert merged(path, {"observe": ["diagnostics"]}, [])["observers"][0]["every"] == 5
+
+
+def test_a_component_that_comes_twice_with_other_options_is_refused(tmp_path):
+    twice = [{"name": "diagnostics", "every": 5}, {"name": "diagnostics", "every": 6}]
+    path = written(tmp_path, "observers: [{name: diagnostics, every: 5}, diagnostics]")
+    for given in ((None, {"observe": twice}, []), (path, {}, [])):
+        with pytest.raises(UserError, match="diagnostics comes twice"):
+            parsed(merged(*given))
+    assert len(settled(observe=["diagnostics", "diagnostics"]).observers) == 1
 
 
 def test_options_of_an_observer_that_is_not_there_are_refused():

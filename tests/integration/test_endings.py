@@ -110,7 +110,8 @@ def test_an_unexpected_error_keeps_everything(scene, whole, tmp_path, with_plugi
     with_plugin["broken"] = Broken(error)
     assert run(scene, out) == 1
     told = capsys.readouterr().err
-    assert told.startswith(f"training failed: in step {FAILS_IN}: {words}")
+    hook = "in hook crossgrad_aggregate_gradients of plugin broken, "
+    assert told.startswith(f"training failed: in step {FAILS_IN}: {hook}") and words in told
     assert "Traceback" not in told and f"the traceback is in {out / 'log.txt'}" in told
     assert told.rstrip().endswith(f"continue with: crossgrad run --resume {out}")
     log = (out / "log.txt").read_text()

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from crossgrad_core.plugin import (
     Densifier, Draw, Edit, Figure, Grouping, Loss, Metric, Observer, Rasterizer, Reader, Resolution,
-    Rows, Rule, Sampler, hookimpl,
+    Rows, Rule, Sampler, UserError, hookimpl,
 )
 
 class TensorMetric(Metric):
@@ -52,6 +52,26 @@ class Objecting(Observer):
     @hookimpl
     def crossgrad_objections(self, selection):
         raise RuntimeError("no answer")
+
+class Steps(Observer):
+    @hookimpl
+    def crossgrad_step_end(self, record):
+        if record.step > 1:
+            raise ZeroDivisionError("nothing to divide")
+
+class Around(Observer):
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        answer = yield
+        if context.step > 1:
+            raise LookupError("nothing to look up")
+        return answer
+
+class Asks(Observer):
+    @hookimpl
+    def crossgrad_after_step(self, context):
+        if context.step > 1:
+            raise UserError("this observer needs a longer run")
 
 class Unfit(Resolution):
     def fitted_to(self, scene):
@@ -95,7 +115,13 @@ PLUGINS = {
     "metrics": {"tensor": "TensorMetric"},
     "samplers": {"numpy": "NumpySampler", "behind": "Behind", "before": "Before"},
     "groupings": {"fewer": "Fewer", "failing": "Failing"},
-    "observers": {"words": "Words", "objecting": "Objecting"},
+    "observers": {
+        "words": "Words",
+        "objecting": "Objecting",
+        "steps": "Steps",
+        "around": "Around",
+        "asks": "Asks",
+    },
     "resolutions": {"unfit": "Unfit"},
     "losses": {"infinite": "Infinite", "vector": "Vector"},
     "densifiers": {"typo": "Typo", "emptying": "Emptying"},
@@ -156,8 +182,12 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
         (("--sampler", "near-far", "--grouping", "failing"), "ValueError: nothing fits"),
         (("--observe", "words"), "found:    this is no list\n"),
         (("--observe", "objecting"), "RuntimeError: no answer"),
+        (
+            ("--observe", "objecting"),
+            "in hook crossgrad_objections of observer objecting, from faulty-package 1.0",
+        ),
         (("--resolution", "unfit"), "a plugin of faulty-package 1.0 failed"),
-        (("--resolution", "unfit"), "made_up_faulty.py:47"),
+        (("--resolution", "unfit"), "made_up_faulty.py:67"),
         (("--loss", "infinite"), "the photometric loss is not finite"),
         (("--loss", "infinite", "--seconds", "1"), "the photometric loss is not finite"),
         (("--loss", "vector"), "a step that was tried out before the training failed"),
@@ -175,6 +205,26 @@ def test_it_is_one_message_before_anything_is_written(
     said = capsys.readouterr().err
     assert words in said and "to do:" in said
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("steps", "step_end", "ZeroDivisionError: nothing to divide"),
+        ("around", "densify", "LookupError: nothing to look up"),
+        ("asks", "after_step", "this observer needs a longer run"),
+    ],
+)
+def test_a_hook_that_fails_in_training_is_named_with_its_plugin(
+    scene, tmp_path, monkeypatch, capsys, case
+):
+    observer, hook, words = case
+    installed(monkeypatch, tmp_path / "site", PLUGINS)
+    assert run(scene, tmp_path / "run", "--observe", observer) == 1
+    error = json.loads((tmp_path / "run" / "summary.json").read_text())["error"]
+    whose = f"in step 2: in hook crossgrad_{hook} of observer {observer}, from faulty-package 1.0: "
+    assert error.startswith(whose) and words in error
+    assert whose in capsys.readouterr().err
 
 
 def test_what_fails_when_it_is_asked_keeps_nobody_from_the_others(

@@ -6,6 +6,7 @@ import pytest
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.registry.entries import entries, load
 from crossgrad_core.run import app
 from crossgrad_core.run.results.config_file import read_config, read_notes
 
@@ -53,6 +54,33 @@ def test_these_runs_start_bare(scene, tmp_path, options):
     stored = read_config(tmp_path / "run")
     assert stored["start"] == {"name": "sfm"}
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory):
+    """Gives a scene with that many points; its photos are large enough to have features."""
+    root = tmp_path_factory.mktemp("sparse")
+
+    def made(points):
+        folder = root / str(points)
+        size = {"width": 240, "height": 160}
+        return folder if folder.exists() else write_tiny_scene(folder, points=points, **size)
+
+    return made
+
+
+@pytest.mark.parametrize("points", [0, 1, 2])
+@pytest.mark.parametrize("start", sorted(entries("starts")))
+def test_every_start_trains_a_scene_with_no_points_or_few_of_them(
+    sparse, tmp_path, capsys, start, points
+):
+    given = ("--steps", "4", "--threads", "1", "-q", "--out", tmp_path / "run")
+    trains = points or load("starts", start).alone
+    assert ended("run", sparse(points), *given, "--start", start) == (0 if trains else 2)
+    if trains:
+        assert primitives(tmp_path / "run") >= max(points, 1)
+    else:
+        assert "the scene has no SfM points to start from" in capsys.readouterr().err
 
 
 def test_points_of_its_own_make_a_start_do_nothing(scene, tmp_path, capsys):

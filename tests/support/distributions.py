@@ -12,6 +12,7 @@ def write_distribution(
     plugins: Mapping[str, Mapping[str, str]],
     modules: Mapping[str, str] | None = None,
     version: str = "1.0",
+    requires: str = "",
 ) -> None:
     """Writes a package into a folder as an installer would; put the folder on `sys.path` to see it.
 
@@ -21,10 +22,14 @@ def write_distribution(
         plugins: Slot -> plugin name -> `module:Class`.
         modules: Name of a module, such as `top` or `package/module` -> its source.
         version: Version of the distribution.
+        requires: What it requires, such as `crossgrad>=0.1,<0.2`.
     """
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    required = f"Requires-Dist: {requires}\n" if requires else ""
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n{required}"
+    )
     sections = [
         "\n".join([f"[crossgrad.{slot}]", *(f"{key} = {value}" for key, value in each.items())])
         for slot, each in plugins.items()

@@ -7,11 +7,13 @@ from crossgrad_core.commands import (
     GROUPS,
     OFFERED,
     Entry,
+    Stray,
     UserError,
     did_you_mean,
     offers,
     sentences,
     singular,
+    strays,
 )
 from crossgrad_core.testing.checking import Result, check_entry
 
@@ -31,7 +33,7 @@ def check_package(package: str) -> tuple[str, bool]:
     Raises:
         UserError: No such package is installed, or it offers no plugin.
     """
-    found = _entries_of(package)
+    found, lost = _entries_of(package), _strays_of(package)
     origins = sorted({f"{entry.distribution} {entry.version}" for entry in found})
     lines, failed = [", ".join(origins)], 0
     width = max(len(_label(entry)) for entry in found)
@@ -41,9 +43,17 @@ def check_package(package: str) -> tuple[str, bool]:
         failed += bool(failures)
         lines.append(f"  {_label(entry):<{width}}  {_verdict(results, failures)}")
         lines += [_reason(result) for result in failures]
-    total = len(found)
+    total = len(found) + len(lost)
+    for stray in lost:
+        lines += [f"  {stray.name}  FAIL", _reason(Result("it is never read", stray.reason))]
+    failed += len(lost)
     lines.append(f"{total - failed} of {total} plugins keep the contract of their slot")
     return "\n".join(lines), failed == 0
+
+
+def _strays_of(package: str) -> list[Stray]:
+    """Entry points of a package in groups that do not exist."""
+    return [each for each in strays() if _normalized(each.distribution) == _normalized(package)]
 
 
 def _entries_of(package: str) -> list[Entry]:
@@ -64,6 +74,7 @@ def _entries_of(package: str) -> list[Entry]:
         raise UserError(
             f"package {package!r} offers no plugins",
             expected=f"entry points in a group such as {GROUPS['operators']}",
+            found=sentences(*(f"{each.name}: {each.reason}" for each in _strays_of(package))),
             todo="name them in its pyproject.toml (docs/plugins.md) and install it again",
         )
     raise UserError(

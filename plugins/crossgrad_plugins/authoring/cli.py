@@ -17,6 +17,8 @@ from crossgrad_core.commands import (
     offers,
     plural,
     sentences,
+    strays,
+    unmet_requirement,
 )
 
 app = typer.Typer(
@@ -45,6 +47,8 @@ def list_plugins(slot: SlotOption = None) -> None:
     for each in _slots(slot):
         typer.echo(each)
         typer.echo("\n".join(_rows(offers(each))) or "  none installed")
+    if lost := [f"  {each.name}  {each.origin}: {each.reason}" for each in strays()]:
+        typer.echo("\n".join(["never read", *lost]))
     typer.echo("\n`crossgrad plugins show NAME` explains one of them.")
 
 
@@ -142,5 +146,7 @@ def _rows(found: tuple[Entry, ...]) -> list[str]:
             note = "  offered twice: it is refused where it is asked for"
         if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
             note = "  never called: the core has a command of that name"
+        if required := unmet_requirement(entry.distribution):
+            note = f"  refused where it is asked for: it requires {required}"
         rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
     return rows

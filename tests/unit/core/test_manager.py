@@ -202,6 +202,36 @@ def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
     assert "yield" in caught.value.todo
 
 
+def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers():
+    class Failing:
+        @hookimpl
+        def crossgrad_densify(self, context):
+            raise ValueError("no")
+
+    class Around:
+        @hookimpl(wrapper=True)
+        def crossgrad_densify(self, context):
+            return (yield)
+
+    class After:
+        @hookimpl(wrapper=True)
+        def crossgrad_densify(self, context):
+            yield
+            raise LookupError("never")
+
+    hook = make_manager({"failing": Failing(), "around": Around()}).hook
+    with pytest.raises(ValueError, match="no") as caught:
+        hook.crossgrad_densify(context=None)
+    (note,) = caught.value.__notes__
+    assert note.startswith("in hook crossgrad_densify of plugin failing, ")
+    answering = Densifier(Densified(NO_EDIT))
+    hook = make_manager({"one": answering, "after": After(), "around": Around()}).hook
+    with pytest.raises(LookupError) as caught:
+        hook.crossgrad_densify(context=None)
+    (note,) = caught.value.__notes__
+    assert "of plugin after, " in note
+
+
 def test_a_seam_without_plugins_is_an_error():
     with pytest.raises(UserError, match="plugins none"):
         call_seam(make_manager({}).hook.crossgrad_densify, None, Densified)

@@ -5,10 +5,14 @@ import sys
 import pytest
 from support.distributions import write_distribution
 
+from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.registry.strays import strays
+from crossgrad_core.run.assemble import check_names
+from crossgrad_core.system.version import VERSION
 
 GOOD = """
 from functools import wraps
@@ -76,9 +80,9 @@ def install(tmp_path, monkeypatch):
     """Puts made-up distributions on the path; forgets their modules afterwards."""
     before = set(sys.modules)
 
-    def put(name, plugins, modules=None, version="1.0"):
+    def put(name, plugins, modules=None, version="1.0", requires=""):
         folder = tmp_path / f"{name}-{version}"
-        write_distribution(folder, name, plugins, modules, version)
+        write_distribution(folder, name, plugins, modules, version, requires)
         monkeypatch.syspath_prepend(folder)
 
     yield put
@@ -286,6 +290,60 @@ def test_a_value_out_of_bounds_is_refused_with_what_was_found(good):
     assert error.what == "option share of grouping good is not valid"
     assert error.expected == "less than 1"
     assert error.found == "1.5 (float)"
+
+
+@pytest.mark.parametrize(
+    "requires",
+    ["crossgrad>=0.1,<0.2", "Crossgrad [geo] == 0.1.*", "crossgrad>9; python_version>'3'"],
+)
+def test_a_package_for_another_version_of_crossgrad_is_refused(install, requires):
+    plugins = {"groupings": {"dated": "made_up_dated:Good"}}
+    install("made-up", plugins, {"made_up_dated": GOOD}, "1.4", requires)
+    error = refusal("groupings", "dated")
+    assert "grouping dated is written for another version of crossgrad" in error.what
+    assert error.expected.startswith("crossgrad") and "made-up 1.4 requires" in error.expected
+    assert error.found == f"crossgrad {VERSION}"
+    assert "made_up_dated" not in sys.modules
+    with pytest.raises(UserError, match="another version of crossgrad"):
+        check_names(RunConfig(grouping={"name": "dated"}))
+
+
+@pytest.mark.parametrize(
+    "requires",
+    [
+        "", "crossgrad", "crossgrad>=0.2,<0.3", "crossgrad-example<0.1", "crossgrad ==",
+        "crossgrad<0.1; extra == 'old'", "numpy<1",
+    ],
+)  # fmt: skip
+def test_a_package_for_this_version_of_crossgrad_is_taken(install, requires):
+    install("made-up", {"groupings": {"good": "made_up:Good"}}, {"made_up": GOOD}, "1.4", requires)
+    assert registry.build("groupings", "good", {})
+
+
+@pytest.mark.parametrize(
+    ("group", "meant"),
+    [
+        ("operator", "crossgrad.operators"),
+        ("backbone", "crossgrad.backbones"),
+        ("loss", "crossgrad.losses"),
+        ("Observers", "crossgrad.observers"),
+        ("opperators", "crossgrad.operators"),
+    ],
+)
+def test_a_misspelt_group_is_named_with_the_right_one(install, group, meant):
+    install("made-up", {group: {"lost": "made_up:Good"}, "observers": {"seen": "made_up:Good"}})
+    (stray,) = [each for each in strays() if each.distribution == "made-up"]
+    assert (stray.name, stray.group, stray.meant) == ("lost", f"crossgrad.{group}", meant)
+    error = refusal("operators", "lost")
+    assert (
+        f"made-up 1.0 offers lost, but there is no entry-point group crossgrad.{group}"
+        in error.todo
+    )
+    assert f"write {meant}" in error.todo
+
+
+def test_groups_of_other_programs_are_none_of_ours():
+    assert list(strays()) == []
 
 
 def test_a_missing_option_is_named(good):

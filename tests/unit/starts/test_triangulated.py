@@ -8,8 +8,10 @@ import pytest
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.training.start import first_state
 from crossgrad_plugins.readers.colmap import ColmapReader
 from crossgrad_plugins.starts import two_views
 from crossgrad_plugins.starts.triangulated import Triangulated
@@ -65,6 +67,16 @@ def test_without_points_the_start_or_the_user_has_to_give_some(bare):
     config = RunConfig(scene="somewhere", threads=1, start={"name": "triangulated", "views": 4})
     setup = assemble(config, bare, "colmap")
     assert setup.selection.start == FEW
+
+
+@pytest.mark.parametrize("backbone", sorted(entries("backbones")))
+def test_every_backbone_begins_with_triangulated_points(bare, backbone):
+    """The points have no sizes and opacities of their own: the backbone has to find some."""
+    chosen = {"backbone": {"name": backbone}, "start": {"name": "triangulated", "views": 4}}
+    setup = assemble(RunConfig(scene="somewhere", steps=2, threads=1, **chosen), bare, "colmap")
+    state = first_state(setup)
+    assert state.primitives(setup) > 100
+    assert all(tensor.isfinite().all() for tensor in state.parameters.values())
 
 
 def test_photos_that_show_nothing_in_common_are_refused(bare):

@@ -27,6 +27,7 @@ from crossgrad_core.testing import (
     rasterizers,
     readers,
     samplers,
+    starts,
 )
 from crossgrad_core.testing.contract import ContractError
 
@@ -688,6 +689,64 @@ class ClampsWhatIsNotThere(api.Observer):
         return api.Densified(api.Edit(values={"scale": api.Rows(scales)}))
 
 
+class CopiesTheParameters(api.Observer):
+    @api.hookimpl
+    def crossgrad_after_step(self, context):
+        return None if context.parameters.copy() else api.Densified(api.NO_EDIT)
+
+
+class LooksAtSingleViews(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        assert context.separate.views == 2
+        return (yield)
+
+
+class AskedForSingleViews(LooksAtSingleViews):
+    needs_separate_gradients = True
+
+
+class RemembersNoLabels(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_aggregate_gradients(self, context):
+        assert len(context.labels) == 2
+        return (yield)
+
+
+class LooksBackAtStepsAsTuples(api.Observer):
+    @api.hookimpl(wrapper=True)
+    def crossgrad_sample_views(self, context):
+        assert context.last is None or len(context.last) == 2
+        return (yield)
+
+
+class CopiesTheGaussians(api.Observer):
+    """Does no wrong."""
+
+    @api.hookimpl
+    def crossgrad_regularize(self, context):
+        if context.gaussians is not None:
+            assert replace(context.gaussians.detached()).means.shape[1] == 3
+
+
+class CountsSingleViews(api.Operator):
+    separate = False
+
+    def aggregate(self, context, state):
+        count = int(context.separate.present().sum())
+        return api.Aggregated(context.gradients.total(), {"present": count}), state
+
+
+class FillsBareScenesWithNothing(load("starts", "sfm")):
+    alone: ClassVar[bool] = True
+
+    def more_points(self, scene):
+        if len(scene.points):
+            return None
+        positions, colors = np.zeros((2, 3)), np.zeros((2, 3), np.uint8)
+        return api.MorePoints(positions, colors, np.array([np.nan, 0.0]), np.full(2, np.nan))
+
+
 class TremblesByItself(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
@@ -945,6 +1004,7 @@ DEFECTS = [
     (metrics.its_columns_are_its_own, CalledPSNR),
     (metrics.its_columns_are_its_own, CalledStep),
     (metrics.its_columns_are_its_own, CalledRegime),
+    (starts.adds_points, FillsBareScenesWithNothing),
 ]
 
 #: What the component itself raises is not caught by the check: `plugins check` reports it.
@@ -956,6 +1016,11 @@ RAISING = [
     (observers.survives_every_event, NeedsAFolder, TypeError),
     (observers.survives_an_early_end, NeedsASession, ZeroDivisionError),
     (observers.seams_stay_answered, Swallows, api.UserError),
+    (observers.questions_are_answered_in_kind, CopiesTheParameters, AttributeError),
+    (observers.seams_stay_answered, LooksAtSingleViews, TypeError),
+    (observers.survives_every_event, RemembersNoLabels, TypeError),
+    (observers.survives_every_event, LooksBackAtStepsAsTuples, TypeError),
+    (aggregation.every_tensor_is_answered, CountsSingleViews, TypeError),
 ]
 
 
@@ -981,6 +1046,8 @@ def test_an_error_of_the_component_comes_through(check, make, error):
         (operators.OPERATOR_CHECKS, Adding),
         (samplers.SAMPLER_CHECKS, InTurn),
         (observers.OBSERVER_CHECKS, Renders),
+        (observers.OBSERVER_CHECKS, AskedForSingleViews),
+        (observers.OBSERVER_CHECKS, CopiesTheGaussians),
     ],
     ids=name_of,
 )

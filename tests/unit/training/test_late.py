@@ -1,5 +1,7 @@
 """Steps of Adam that rows are late with: the bits of steps that are taken at once."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +12,7 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.contexts import Regularized
+from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
@@ -213,6 +216,46 @@ class PerView:
         return (yield)
 
 
+#: Ways to copy Gaussians without their graph.
+COPIES = (
+    copy.copy,
+    copy.deepcopy,
+    replace,
+    Gaussians.detached,
+    lambda gaussians: gaussians.mapped(torch.clone),
+    lambda gaussians: Gaussians(**vars(gaussians)),
+    lambda gaussians: pickle.loads(pickle.dumps(gaussians)),
+)
+
+
+class Copies:
+    """Copies what it is given in every third step, in another way each time."""
+
+    @hookimpl
+    def crossgrad_regularize(self, context):
+        if context.step % 3:
+            return
+        if context.gaussians is None:
+            copied = (copy.copy, copy.deepcopy)[context.step % 2](context.parameters)
+            assert type(copied) is dict
+            assert torch.equal(copied["f_rest"], context.parameters["f_rest"])
+        elif context.step % 2:
+            self.copy(context.gaussians.detached(), context, context.step // 2)
+        else:
+            assert replace(context.gaussians).sh_rest is context.gaussians.sh_rest
+
+    @hookimpl(wrapper=True)
+    def crossgrad_densify(self, context):
+        for record in context.views if context.step % 3 == 1 else ():
+            self.copy(record.gaussians, context, context.step // 3)
+        return (yield)
+
+    def copy(self, gaussians, context, number):
+        copied = COPIES[number % len(COPIES)](gaussians)
+        assert type(copied) is Gaussians and copied.on_demand is None and not copied.misfit()
+        assert torch.equal(copied.sh_rest, context.parameters["f_rest"])
+
+
 class Decay:
     """Reads the higher bands in every fifth step, and pulls at them."""
 
@@ -268,6 +311,7 @@ def everything(state):
         ({"average": 0.5}, ()),
         ({}, (Decay,)),
         ({"views": 2}, (PerView,)),
+        ({}, (Copies,)),
         ({"sh_every": 3}, (Decay,)),
         ({"sh_every": 3, "operator": "pcgrad", "views": 2}, (PerView,)),
     ],

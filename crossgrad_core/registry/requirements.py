@@ -1,0 +1,41 @@
+"""Which versions of crossgrad the package of a plugin says that it works with."""
+
+from typing import Final
+
+from crossgrad_core.system.version import VERSION
+
+#: The name of the distribution that packages require.
+CROSSGRAD: Final = "crossgrad"
+
+
+def unmet_requirement(distribution: str) -> str:
+    """What a distribution requires of crossgrad, if this version is another; else empty."""
+    if distribution == CROSSGRAD:
+        return ""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        lines = requires(distribution) or []
+    except (PackageNotFoundError, ValueError):
+        return ""
+    # Packages have many requirements, and few of them begin like this one.
+    return next(filter(None, map(_refusing, filter(_may_be_ours, lines))), "")
+
+
+def _may_be_ours(line: str) -> bool:
+    return line.lstrip().lower().startswith(CROSSGRAD)
+
+
+def _refusing(line: str) -> str:
+    """The requirement in a line of metadata, if it excludes this version of crossgrad."""
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    try:
+        requirement = Requirement(line)
+    except InvalidRequirement:
+        return ""
+    applies = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+    if requirement.name.lower() != CROSSGRAD or not applies:
+        return ""
+    met = requirement.specifier.contains(VERSION, prereleases=True)
+    return "" if met else f"{CROSSGRAD}{requirement.specifier}"

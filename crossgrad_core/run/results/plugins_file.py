@@ -1,0 +1,215 @@
+"""plugins.json: the packages that train a run, crossgrad included, and their versions."""
+
+import json
+import logging
+from collections.abc import Container, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from crossgrad_core.contract.component import Component
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import OURS, Entry, entries, installed_as
+from crossgrad_core.registry.slots import GROUPS
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.input_files import read_file
+from crossgrad_core.system.version import VERSION
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import listed, plural, singular
+
+FILE: Final = "plugins.json"
+_LOG = logging.getLogger(__name__)
+
+
+class Package(BaseModel):
+    """A package that trains a run.
+
+    Attributes:
+        versions: The versions that trained it, one after the other.
+        components: Its components in the run, such as `operator pcgrad`; none of crossgrad's own.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    versions: tuple[str, ...] = Field(min_length=1)
+    components: tuple[str, ...] = ()
+
+
+#: Name of a package -> the package.
+Packages: TypeAlias = dict[str, Package]
+_PACKAGES: Final = TypeAdapter(Packages)
+
+
+def packages_of(setup: Setup) -> Packages:
+    """The packages of all components of a run, those inside other components included."""
+    found = [installed_as(type(part)) for part in _parts(setup.plugins)]
+    found.append(entries("readers").get(setup.selection.names["reader"]))
+    packages = {OURS: Package(versions=(VERSION,))}
+    foreign = [each for each in found if each is not None and each.distribution != OURS]
+    for entry in foreign:
+        same = [each for each in foreign if each.distribution == entry.distribution]
+        components = tuple(sorted({_described(each) for each in same}))
+        packages[entry.distribution] = Package(versions=(entry.version,), components=components)
+    return packages
+
+
+def write_plugins(folder: Path, packages: Packages) -> None:
+    """Writes a run's plugins.json.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    data = {name: package.model_dump(mode="json") for name, package in packages.items()}
+    write_atomically(folder / FILE, f"{json.dumps(data, indent=1)}\n".encode())
+
+
+def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
+    """The packages that trained a run; None, with a note unless `quiet`, if that is not known."""
+    path = folder / FILE
+    try:
+        return _PACKAGES.validate_json(read_file(path))
+    except OSError:
+        why = f"{folder} has no {FILE}: the run is of an older version"
+    except ValidationError:
+        why = f"{path} is damaged, or of another version"
+    if not quiet:
+        _LOG.warning("%s; whether its plugins are still the same cannot be told", why)
+    return None
+
+
+def with_present(known: Packages | None, present: Packages) -> Packages:
+    """The known packages and the present ones; a version that is new comes after the others."""
+    known = known or {}
+    packages = {**known}
+    for name, package in present.items():
+        before = known[name].versions if name in known else ()
+        new = package.versions if before[-1:] != package.versions else ()
+        packages[name] = Package(versions=(*before, *new), components=package.components)
+    return packages
+
+
+def history(packages: Packages) -> tuple[str, ...]:
+    """A note on each package of which several versions trained the run."""
+    return tuple(
+        f"trained with {name} {', then '.join(package.versions)} (--accept-plugins)"
+        f"{': ' if package.components else ''}{', '.join(package.components)}"
+        for name, package in packages.items()
+        if len(package.versions) > 1
+    )
+
+
+def without_outdated(notes: Iterable[str], packages: Packages) -> Iterator[str]:
+    """The notes but those that name a single version of a package of which there were several."""
+    outdated = tuple(
+        f"from {name} {version}: "
+        for name, package in packages.items()
+        if len(package.versions) > 1
+        for version in package.versions
+    )
+    return (note for note in notes if not note.startswith(outdated))
+
+
+def refuse_missing(
+    folder: Path, packages: Packages | None, optional: Container[str] = frozenset()
+) -> None:
+    """Refuses a run of which components are not installed, and names their packages.
+
+    Args:
+        folder: The run's folder.
+        packages: What trained it; None if that is not known.
+        optional: Slots (singular words) whose components are not needed.
+
+    Raises:
+        UserError: Components are missing.
+    """
+    gone = {
+        name: lost
+        for name, package in (packages or {}).items()
+        if (lost := [each for each in package.components if _lacks(each, optional)])
+    }
+    if gone and packages:
+        named = {name: f"{name}=={packages[name].versions[-1]}" for name in gone}
+        raise UserError(
+            "the run was trained with components that are not installed here",
+            where=folder / FILE,
+            expected=listed(f"{listed(lost)} of {name}" for name, lost in gone.items()),
+            found=listed(_found(name) for name in gone),
+            todo=f"pip install {' '.join(named.values())}",
+        )
+
+
+def changes(packages: Packages | None) -> dict[str, str]:
+    """Package and version that trained a run last -> what is there in its place, if another."""
+    found = {}
+    for name, package in (packages or {}).items():
+        was = f"{name} {package.versions[-1]}"
+        if name == OURS:
+            now = {f"{OURS} {VERSION}"}
+        else:
+            present = (_entry(each) for each in package.components)
+            now = {f"{each.distribution} {each.version}" for each in present if each is not None}
+        if now - {was}:
+            found[was] = listed(sorted(now))
+    return found
+
+
+def refuse_changed(folder: Path, packages: Packages | None) -> None:
+    """Refuses to go on with other versions of packages than those that trained a run.
+
+    Raises:
+        UserError: A package has another version, or a component comes from another package.
+    """
+    if changed := changes(packages):
+        raise UserError(
+            "the run was trained with other versions of packages",
+            where=folder / FILE,
+            expected=listed(changed),
+            found=listed(changed.values()),
+            todo="install those versions again, or add --accept-plugins to go on with these",
+        )
+
+
+def report_changed(packages: Packages | None) -> None:
+    """Tells those who look at a run that other versions of packages trained it."""
+    for was, now in changes(packages).items():
+        _LOG.warning("the run was trained with %s; installed is %s", was, now)
+
+
+def _parts(value: object) -> Iterator[Component]:
+    """The components in a value, those in the options of other components included."""
+    if isinstance(value, Component):
+        yield value
+    inner: Iterable[object] = ()
+    if isinstance(value, BaseModel):
+        inner = vars(value).values()
+    elif isinstance(value, Mapping):
+        inner = value.values()
+    elif isinstance(value, list | tuple):
+        inner = value
+    for each in inner:
+        yield from _parts(each)
+
+
+def _described(entry: Entry) -> str:
+    return f"{singular(entry.slot)} {entry.name}"
+
+
+def _entry(component: str) -> Entry | None:
+    """The entry of a component such as `operator pcgrad`; None if it is not installed."""
+    word, _, name = component.partition(" ")
+    return entries(plural(word)).get(name) if plural(word) in GROUPS else None
+
+
+def _lacks(component: str, optional: Container[str]) -> bool:
+    return component.partition(" ")[0] not in optional and _entry(component) is None
+
+
+def _found(package: str) -> str:
+    """What there is of a package whose components are missing."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"{package} {version(package)}, which does not offer them"
+    except (PackageNotFoundError, ValueError):
+        return f"no package {package}"
