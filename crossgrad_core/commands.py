@@ -26,7 +26,7 @@ from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_o
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce, finish
 from crossgrad_core.system.tables import table_bytes, write_table
-from crossgrad_core.system.terminal import is_live
+from crossgrad_core.system.terminal import controls_of, is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder, check_new
@@ -34,6 +34,7 @@ from crossgrad_core.wording import (
     count,
     did_you_mean,
     listed,
+    one_line,
     plural,
     sentences,
     singular,
@@ -101,6 +102,7 @@ __all__ = [
     "chosen",
     "clear_half_written",
     "configured",
+    "controls_of",
     "count",
     "counting_of",
     "counts_as_short",
@@ -125,6 +127,7 @@ __all__ = [
     "model_of",
     "names",
     "offers",
+    "one_line",
     "open_run",
     "panels_of",
     "parse_number",

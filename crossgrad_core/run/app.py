@@ -28,12 +28,12 @@ from crossgrad_core.run.results.folder import (
     SMALLEST_NEED,
     RunName,
     check_out,
+    clear_half_written,
     create_run_folder,
     expected_bytes,
 )
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
-from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.plan_file import write_plan
 from crossgrad_core.run.results.scene_file import write_scene
@@ -47,7 +47,6 @@ from crossgrad_core.run.settings_for_nothing import (
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.scene.photo_check import check_photos, fits
-from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
@@ -61,7 +60,7 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.veils import note_on_sizes
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, one_line
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -293,8 +292,7 @@ def _held(folder: Path) -> Iterator[None]:
                 "into it",
                 folder,
             )
-        for place in (folder, *folder.glob(f"{RENDERS}/*")):
-            clear_leftovers(place)
+        clear_half_written(folder)
         yield
 
 
@@ -320,7 +318,7 @@ def _train(
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
     print(table)  # noqa: T201 - the result of the command
     if folder.is_dir():  # Nobody moved it meanwhile.
-        print(f"results in {folder}")  # noqa: T201
+        print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:
         print(line, file=sys.stderr)  # noqa: T201
 

@@ -26,6 +26,7 @@ from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.wording import one_line
 
 #: A run that ends so many decibels below its best evaluation says so; where few photos are held out
 #: single evaluations differ by less all the time.
@@ -215,7 +216,7 @@ def last_words(course: Course) -> list[str]:
     if course.session.gone:
         return lines
     if ending.traced:
-        lines.append(f"the traceback is in {folder / LOG}")
+        lines.append(f"the traceback is in {one_line(folder / LOG)}")
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]
@@ -237,7 +238,7 @@ def overdone(rows: Sequence[Row]) -> list[str]:
 
 def resume_line(folder: Path) -> str:
     """How a run goes on."""
-    return f"continue with: crossgrad run --resume {quote(str(folder))}"
+    return f"continue with: crossgrad run --resume {one_line(quote(str(folder)))}"
 
 
 def _kept(course: Course) -> list[str]:

@@ -14,6 +14,7 @@ from crossgrad_core.commands import (
     disk_errors,
     entries,
     locked,
+    one_line,
     way_on,
     write_atomically,
 )
@@ -42,9 +43,9 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
-        print(line)  # noqa: T201 - the result of the command
-    print(f"scene in {scene}; the report is {scene / 'report.md'}")  # noqa: T201
-    print(f"next: crossgrad run {scene}")  # noqa: T201
+        print(one_line(line))  # noqa: T201 - the result of the command
+    print(one_line(f"scene in {scene}; the report is {scene / 'report.md'}"))  # noqa: T201
+    print(one_line(f"next: crossgrad run {scene}"))  # noqa: T201
 
 
 def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:
