@@ -19,6 +19,12 @@ from crossgrad_core.registry.entries import Entry, build, entries, load_entry, o
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
+from crossgrad_core.system.checksums import (
+    changed_files,
+    check_unchanged,
+    drop_checksums,
+    write_checksums,
+)
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import disk_errors, disk_full, is_leftover, write_atomically
 from crossgrad_core.system.grouped import GroupedCommand
@@ -99,6 +105,7 @@ __all__ = [
     "check_file",
     "check_folder",
     "check_new",
+    "check_unchanged",
     "chosen",
     "clear_half_written",
     "configured",
@@ -109,6 +116,7 @@ __all__ = [
     "did_you_mean",
     "disk_errors",
     "disk_full",
+    "drop_checksums",
     "entries",
     "exit_code",
     "find_runs",
@@ -156,6 +164,7 @@ __all__ = [
     "with_article",
     "with_steps",
     "write_atomically",
+    "write_checksums",
     "write_mapping",
     "write_settings",
     "write_table",
@@ -346,10 +355,12 @@ def summary_of(folder: Path) -> dict[str, Any] | None:
 
     Imports no torch.
     """
+    from crossgrad_core.run.results.summary import FILE as SUMMARY
     from crossgrad_core.run.results.summary import read_summary
 
     try:
-        return read_summary(folder)
+        damaged = changed_files(folder, [SUMMARY])
+        return None if damaged else read_summary(folder)
     except UserError:
         return None
 

@@ -22,6 +22,7 @@ from crossgrad_core.run.opening import continued, parsed, set_up
 from crossgrad_core.run.planning import seconds_of
 from crossgrad_core.run.reason import reason_of
 from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
     RUNS,
@@ -47,6 +48,7 @@ from crossgrad_core.run.settings_for_nothing import (
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.scene.photo_check import check_photos, fits
+from crossgrad_core.system.checksums import changed_files, drop_checksums
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
@@ -344,7 +346,8 @@ def resumed(
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
-        if done and all((folder / name).is_file() for name in files):
+        damaged = set(changed_files(folder)) - {CONFIG}  # Its settings are compared by themselves.
+        if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
                 "the run is finished",
                 where=folder,
@@ -366,6 +369,7 @@ def resumed(
             state.clock.load += _decoded(setup, way)
             with _tried_out():
                 state.clock.compile += warm_up(setup, state)
+        drop_checksums(folder)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         session = Session.resumed(folder, setup, step)
         length = Forecast(Planned(setup.config.revisions))

@@ -8,15 +8,17 @@ from shlex import quote
 from typing import Final, TypeVar
 
 from crossgrad_core.contract.contexts import RunInfo
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.reason import is_unexpected, reason_of, steps_of, traceback_of
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.seal import seal
 from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
+from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.edits import keep
@@ -91,6 +93,10 @@ class Course:
         described = self.ending
         self._attempt("", lambda: self.setup.hook.crossgrad_run_end(status=described.status))
         if self.ending != described:
+            self._summarise()
+        sealed = self.ending
+        self._attempt(f"no {SUMS}", lambda: seal(self.session.folder))
+        if self.ending != sealed:
             self._summarise()
         return self.ending
 
@@ -244,7 +250,7 @@ def resume_line(folder: Path) -> str:
 def _kept(course: Course) -> list[str]:
     """What to say about the state, where not all of it is in the newest checkpoint."""
     step = course.state.step
-    saved = max(complete_checkpoints(course.session.folder / CHECKPOINTS), default=0)
+    saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
         return []
     there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"

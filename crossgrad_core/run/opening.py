@@ -1,5 +1,6 @@
 """From settings, or from a run's folder, to a run that can go on."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,11 +17,12 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.assemble import assemble, check_names, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import load_latest
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.persist import check_settings, from_checkpoint
 from crossgrad_core.run.rasterizers import drawn_elsewhere
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
+from crossgrad_core.run.results.kept import edited, restored
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
@@ -34,6 +36,7 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.wording import listed
 
+_LOG = logging.getLogger(__name__)
 #: How a run ended that wrote down its results, and a checkpoint with them.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 #: What a run says that has to begin again.
@@ -109,7 +112,7 @@ def require_checkpoint(folder: Path) -> None:
         UserError: It is no run, or it has no checkpoint.
     """
     read_config(folder)
-    if not complete_checkpoints(folder / CHECKPOINTS):
+    if not named_checkpoints(folder / CHECKPOINTS):
         _refuse_lost_checkpoints(folder)
         writer = writer_of(folder)
         raise UserError(
@@ -162,7 +165,7 @@ def continued(
         UserError: It is no run, a setting would change the training, or the scene is another one.
     """
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
-    if complete_checkpoints(folder / CHECKPOINTS):
+    if named_checkpoints(folder / CHECKPOINTS):
         return _from(folder, settings, verbosity, check)
     _refuse_lost_checkpoints(folder)
     setup, seconds = set_up(_config(folder, settings), verbosity)
@@ -186,7 +189,14 @@ def _from(
     check_settings(as_it_was(setup.config, config), checkpoint)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
-    return caught_up(replace(setup, notes=_noted(folder, setup)), state.step), state
+    notes = edited(folder, checkpoint.scalars)
+    if looks:
+        for note in notes:
+            _LOG.warning("%s", note)
+    else:
+        notes = (*restored(folder, checkpoint.scalars, state.step), *notes)
+    notes = (*notes, *_noted(folder, setup))
+    return caught_up(replace(setup, notes=notes), state.step), state
 
 
 def _noted(folder: Path, setup: Setup) -> tuple[str, ...]:

@@ -69,6 +69,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         points=local,
         point_colors=points.colors,
         similarity=frame.similarity,
+        files=raw.files,
         notes=(
             *raw.notes,
             *point_notes,

@@ -12,6 +12,7 @@ from crossgrad_core.run.afterwards.places import own_name, writing
 from crossgrad_core.run.export import Exported, described, export_scene, georef_of
 from crossgrad_core.run.results.panel_names import flat_names
 from crossgrad_core.run.session import CLOUD
+from crossgrad_core.system.checksums import relisted
 from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.writability import check_file, check_new
 from crossgrad_core.training.setup import Setup
@@ -100,7 +101,8 @@ def exported(
         else:
             path = out or folder / name
             check_new(path)
-        return path, export_scene(setup, state, path, camera, exporter, coordinates)
+        with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
+            return path, export_scene(setup, state, path, camera, exporter, coordinates)
 
 
 def _flat(setup: Setup, camera: str) -> str:

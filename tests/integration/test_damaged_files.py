@@ -1,0 +1,123 @@
+"""A damaged file ends in the right result or in one error, and nothing is lost by it.
+
+Every file that a fresh run, sweep or prepared scene has is damaged in every way, one at a time. A
+file that is added later is among them by itself.
+"""
+
+import csv
+import shutil
+
+import pytest
+from support.damage import DAMAGES, cases, command, files_of
+from support.scenes import write_tiny_scene
+
+from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.pictures import with_pictures, worst_views
+from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.tables import tables_of
+
+CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
+#: Another scene file, photo or setting makes other results, and the command says so.
+TOLD = ("was edited since", "is restored as it was", "cannot be told", "is not the file that")
+
+THOROUGH = pytest.mark.parametrize(
+    "thorough", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["short", "thorough"]
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9, folders=("a", "b"))
+
+
+@pytest.fixture(scope="module")
+def stopped(scene, tmp_path_factory):
+    """A run that stopped between two of its evaluations."""
+    out = tmp_path_factory.mktemp("stopped") / "run"
+    options = ("--steps", 8, "--stop-after", 5, "--eval-every", 3, "--save-every", 2)
+    settings = ("--threads", 1, "--set", "observers=diagnostics", "-q")
+    with pytest.raises(SystemExit, match="0"):
+        from crossgrad_core.cli.main import main
+
+        main([str(each) for each in ("run", scene, "--out", out, *options, *settings)])
+    return out
+
+
+@pytest.fixture(scope="module")
+def finished(stopped, tmp_path_factory):
+    """The same run at its end."""
+    out = shutil.copytree(stopped, tmp_path_factory.mktemp("finished") / "run")
+    with pytest.raises(SystemExit, match="0"):
+        from crossgrad_core.cli.main import main
+
+        main(["run", "--resume", str(out), "-q"])
+    return out
+
+
+def rows(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return [{k: v for k, v in row.items() if k not in CLOCKS} for row in csv.DictReader(file)]
+
+
+def results(run):
+    """What must not change: figures, Gaussians and parameters."""
+    newest = max((run / "checkpoints").glob("step-*"))
+    return (
+        rows(run / "metrics.csv"),
+        rows(run / "per_view.csv"),
+        (run / "point_cloud.ply").read_bytes(),
+        newest.name,
+        (newest / "tensors.safetensors").read_bytes(),
+    )
+
+
+def contents(folder):
+    return {file: (folder / file).read_bytes() for file in files_of(folder)}
+
+
+def damaged(whole, place, file, damage):
+    shutil.rmtree(place, ignore_errors=True)
+    copy = shutil.copytree(whole, place)
+    DAMAGES[damage](copy / file)
+    return copy
+
+
+@THOROUGH
+def test_a_run_goes_on_as_if_nothing_had_happened_or_not_at_all(
+    stopped, finished, tmp_path, capsys, thorough
+):
+    wanted = results(finished)
+    for file, damage in cases(files_of(stopped), thorough=thorough):
+        run = damaged(stopped, tmp_path / "run", file, damage)
+        before = contents(run)
+        end = command(capsys, "run", "--resume", run)
+        if end.code == 0:
+            told = any(words in end.err for words in TOLD)
+            assert results(run) == wanted or told, (file, damage, end)
+        else:
+            assert end.is_refused and str(file.name) in end.err, (file, damage, end)
+            assert contents(run) == before, (file, damage)
+
+
+@THOROUGH
+@pytest.mark.parametrize("name", ["eval", "export", "render"])
+def test_a_look_at_a_run_shows_what_it_is_or_nothing(finished, tmp_path, capsys, name, thorough):
+    def looked(run):
+        out = tmp_path / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        place = {"eval": (), "export": ("--out", out / "x.ply"), "render": ("--out", out)}[name]
+        end = command(capsys, name, run, *place)
+        return end, contents(out), end.out if name == "eval" else ""
+
+    wanted = looked(shutil.copytree(finished, tmp_path / "whole"))
+    assert wanted[0].code == 0
+    for file, damage in cases(files_of(finished), thorough=thorough):
+        run = damaged(finished, tmp_path / "run", file, damage)
+        before = contents(run)
+        found = looked(run)
+        if found[0].code == 0:
+            assert found[1:] == wanted[1:] or "was edited since" in found[0].err, (file, damage)
+        else:
+            assert found[0].is_refused, (file, damage, found)
+            assert contents(run) == before, (file, damage)
