@@ -26,7 +26,13 @@ from crossgrad_core.system.checksums import (
     write_checksums,
 )
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
-from crossgrad_core.system.files import disk_errors, disk_full, is_leftover, write_atomically
+from crossgrad_core.system.files import (
+    disk_errors,
+    disk_full,
+    is_leftover,
+    text_bytes,
+    write_atomically,
+)
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
 from crossgrad_core.system.progress import Progress
@@ -43,6 +49,7 @@ from crossgrad_core.wording import (
     one_line,
     plural,
     sentences,
+    showable,
     singular,
     with_article,
 )
@@ -148,6 +155,7 @@ __all__ = [
     "read_settings",
     "resolved",
     "sentences",
+    "showable",
     "shows_few_times",
     "singular",
     "summary",
@@ -155,6 +163,7 @@ __all__ = [
     "table_bytes",
     "take_steps",
     "tell",
+    "text_bytes",
     "usual_budget",
     "usual_densifier",
     "usual_dropout",
@@ -244,7 +253,7 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
     """
     from crossgrad_core.system.yaml_values import write_yaml
 
-    write_atomically(path, write_yaml(content).encode())
+    write_atomically(path, text_bytes(write_yaml(content)))
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":

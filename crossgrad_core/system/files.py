@@ -161,6 +161,14 @@ def _is_alive(process: int) -> bool:
     return True
 
 
+def text_bytes(text: str) -> bytes:
+    r"""Return a text in UTF-8; a byte of a file name that is not becomes `\udc80` or the like.
+
+    In JSON and YAML this is an escape, from which the name is read again.
+    """
+    return text.encode(errors="backslashreplace")
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Writes a whole file through `atomic_file`."""
     with atomic_file(path, len(content)) as file:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import isnan
 from pathlib import Path
 
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> None:
@@ -31,7 +31,7 @@ def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
     """Lines of cells as they stand in a file: UTF-8, commas, a line feed behind each line."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue().encode()
+    return text_bytes(text.getvalue())
 
 
 def as_cell(value: float | str | None) -> str:

@@ -11,6 +11,7 @@ import pytest
 from support.damage import DAMAGES, cases, command, files_of
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare.comparison import Options, compared
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.source import read_runs
@@ -35,7 +36,7 @@ def stopped(scene, tmp_path_factory):
     """A run that stopped between two of its evaluations."""
     out = tmp_path_factory.mktemp("stopped") / "run"
     options = ("--steps", 8, "--stop-after", 5, "--eval-every", 3, "--save-every", 2)
-    settings = ("--threads", 1, "--set", "observers=diagnostics", "-q")
+    settings = ("--threads", 1, "--plan", "turns", "-q")
     with pytest.raises(SystemExit, match="0"):
         from crossgrad_core.cli.main import main
 
@@ -121,3 +122,46 @@ def test_a_look_at_a_run_shows_what_it_is_or_nothing(finished, tmp_path, capsys,
         else:
             assert found[0].is_refused, (file, damage, found)
             assert contents(run) == before, (file, damage)
+
+
+def compared_tables(folder):
+    comparison = compared(read_runs([folder], skip_broken=False), Options())
+    views = worst_views(comparison)
+    with_pictures(comparison, views)
+    return tables_of(comparison, views)
+
+
+@THOROUGH
+def test_a_comparison_has_the_same_tables_or_is_refused(finished, tmp_path, thorough):
+    runs = tmp_path / "runs"
+    shutil.copytree(finished, runs / "other")
+    config = runs / "other" / "config.yaml"
+    summary = runs / "other" / "summary.json"
+    (runs / "other" / "SHA256SUMS").unlink()
+    for path, old, new in ((config, "seed: 0", "seed: 1"), (summary, '"seed": 0', '"seed": 1')):
+        path.write_text(path.read_text().replace(old, new))
+    shutil.copytree(finished, runs / "run")
+    wanted = compared_tables(runs)
+    for file, damage in cases(files_of(finished), thorough=thorough):
+        damaged(finished, runs / "run", file, damage)
+        try:
+            assert compared_tables(runs) == wanted, (file, damage)
+        except UserError as error:
+            assert str(file.name) in error.where, (file, damage, error)
+
+
+@THOROUGH
+def test_a_scene_is_the_one_that_was_trained_on_or_refused(
+    scene, finished, tmp_path, capsys, thorough
+):
+    run = shutil.copytree(finished, tmp_path / "run")
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace(str(scene), str(tmp_path / "scene")))
+    shutil.copytree(scene, tmp_path / "scene")
+    wanted = command(capsys, "eval", run)
+    assert wanted.code == 0
+    for file, damage in cases(files_of(scene), thorough=thorough):
+        damaged(scene, tmp_path / "scene", file, damage)
+        found = command(capsys, "eval", run)
+        assert found.is_refused or (found.code, found.out) == (0, wanted.out), (file, damage)
+        assert found.code == 2 or "points3D" not in file.name, (file, damage)

@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes
+from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes, text_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
@@ -70,7 +70,7 @@ def compare(
     figures = drawn_figures(comparison)
     notes = (*comparison.notes, *differing_code(comparison.main), *unreadable)
     page = page_of(comparison, figures, pictured, views, notes, version("crossgrad"))
-    files = {PAGE: page.encode()}
+    files = {PAGE: text_bytes(page)}
     files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}
     files |= {f"{FIGURES}/{figure.name}.png": figure.png for figure in figures}
     files |= {

@@ -15,6 +15,7 @@ from crossgrad_core.commands import (
     entries,
     locked,
     one_line,
+    text_bytes,
     way_on,
     write_atomically,
 )
@@ -170,5 +171,5 @@ def _write_report(layout: Layout, report: Report) -> None:
         write_atomically(layout.georef, content.encode())
     picture = draw(report, pycolmap.Reconstruction(layout.placed))
     write_atomically(layout.scene / "report.png", picture)
-    write_atomically(layout.scene / "report.md", page_of(report).encode())
+    write_atomically(layout.scene / "report.md", text_bytes(page_of(report)))
     write_atomically(layout.report, json.dumps(data_of(report), indent=1).encode())

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING, Any, Final
 
+from crossgrad_core.commands import one_line, showable
 from crossgrad_plugins.compare.figures.fonts import fall_back, family
 
 if TYPE_CHECKING:
@@ -178,7 +179,8 @@ def variables() -> dict[str, str]:
 
 
 def literal(text: str) -> str:
-    """Text for a legend, which hides what begins with an underscore."""
+    """Return text for a legend, which hides what begins with an underscore."""
+    text = showable(text)
     return f"'{text}'" if text.startswith("_") else text
 
 
@@ -188,7 +190,7 @@ def panel_title(ax: "Axes", scene: str) -> None:
     beside = 1 if place is None else place.get_gridspec().ncols
     room = _LETTERS // beside - 8
     lines = [""]
-    for part in _PARTS.findall(scene):
+    for part in _PARTS.findall(one_line(scene)):
         if lines[-1] and len(lines[-1] + part) > room:
             lines.append("")
         lines[-1] += part
