@@ -220,7 +220,16 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     # What a run began with is written down; where it is not, it was that of the first versions.
     stored["sh_from"] = stored.get("sh_from") or 0
     stored["sh_every"] = stored.get("sh_every") or 1
-    config = parsed({**stored, **settings})
+    try:
+        config = parsed({**stored, **settings})
+    except UserError as error:
+        raise UserError(
+            error.what,
+            where=f"{folder / CONFIG}, {error.where}",
+            expected=error.expected,
+            found=error.found,
+            todo=error.todo,
+        ) from error
     if "device" in settings:
         return drawn_elsewhere(config)
     _check_device(config.device, folder)

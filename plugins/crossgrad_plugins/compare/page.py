@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crossgrad_core.commands import count, one_line
+from crossgrad_core.commands import count, one_line, showable
 from crossgrad_plugins.compare import words
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
@@ -101,7 +101,9 @@ def page_of(
 
 def _shown(value: object) -> object:
     """Return a text with its control characters as escapes, and all else as it is."""
-    return one_line(value) if type(value) is str else value
+    if not isinstance(value, str):
+        return value
+    return one_line(value) if type(value) is str else type(value)(showable(value))
 
 
 def arm_rows(comparison: Comparison) -> list[ArmRow]:
