@@ -32,7 +32,8 @@ class FileMark(_Mark):
     Attributes:
         bytes: Its size.
         sha256: Digest of its first and last 64 KiB, by which runs of all versions know it.
-        whole: Digest of the whole file; None in a fingerprint of an earlier version.
+        whole: Digest of the whole file; None of a file that the other digest covers, and in a
+            fingerprint of an earlier version.
     """
 
     bytes: int
@@ -142,7 +143,8 @@ def mark_of(path: Path) -> FileMark:
             file.seek(max(END, size - END))
             digest.update(file.read(END))
             file.seek(0)
-            whole = file_digest(file, "sha256").hexdigest()
+            # The ends are all of a small file.
+            whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(
             "a file of the scene cannot be read",
