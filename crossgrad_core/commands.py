@@ -21,14 +21,26 @@ from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_
 from crossgrad_core.registry.strays import Stray, strays
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
+from crossgrad_core.system.checksums import (
+    changed_files,
+    check_unchanged,
+    drop_checksums,
+    write_checksums,
+)
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
-from crossgrad_core.system.files import disk_errors, disk_full, is_leftover, write_atomically
+from crossgrad_core.system.files import (
+    disk_errors,
+    disk_full,
+    is_leftover,
+    text_bytes,
+    write_atomically,
+)
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce, finish
 from crossgrad_core.system.tables import table_bytes, write_table
-from crossgrad_core.system.terminal import is_live
+from crossgrad_core.system.terminal import controls_of, is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.system.writability import check_file, check_folder, check_new
@@ -36,8 +48,10 @@ from crossgrad_core.wording import (
     count,
     did_you_mean,
     listed,
+    one_line,
     plural,
     sentences,
+    showable,
     singular,
     with_article,
 )
@@ -101,15 +115,18 @@ __all__ = [
     "check_file",
     "check_folder",
     "check_new",
+    "check_unchanged",
     "chosen",
     "clear_half_written",
     "configured",
+    "controls_of",
     "count",
     "counting_of",
     "counts_as_short",
     "did_you_mean",
     "disk_errors",
     "disk_full",
+    "drop_checksums",
     "entries",
     "exit_code",
     "find_runs",
@@ -128,6 +145,7 @@ __all__ = [
     "model_of",
     "names",
     "offers",
+    "one_line",
     "open_run",
     "panels_of",
     "parse_number",
@@ -140,6 +158,7 @@ __all__ = [
     "read_settings",
     "resolved",
     "sentences",
+    "showable",
     "shows_few_times",
     "singular",
     "strays",
@@ -148,6 +167,7 @@ __all__ = [
     "table_bytes",
     "take_steps",
     "tell",
+    "text_bytes",
     "unmet_requirement",
     "usual_budget",
     "usual_densifier",
@@ -158,6 +178,7 @@ __all__ = [
     "with_article",
     "with_steps",
     "write_atomically",
+    "write_checksums",
     "write_mapping",
     "write_settings",
     "write_table",
@@ -237,7 +258,7 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
     """
     from crossgrad_core.system.yaml_values import write_yaml
 
-    write_atomically(path, write_yaml(content).encode())
+    write_atomically(path, text_bytes(write_yaml(content)))
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
@@ -348,10 +369,12 @@ def summary_of(folder: Path) -> dict[str, Any] | None:
 
     Imports no torch.
     """
+    from crossgrad_core.run.results.summary import FILE as SUMMARY
     from crossgrad_core.run.results.summary import read_summary
 
     try:
-        return read_summary(folder)
+        damaged = changed_files(folder, [SUMMARY])
+        return None if damaged else read_summary(folder)
     except UserError:
         return None
 

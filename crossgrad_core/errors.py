@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.wording import showable
+from crossgrad_core.wording import one_line, showable
 
 #: Longest part of a message, and longest place; the middle of what is longer is left out.
 LONGEST: Final = 500
@@ -34,7 +34,7 @@ class UserError(Exception):
     def message(self) -> str:
         """The error as indented lines: what, where, expected, found, what to do."""
         rows = (
-            ("where", _short(self.where, LONGEST_PLACE)),
+            ("where", _short(one_line(self.where), LONGEST_PLACE)),
             ("expected", _short(self.expected)),
             ("found", _short(self.found)),
             ("to do", _short(self.todo)),

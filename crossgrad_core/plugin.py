@@ -99,9 +99,9 @@ from crossgrad_core.run.results.lines import (
 from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.input_files import is_file, open_file, read_file
-from crossgrad_core.system.terminal import shows_bar
+from crossgrad_core.system.terminal import controls_of, shows_bar
 from crossgrad_core.system.text_files import read_json, read_rows
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, showable
 
 __all__ = [
     "COORDINATES_TAG",
@@ -203,6 +203,7 @@ __all__ = [
     "build_component",
     "centers_of",
     "component_name",
+    "controls_of",
     "diagonals",
     "eight_bit",
     "evaluation_line",
@@ -227,6 +228,7 @@ __all__ = [
     "screen_statistics",
     "set_for_nothing",
     "shortness",
+    "showable",
     "shows_bar",
     "size_text",
     "transformed",

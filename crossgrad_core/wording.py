@@ -3,14 +3,20 @@
 import re
 from collections.abc import Iterable
 
-# Control characters could move the cursor or recolour the terminal; lone surrogates stand for bytes
-# that are not UTF-8, and cannot be written to a file.
-_UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+# Control characters could move the cursor or recolour the terminal, and those of bidirectional text
+# reorder a line; lone surrogates stand for bytes that are not UTF-8, and cannot be written to a
+# file.
+_UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def showable(text: str) -> str:
-    """Text from any file as a terminal can show it."""
+    """Return text from any file as a terminal can show it; line feeds stay."""
     return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
+
+
+def one_line(text: object) -> str:
+    """Return text that stays within one line, such as a name or a path: line feeds are escaped."""
+    return showable(str(text)).replace("\n", "\\n")
 
 
 def singular(slot: str) -> str:

@@ -13,6 +13,7 @@ from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin, notes_on
+from crossgrad_core.system.files import is_too_long, path_too_long
 from crossgrad_core.system.grouped import GroupedCommand
 from crossgrad_core.system.startup import finish
 from crossgrad_core.system.version import VERSION
@@ -72,12 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         get_command(app)(args=arguments, prog_name="crossgrad")
     except Exception as error:
         told = error if isinstance(error, UserError) else failed_plugin(error)
+        if told is None and isinstance(error, OSError) and is_too_long(error):
+            told = path_too_long(error.filename)
         if told is None:  # Our own mistakes keep their traceback.
             raise
         finish()
-        typer.echo(f"error: {told}", err=True)
+        print(f"error: {told}", file=sys.stderr)  # noqa: T201
         for note in notes_on(told):
-            typer.echo(f"  {note}", err=True)
+            print(f"  {note}", file=sys.stderr)  # noqa: T201
         sys.exit(BAD_INPUT)
     finally:
         finish()

@@ -1,4 +1,4 @@
-"""Output that may lose its reader: a pipe or terminal that closes ends no command."""
+"""Standard streams that end no command: a reader may leave, and text may not fit the encoding."""
 
 import io
 import os
@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final, TextIO
 
 from typing_extensions import override
 
+from crossgrad_core.system.terminal import PlainText
+
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
@@ -14,10 +16,11 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Makes stdout and stderr swallow what can no longer be read.
+    """Make stdout and stderr swallow what can no longer be read, and escape what is no plain text.
 
     A closed pipe (`| head`), a terminal that is gone or a full disk would otherwise end a training
-    of hours at its next line of progress. What a run says stands in its log.txt as well.
+    of hours at its next line of progress. So would the name of a folder that the encoding of the
+    terminal lacks. What a run says stands in its log.txt as well.
     """
     _occupy()
     sys.stdout = _lasting(sys.stdout)
@@ -51,7 +54,7 @@ def _occupy() -> None:
 
 
 def _lasting(stream: TextIO | None) -> TextIO:
-    """The stream over the same file; one of another kind (a Windows console) as it is."""
+    """Return a stream over the same file; one of another kind (a Windows console) as it is."""
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")
     if not isinstance(stream, io.TextIOWrapper):
@@ -60,10 +63,10 @@ def _lasting(stream: TextIO | None) -> TextIO:
     if type(below) is not io.FileIO:
         return stream
     file = _LastingFile(below.fileno(), "w", closefd=False)
-    return io.TextIOWrapper(
+    return PlainText(
         io.BufferedWriter(file),
         encoding=stream.encoding,
-        errors=stream.errors,
+        errors="backslashreplace",
         line_buffering=stream.line_buffering,
         write_through=stream.write_through,
     )

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Protocol, Self
 
 import numpy as np
@@ -135,6 +136,7 @@ class Scene:
             distance to neighbours tells. None: at all points.
         point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
         georeference: Where on Earth it is.
+        files: Files that it was read from, except photos and masks.
     """
 
     name: str
@@ -148,6 +150,7 @@ class Scene:
     point_sizes: NDArray[np.float64] | None = None
     point_opacities: NDArray[np.float64] | None = None
     georeference: Georeference = UNPLACED
+    files: tuple[Path, ...] = ()
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
         """The scene with these of its points alone, [Q] rising; views know their new rows."""

@@ -22,18 +22,19 @@ from crossgrad_core.run.opening import continued, parsed, set_up
 from crossgrad_core.run.planning import seconds_of
 from crossgrad_core.run.reason import reason_of
 from crossgrad_core.run.resolve import resolved
+from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
     RUNS,
     SMALLEST_NEED,
     RunName,
     check_out,
+    clear_half_written,
     create_run_folder,
     expected_bytes,
 )
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
-from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
 from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.plan_file import write_plan
 from crossgrad_core.run.results.plugins_file import (
@@ -53,7 +54,7 @@ from crossgrad_core.run.settings_for_nothing import (
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.scene.photo_check import check_photos, fits
-from crossgrad_core.system.files import clear_leftovers
+from crossgrad_core.system.checksums import changed_files, drop_checksums
 from crossgrad_core.system.interrupts import exit_code, way_on
 from crossgrad_core.system.writability import check_folder
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
@@ -67,7 +68,7 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.training.veils import note_on_sizes
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, one_line
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -303,8 +304,7 @@ def _held(folder: Path) -> Iterator[None]:
                 "into it",
                 folder,
             )
-        for place in (folder, *folder.glob(f"{RENDERS}/*")):
-            clear_leftovers(place)
+        clear_half_written(folder)
         yield
 
 
@@ -330,7 +330,7 @@ def _train(
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
     print(table)  # noqa: T201 - the result of the command
     if folder.is_dir():  # Nobody moved it meanwhile.
-        print(f"results in {folder}")  # noqa: T201
+        print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:
         print(line, file=sys.stderr)  # noqa: T201
 
@@ -363,7 +363,8 @@ def resumed(
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
-        if done and all((folder / name).is_file() for name in files):
+        damaged = set(changed_files(folder)) - {CONFIG}  # Its settings are compared by themselves.
+        if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
                 "the run is finished",
                 where=folder,
@@ -385,6 +386,7 @@ def resumed(
             state.clock.load += _decoded(setup, way)
             with _tried_out():
                 state.clock.compile += warm_up(setup, state)
+        drop_checksums(folder)
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         known = read_plugins(folder, quiet=True) if step else None
         write_plugins(folder, with_present(known, packages_of(setup)))

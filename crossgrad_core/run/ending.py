@@ -9,15 +9,17 @@ from typing import Final, TypeVar
 
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.registry.entries import notes_on
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.reason import is_unexpected, reason_of, traceback_of
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.seal import seal
 from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
+from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length
 from crossgrad_core.training.clock import Laps
 from crossgrad_core.training.edits import keep
@@ -27,6 +29,7 @@ from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.wording import one_line
 
 #: A run that ends so many decibels below its best evaluation says so; where few photos are held out
 #: single evaluations differ by less all the time.
@@ -91,6 +94,10 @@ class Course:
         described = self.ending
         self._attempt("", lambda: self.setup.hook.crossgrad_run_end(status=described.status))
         if self.ending != described:
+            self._summarise()
+        sealed = self.ending
+        self._attempt(f"no {SUMS}", lambda: seal(self.session.folder))
+        if self.ending != sealed:
             self._summarise()
         return self.ending
 
@@ -216,7 +223,7 @@ def last_words(course: Course) -> list[str]:
     if course.session.gone:
         return lines
     if ending.traced:
-        lines.append(f"the traceback is in {folder / LOG}")
+        lines.append(f"the traceback is in {one_line(folder / LOG)}")
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]
@@ -238,13 +245,13 @@ def overdone(rows: Sequence[Row]) -> list[str]:
 
 def resume_line(folder: Path) -> str:
     """How a run goes on."""
-    return f"continue with: crossgrad run --resume {quote(str(folder))}"
+    return f"continue with: crossgrad run --resume {one_line(quote(str(folder)))}"
 
 
 def _kept(course: Course) -> list[str]:
     """What to say about the state, where not all of it is in the newest checkpoint."""
     step = course.state.step
-    saved = max(complete_checkpoints(course.session.folder / CHECKPOINTS), default=0)
+    saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
         return []
     there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"

@@ -1,5 +1,6 @@
 """From settings, or from a run's folder, to a run that can go on."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,11 +17,12 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.assemble import assemble, check_names, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import load_latest
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.persist import check_settings, from_checkpoint
 from crossgrad_core.run.rasterizers import drawn_elsewhere
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
+from crossgrad_core.run.results.kept import edited, restored
 from crossgrad_core.run.results.lock import writer_of
 from crossgrad_core.run.results.plugins_file import (
     Packages,
@@ -45,6 +47,7 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.wording import listed
 
+_LOG = logging.getLogger(__name__)
 #: How a run ended that wrote down its results, and a checkpoint with them.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 #: What a run says that has to begin again.
@@ -120,7 +123,7 @@ def require_checkpoint(folder: Path) -> None:
         UserError: It is no run, or it has no checkpoint.
     """
     read_config(folder)
-    if not complete_checkpoints(folder / CHECKPOINTS):
+    if not named_checkpoints(folder / CHECKPOINTS):
         _refuse_lost_checkpoints(folder)
         writer = writer_of(folder)
         raise UserError(
@@ -181,7 +184,7 @@ def continued(
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
     packages = read_plugins(folder)
     refuse_missing(folder, packages)
-    if complete_checkpoints(folder / CHECKPOINTS):
+    if named_checkpoints(folder / CHECKPOINTS):
         if not accept_plugins:
             refuse_changed(folder, packages)
         return _from(folder, settings, verbosity, check, packages)
@@ -209,7 +212,13 @@ def _from(
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds
     packages = packages if looks else with_present(packages, packages_of(setup))
-    notes = _noted(folder, setup, packages)
+    notes = edited(folder, checkpoint.scalars)
+    if looks:
+        for note in notes:
+            _LOG.warning("%s", note)
+    else:
+        notes = (*restored(folder, checkpoint.scalars, state.step), *notes)
+    notes = (*notes, *_noted(folder, setup, packages))
     return caught_up(replace(setup, notes=notes), state.step), state
 
 
@@ -235,7 +244,16 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     # What a run began with is written down; where it is not, it was that of the first versions.
     stored["sh_from"] = stored.get("sh_from") or 0
     stored["sh_every"] = stored.get("sh_every") or 1
-    config = parsed({**stored, **settings})
+    try:
+        config = parsed({**stored, **settings})
+    except UserError as error:
+        raise UserError(
+            error.what,
+            where=f"{folder / CONFIG}, {error.where}",
+            expected=error.expected,
+            found=error.found,
+            todo=error.todo,
+        ) from error
     if "device" in settings:
         return drawn_elsewhere(config)
     _check_device(config.device, folder)

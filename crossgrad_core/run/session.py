@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from math import isnan
 from pathlib import Path
 from time import perf_counter
@@ -10,12 +11,14 @@ from crossgrad_core.contract.contexts import EvaluationReport
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.checkpoint.checkpoint import drop_later, save
+from crossgrad_core.run.checkpoint.checkpoint import drop_later, latest, renew_scalars, save
 from crossgrad_core.run.checkpoint.folders import Keep
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.persist import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
+from crossgrad_core.run.results.kept import KEY as KEPT
+from crossgrad_core.run.results.kept import kept_files
 from crossgrad_core.run.results.machine import Machine
 from crossgrad_core.run.results.metrics_csv import (
     MetricsCsv,
@@ -105,6 +108,8 @@ class Session:
         row = metrics_row(totals(setup, state), result)
         self._table.append(row)
         self._evaluated_step = state.step
+        if self._saved_step == state.step:
+            renew_scalars(latest(self.folder), {KEPT: kept_files(self.folder)})
         report = EvaluationReport(state.step, row, tuple(result.regimes))
         setup.hook.crossgrad_evaluation(report=report)
 
@@ -114,9 +119,10 @@ class Session:
             return
         self._require_folder()
         with reporting(state):
-            save(
-                self.folder, to_checkpoint(state, setup.config), Keep(every=setup.config.save_every)
-            )
+            checkpoint = to_checkpoint(state, setup.config)
+            scalars = {**checkpoint.scalars, KEPT: kept_files(self.folder)}
+            keep = Keep(every=setup.config.save_every)
+            save(self.folder, replace(checkpoint, scalars=scalars), keep)
         self._saved_step = state.step
 
     @property

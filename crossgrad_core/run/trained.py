@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, complete_checkpoints
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.results.summary import read_summary
@@ -204,7 +204,7 @@ class _Opened:
         """The run's setup and its newest state."""
         from crossgrad_core.run.afterwards.how import How
 
-        newest = max(complete_checkpoints(folder / CHECKPOINTS), default=0)
+        newest = max(named_checkpoints(folder / CHECKPOINTS), default=0)
         if self._kept is None or self._kept[0] != newest:
             self._kept = newest, How(*self._how).open(folder)
         return self._kept[1]

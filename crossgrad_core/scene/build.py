@@ -23,6 +23,7 @@ from crossgrad_core.scene.raw_checks import (
 )
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
 from crossgrad_core.scene.split import Label, split_views
+from crossgrad_core.wording import one_line
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
@@ -59,7 +60,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     store = PhotoStore(store_folder(), options.disk_mib)
     cache: PhotoCache[PhotoSource] = PhotoCache(options.cache_mib, store)
     return Scene(
-        name=raw.root.resolve().name or "scene",
+        name=one_line(raw.root.resolve().name) or "scene",
         views=tuple(
             View(view.name, camera, FilePhoto(photos.sources[view.name], cache), regime, rows)
             for view, camera, regime, rows in zip(used, cameras, regimes, seen, strict=True)
@@ -69,6 +70,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         points=local,
         point_colors=points.colors,
         similarity=frame.similarity,
+        files=raw.files,
         notes=(
             *raw.notes,
             *point_notes,

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from crossgrad_core.scene.fingerprint import DECIMALS, Fingerprint
+from crossgrad_core.scene.fingerprint import DECIMALS, FileMark, Fingerprint
 from crossgrad_core.scene.wording import name_some
 
 # Libraries of another machine may round the last digits otherwise.
@@ -44,7 +44,9 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     found = _views(was, now)
     if not any(each.weight is Weight.PLACE for each in found):
         found += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
-    return [*found, *_files(was, now)]
+    found += _files(was, now)
+    # What a file changed is told in its place, where it is known.
+    return found or _others(was, now)
 
 
 def _views(was: Fingerprint, now: Fingerprint) -> list[Difference]:
@@ -101,12 +103,25 @@ def _points(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     common = was.views.keys() & now.views.keys()
-    photos = [name for name in common if was.views[name].photo != now.views[name].photo]
-    masks = [name for name in common if was.views[name].mask != now.views[name].mask]
+    photos = [name for name in common if _differ(was.views[name].photo, now.views[name].photo)]
+    masks = [name for name in common if _differ(was.views[name].mask, now.views[name].mask)]
     return [
         *_named(Weight.CONTENT, "photos changed", photos),
         *_named(Weight.CONTENT, "masks changed, new or missing", masks),
     ]
+
+
+def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
+    """Differences of the files besides photos and masks; none to a run that did not note them."""
+    if was.files is None or now.files is None:
+        return []
+    names = was.files.keys() | now.files.keys()
+    changed = [name for name in names if _differ(was.files.get(name), now.files.get(name))]
+    return _named(Weight.CONTENT, "files changed, new or missing", changed)
+
+
+def _differ(before: FileMark | None, after: FileMark | None) -> bool:
+    return before is not after if before is None else before.differs(after)
 
 
 def _named(weight: Weight, what: str, names: Iterable[str]) -> list[Difference]:

@@ -1,7 +1,8 @@
-"""The fingerprint of a scene: frame, cameras, split, points, and the ends of its photos' files."""
+"""The fingerprint of a scene: frame, cameras, split, points, and the digests of its files."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -26,10 +27,25 @@ class _Mark(BaseModel):
 
 
 class FileMark(_Mark):
-    """A file: its size, and the SHA-256 of its first and last 64 KiB."""
+    """A file.
+
+    Attributes:
+        bytes: Its size.
+        sha256: Digest of its first and last 64 KiB, by which runs of all versions know it.
+        whole: Digest of the whole file; None of a file that the other digest covers, and in a
+            fingerprint of an earlier version.
+    """
 
     bytes: int
     sha256: str
+    whole: str | None = None
+
+    def differs(self, other: "FileMark | None") -> bool:
+        """Return whether the other mark is that of another file."""
+        if other is None:
+            return True
+        ends = (self.bytes, self.sha256) != (other.bytes, other.sha256)
+        return ends or (None not in {self.whole, other.whole} and self.whole != other.whole)
 
 
 class ViewMark(_Mark):
@@ -71,6 +87,8 @@ class Fingerprint(_Mark):
         frame: The local frame.
         points: The SfM points.
         lists: Name -> digest of the lists that split the views, where there are any.
+        files: Path below the scene's folder -> file, of the files besides photos and masks that the
+            reader used; None in a fingerprint of an earlier version.
         views: Name -> view.
     """
 
@@ -78,15 +96,16 @@ class Fingerprint(_Mark):
     frame: FrameMark
     points: PointsMark
     lists: dict[str, str]
+    files: dict[str, FileMark] | None = None
     views: dict[str, ViewMark]
 
 
 def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
-    """What a scene is known by; reads at most 128 KiB of each photo and mask.
+    """Return what a scene is known by; reads all of its files.
 
     Args:
         scene: The scene.
-        root: Its folder, for the lists of the split.
+        root: Its folder.
 
     Raises:
         UserError: A photo or mask cannot be read.
@@ -94,12 +113,14 @@ def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
     trained = frozenset(scene.train)
     with ThreadPoolExecutor() as pool:
         files = list(pool.map(_files_of, scene.views))
+        others = {os.path.relpath(path, root): mark_of(path) for path in scene.files}
     lists = {name: root / name for name in (TRAIN_LIST, TEST_LIST) if (root / name).is_file()}
     x, y, z = (float(value) for value in scene.similarity.offset)
     return Fingerprint(
         frame=FrameMark(offset=(x, y, z), scale=scene.similarity.scale),
         points=_points_of(scene),
         lists={name: mark_of(path).sha256 for name, path in lists.items()},
+        files=others,
         views={
             view.name: ViewMark(
                 trained=index in trained, camera=_numbers_of(view.camera), photo=photo, mask=mask
@@ -121,6 +142,9 @@ def mark_of(path: Path) -> FileMark:
             size = file.seek(0, 2)
             file.seek(max(END, size - END))
             digest.update(file.read(END))
+            file.seek(0)
+            # The ends are all of a small file.
+            whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(
             "a file of the scene cannot be read",
@@ -128,7 +152,7 @@ def mark_of(path: Path) -> FileMark:
             found=error.strerror or str(error),
             todo="put it back, or make it readable",
         ) from error
-    return FileMark(bytes=size, sha256=digest.hexdigest())
+    return FileMark(bytes=size, sha256=digest.hexdigest(), whole=whole)
 
 
 def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:

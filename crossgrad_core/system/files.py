@@ -13,7 +13,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.interrupts import UNFINISHED
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp", re.DOTALL)
 _FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 _IN_THE_WAY = frozenset({errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ELOOP})
 
@@ -30,7 +30,7 @@ def size_text(count: int) -> str:
 def free_bytes(path: Path) -> int:
     """Free bytes of the file system that `path`, which need not exist yet, lies or will lie on."""
     place = path.absolute()
-    while not place.exists():
+    while not os.path.exists(place):  # Not of Path, which raises an error for a long name.
         place = place.parent
     return shutil.disk_usage(place).free
 
@@ -56,6 +56,22 @@ def read_only(path: Path) -> UserError:
     )
 
 
+def path_too_long(path: object) -> UserError:
+    """Return the error for a path that the file system cannot hold."""
+    return UserError(
+        "the path is too long for the file system",
+        where=path,
+        expected="names of at most 255 bytes, and at most 4,096 bytes in all, on most systems; "
+        "results need some of these",
+        todo="choose a shorter one",
+    )
+
+
+def is_too_long(error: OSError) -> bool:
+    """Whether a path is longer than the file system takes."""
+    return error.errno == errno.ENAMETOOLONG
+
+
 def is_full(error: OSError) -> bool:
     """Whether there is no room for what should have been written."""
     return error.errno in _FULL
@@ -63,7 +79,7 @@ def is_full(error: OSError) -> bool:
 
 @contextmanager
 def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
-    """Turns a full disk, no permission or a wrong kind of file inside the block into a `UserError`.
+    """Turn a full disk, no permission, a wrong kind of file or a long path into a `UserError`.
 
     Args:
         path: What is being written.
@@ -79,6 +95,8 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
         if error.errno in _IN_THE_WAY:
             what, found = "something else is in the way", error.strerror or ""
             raise UserError(what, where=path, found=found, todo="move it elsewhere") from error
+        if is_too_long(error):
+            raise path_too_long(path) from error
         raise
 
 
@@ -92,7 +110,7 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
     Raises:
         UserError: The disk is full or the folder may not be written to; an old file is untouched.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = unfinished_name(path)
     with disk_errors(path, needed):
         UNFINISHED.add(str(temporary))
         try:
@@ -107,16 +125,48 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
             UNFINISHED.discard(str(temporary))
 
 
+def unfinished_name(path: Path) -> Path:
+    """Return what a file is called until it is whole."""
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
 def is_leftover(path: Path) -> bool:
     """Whether `atomic_file` left this behind in a process that was killed, or is writing it now."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
-def clear_leftovers(folder: Path) -> None:
-    """Deletes half-written files of killed processes in a folder that only this one writes into."""
+def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
+    """Delete the half-written files that killed processes left in a folder.
+
+    Args:
+        folder: The folder.
+        shared: Whether other processes may write into it: then a file stays while its process runs.
+    """
     for path in folder.glob(".*.tmp"):
-        if is_leftover(path):
+        named = _TEMPORARY.fullmatch(path.name)
+        if named and not (shared and _is_alive(int(named[1]))):
             path.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    """Whether another process of this machine has that number."""
+    if process == os.getpid():  # Left by an earlier process with this number, as in a container.
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def text_bytes(text: str) -> bytes:
+    r"""Return a text in UTF-8; a byte of a file name that is not becomes `\udc80` or the like.
+
+    In JSON and YAML this is an escape, from which the name is read again.
+    """
+    return text.encode(errors="backslashreplace")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

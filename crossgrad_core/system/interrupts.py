@@ -19,6 +19,8 @@ SIGNALS = tuple(
 _WAYS_ON: list[str] = []
 #: Files that are being written; they are deleted where the process ends at once.
 UNFINISHED: set[str] = set()
+#: Numbers of the processes that write such files; they end first.
+HELPERS: set[int] = set()
 
 
 def exit_code(number: int) -> int:
@@ -44,7 +46,7 @@ def tell(text: str, *, alone: bool = True) -> None:
         sys.stderr.flush()
     except RuntimeError:  # The handler came while stderr was being written to.
         with suppress(OSError):
-            os.write(2, line.encode())
+            os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
         pass  # There is nowhere left to say it.
 
@@ -56,7 +58,11 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
         tell(line, alone=False)
     with suppress(Exception):
         sys.stdout.flush()
-    for path in UNFINISHED:
+    for helper in list(HELPERS):
+        with suppress(OSError):
+            os.kill(helper, signal.SIGTERM)
+            os.waitpid(helper, 0)
+    for path in list(UNFINISHED):
         with suppress(OSError):
             os.unlink(path)
     os._exit(exit_code(number))

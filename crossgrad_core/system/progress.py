@@ -3,6 +3,8 @@
 import sys
 from time import monotonic
 
+from crossgrad_core.wording import one_line
+
 
 class Progress:
     """Lines on stderr that begin with three dots, one at most in so many seconds.
@@ -24,5 +26,5 @@ class Progress:
         """Shows a line where one is due."""
         if self.due:
             self._last = monotonic()
-            sys.stderr.write(f"... {text}\n")
+            sys.stderr.write(f"... {one_line(text)}\n")
             sys.stderr.flush()

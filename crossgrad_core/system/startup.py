@@ -12,8 +12,9 @@ from typing import Final
 
 from typing_extensions import override
 
-from crossgrad_core.system.terminal import is_live
+from crossgrad_core.system.terminal import controls_of, is_live
 from crossgrad_core.system.version import VERSION
+from crossgrad_core.wording import one_line
 
 #: The logger that speaks of kernels, and how its messages begin.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
@@ -138,7 +139,8 @@ def _say(text: str, *, stays: bool = True) -> None:
     """Writes a line; one that does not stay is overwritten by the next."""
     clear = "\r\x1b[K" if is_live(sys.stderr) else ""
     try:
-        sys.stderr.write(f"{clear}{text}" + ("\n" if stays else ""))
-        sys.stderr.flush()
+        stream = controls_of(sys.stderr)
+        stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
+        stream.flush()
     except (OSError, ValueError):
         pass  # It is no longer read.

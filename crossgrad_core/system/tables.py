@@ -1,12 +1,11 @@
 """Tables in CSV files."""
 
 import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from math import isnan
 from pathlib import Path
 
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> None:
@@ -29,9 +28,17 @@ def table_bytes(rows: Sequence[Mapping[str, str | int | float]]) -> bytes:
 
 def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
     """Lines of cells as they stand in a file: UTF-8, commas, a line feed behind each line."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue().encode()
+    rows = _Rows()
+    # With this line end both of its signs are quoted in a cell.
+    csv.writer(rows, lineterminator="\r\n").writerows(lines)
+    return text_bytes("".join(row.removesuffix("\r\n") + "\n" for row in rows))
+
+
+class _Rows(list[str]):
+    """The rows that a `csv.writer` writes, one by one."""
+
+    def write(self, row: str) -> None:
+        self.append(row)
 
 
 def as_cell(value: float | str | None) -> str:

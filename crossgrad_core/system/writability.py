@@ -1,10 +1,22 @@
 """Whether results can be written, asked before the work that leads to them; nothing stays."""
 
+import os
 import tempfile
 from pathlib import Path
+from typing import Final
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.system.files import disk_errors, disk_full, free_bytes, read_only
+from crossgrad_core.system.files import (
+    disk_errors,
+    disk_full,
+    free_bytes,
+    path_too_long,
+    read_only,
+    unfinished_name,
+)
+
+#: Bytes of the longest path of a file below a folder of results.
+_BELOW: Final = 200
 
 
 def check_folder(folder: Path, needed: int = 0) -> None:
@@ -18,8 +30,9 @@ def check_folder(folder: Path, needed: int = 0) -> None:
         UserError: What is in the way, and what to do.
     """
     place = folder.absolute()
-    while not (place.exists() or place.is_symlink()):
+    while not os.path.lexists(place):
         place = place.parent
+    _check_length(folder, place)
     if not place.is_dir():
         raise UserError(
             "cannot make this folder",
@@ -35,6 +48,17 @@ def check_folder(folder: Path, needed: int = 0) -> None:
         raise read_only(folder) from error
     if needed and free_bytes(place) < needed:
         raise disk_full(folder, needed)
+
+
+def _check_length(folder: Path, place: Path) -> None:
+    """Refuse a folder whose path leaves no room for those of the files in it."""
+    name, path = (
+        os.pathconf(place, limit) if hasattr(os, "pathconf") else default
+        for limit, default in (("PC_NAME_MAX", 255), ("PC_PATH_MAX", 4096))
+    )
+    longest = max(len(os.fsencode(part)) for part in folder.absolute().parts)
+    if longest > name or len(os.fsencode(folder.absolute())) + _BELOW > path:
+        raise path_too_long(folder)
 
 
 def check_own(path: Path) -> None:
@@ -61,8 +85,21 @@ def check_new(*paths: Path) -> None:
     Raises:
         UserError: The first of them.
     """
-    if path := next((each for each in paths if each.exists()), None):
-        raise UserError("the file exists", where=path, todo="choose another place, or remove it")
+    for path in paths:
+        with disk_errors(path):
+            if path.exists():
+                todo = "choose another place, or remove it"
+                raise UserError("the file exists", where=path, todo=todo)
+
+
+def check_name(path: Path) -> None:
+    """Refuse a file whose name leaves no room for that of its unfinished form.
+
+    Raises:
+        UserError: The name or the path is too long.
+    """
+    with disk_errors(path):
+        unfinished_name(path).exists()
 
 
 def check_file(path: Path) -> None:
@@ -71,6 +108,7 @@ def check_file(path: Path) -> None:
     Raises:
         UserError: What is in the way, and what to do.
     """
+    check_name(path)
     if path.is_dir():
         raise UserError(
             "a file is to be written, and this is a folder", where=path, todo="name a file in it"

@@ -38,7 +38,8 @@ _FLOAT = re.compile(
 )
 _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
 _LINE_ENDS = re.compile("[\r\n\x85\u2028\u2029]")
-_IMPOSSIBLE = re.compile("[\0\ud800-\udfff]")
+# Bytes of a file name that are not UTF-8 are \udc80 to \udcff.
+_IMPOSSIBLE = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")
 
 
 class _Loader(yaml.SafeLoader):

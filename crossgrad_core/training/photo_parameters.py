@@ -14,6 +14,7 @@ from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.checksums import warn_if_changed
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.photo_file import read_values, write_values
@@ -63,6 +64,7 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
     if path is None:
         return {}
     starts = {name: each.first() for name, each in setup.per_photo.items()}
+    warn_if_changed(path)
     known = read_values(path, starts)
     names = [view.name for view in setup.train_views]
     rows = [row for row, name in enumerate(names) if name in known]

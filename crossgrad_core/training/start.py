@@ -19,6 +19,7 @@ from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
+from crossgrad_core.system.checksums import warn_if_changed
 from crossgrad_core.training import photo_parameters
 from crossgrad_core.training.compile_ahead import compiling_beside
 from crossgrad_core.training.loop import timed_step
@@ -81,6 +82,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     """
     reading, scene = setup.config.reading, setup.scene
     if reading.init_file is not None:
+        warn_if_changed(reading.init_file)
         gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, scene.similarity)
         return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
     begun = with_random_points(scene, rng) if reading.init == "random" else _begun(setup)

@@ -9,9 +9,11 @@ import sys
 import threading
 
 import pytest
+from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.cli import streams
+from crossgrad_core.system.terminal import controls_of
 
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 
@@ -61,6 +63,72 @@ def test_a_full_disk_below_the_terminal_is_swallowed(monkeypatch):
         monkeypatch.setattr(sys, "stderr", streams._lasting(full))
         sys.stderr.write("x" * 100_000 + "\n")
         sys.stderr.flush()
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_what_the_encoding_lacks_and_what_controls_a_terminal_is_escaped(encoding):
+    read, write = os.pipe()
+    with open(read, "rb") as reader, open(write, "w", encoding=encoding) as stdout:
+        stream = streams._lasting(stdout)
+        stream.write("Ł\x1b[31m \u202e \udcff\r\n")
+        controls_of(stream).write("\x1b[K")
+        stream.flush()
+        letter = "Ł".encode(encoding, "backslashreplace")
+        assert reader.readline() == letter + rb"\x1b[31m \u202e \udcff\r" + b"\n"
+        assert reader.read(3) == b"\x1b[K"
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory):
+    """A run in a folder whose name no ASCII terminal can show."""
+    place = tmp_path_factory.mktemp("foreign")
+    scene = write_tiny_scene(place / "Łódź\x1b[31m", views=5)
+    options = ("--steps", "2", "--threads", "1", "-q")
+    ended = in_ascii("run", scene, *options, "--out", place / "żółw\x1b[31m")
+    return place / "żółw\x1b[31m", ended
+
+
+def in_ascii(*arguments):
+    return subprocess.run(
+        [*CROSSGRAD, *map(os.fspath, arguments)],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        check=False,
+    )
+
+
+def test_a_run_says_where_its_results_are_on_every_terminal(foreign):
+    folder, ended = foreign
+    assert ended.returncode == 0, ended.stderr
+    assert rb"results in" in ended.stdout and rb"\u017c\xf3\u0142w\x1b[31m" in ended.stdout
+    log = (folder / "log.txt").read_text(encoding="utf-8")
+    assert r"Łódź\x1b[31m" in log and "\x1b" not in log
+
+
+@pytest.mark.parametrize("command", ["export", "render", "compare"])
+def test_a_command_says_where_its_results_are_on_every_terminal(foreign, command, tmp_path):
+    out = tmp_path / "ó\x1b[31m"
+    place = out.with_suffix(".ply") if command == "export" else out
+    ended = in_ascii(command, foreign[0], "--out", place)
+    assert ended.returncode == 0, ended.stderr
+    assert rb"\xf3\x1b[31m" in ended.stdout and b"\x1b" not in ended.stdout + ended.stderr
+    assert place.exists()
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "/".join(["folder"] * 700), "a" * 250])
+@pytest.mark.parametrize("command", ["run", "export", "render", "compare"])
+def test_a_path_that_is_too_long_is_one_error(command, name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    if len(name) < 255 and command != "export":
+        pytest.skip("a folder may have that name")
+    (tmp_path / "config.yaml").write_text("scene: s\nseed: 0\n")
+    checkpoint = tmp_path / "checkpoints" / "step-000001"
+    checkpoint.mkdir(parents=True)
+    given = () if command == "run" else (tmp_path,)
+    assert ended(command, *given, "--out", name) == 2
+    said = capsys.readouterr().err
+    assert said.count("error: ") == 1 and "the path is too long" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "config.yaml"]
 
 
 def test_streams_of_another_kind_stay_as_they_are():

@@ -114,9 +114,10 @@ class RunFolder:
         return found
 
     def _write_views(self, folder: Path) -> None:
-        lines = ["name,regime,psnr,ssim"]
-        lines += [f"{name},{regime},{p},{p / 30.0}" for name, regime, p in self.view_figures()]
-        (folder / "per_view.csv").write_text("\n".join(lines) + "\n")
+        lines = [["name", "regime", "psnr", "ssim"]]
+        lines += [[name, regime, p, p / 30.0] for name, regime, p in self.view_figures()]
+        with (folder / "per_view.csv").open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(lines)
 
     def _summary(self, config: dict) -> dict:
         final = self.figures(1.0)

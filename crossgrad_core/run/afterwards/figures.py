@@ -23,6 +23,7 @@ from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.table import final_table, metric_lines
 from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.run.session import totals
+from crossgrad_core.system.checksums import relisted, warn_if_changed
 from crossgrad_core.wording import listed
 
 _LOG = logging.getLogger(__name__)
@@ -77,7 +78,9 @@ def evaluated_on(
         result = measured(there.views, draw, setup.metrics, points=points)
         if writes:
             name = name_for(folder, ending(there.name), on)
-            write_per_view(folder, result, f"per_view_on_{name}.csv")
+            file = f"per_view_on_{name}.csv"
+            with relisted(folder, file):
+                write_per_view(folder, result, file)
         return result, there
 
 
@@ -104,6 +107,7 @@ def evaluated_file(
     """
     require_checkpoint(folder)
     setup, state = how.open(folder)
+    warn_if_changed(ply)
     gaussians = build(Exporter, EXPORTER, {}).read(ply, setup.scene.similarity)
     if on is None:
         there, views, points = None, setup.scene.test_views, setup.scene.points
@@ -132,7 +136,8 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
             name = own_name(folder, PER_VIEW, state.step)
             name = name.replace(".", "_accepted.") if is_changed(setup) else name
             if name != PER_VIEW or not _loses_figures(folder, result):
-                write_per_view(folder, result, name)
+                with relisted(folder, name):
+                    write_per_view(folder, result, name)
         return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
 
 

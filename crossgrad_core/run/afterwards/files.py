@@ -12,8 +12,11 @@ from crossgrad_core.run.afterwards.places import own_name, writing
 from crossgrad_core.run.export import Exported, described, export_scene, georef_of
 from crossgrad_core.run.results.panel_names import flat_names
 from crossgrad_core.run.session import CLOUD
+from crossgrad_core.system.checksums import relisted
+from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.writability import check_file, check_new
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import one_line
 
 #: Files of Gaussians by the names that programs give them: none holds what another one's says.
 _OF_FORMATS: Final = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
@@ -34,7 +37,7 @@ def export(
     )
     for line in described(content, path):
         print(line)  # noqa: T201
-    print(f"{content.gaussians:,} Gaussians in {path}")  # noqa: T201
+    print(f"{content.gaussians:,} Gaussians in {one_line(path)}")  # noqa: T201
 
 
 def exported(
@@ -70,8 +73,9 @@ def exported(
         find("exporters", file_format)
     with writing(folder, out, "exporting"):
         if out is not None:
-            check_new(out, georef_of(out))
             check_file(out)
+            check_new(out, georef_of(out))
+            clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
         exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
         if file_format not in {None, setup.selection.names["exporter"]}:
@@ -97,7 +101,8 @@ def exported(
         else:
             path = out or folder / name
             check_new(path)
-        return path, export_scene(setup, state, path, camera, exporter, coordinates)
+        with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
+            return path, export_scene(setup, state, path, camera, exporter, coordinates)
 
 
 def _flat(setup: Setup, camera: str) -> str:

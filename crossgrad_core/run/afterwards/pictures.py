@@ -23,8 +23,10 @@ from crossgrad_core.run.results.panel_layout import folder_of
 from crossgrad_core.run.results.panel_names import ending
 from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.sources import name_for
+from crossgrad_core.system.checksums import relisted
+from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.system.writability import check_folder, check_new
-from crossgrad_core.wording import count
+from crossgrad_core.wording import count, one_line
 
 
 def render(
@@ -70,8 +72,10 @@ def render(
         writer = replace(writer, folder=out or own)
         if out is not None:
             check_new(*(out / f"{file}.png" for file in writer.files.values()))
-        measured(views, draw, setup.metrics, on_view=writer.write)
-        print("\n".join([*remarks, f"{count(len(views), 'panel')} in {writer.folder}"]))  # noqa: T201
+        clear_leftovers(writer.folder, shared=True)
+        with relisted(folder, *(() if out else (_below(folder, own),))):
+            measured(views, draw, setup.metrics, on_view=writer.write)
+        print("\n".join([*remarks, f"{count(len(views), 'panel')} in {one_line(writer.folder)}"]))  # noqa: T201
 
 
 def fly(
@@ -109,18 +113,24 @@ def fly(
         along = flight(setup.scene, path, frames or FRAMES)
         if out is not None:
             check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
+            clear_leftovers(out, shared=True)
         draw, own = camera_renderer(setup, state), out is None
         if out is None:
             name = ending(along.name)
             name = name if path == LADDER else name_for(folder, name, Path(path))
             out = folder_of(folder, state.step) / f"path_{name}"
-        with torch.no_grad():
-            files = write_frames(map(draw, along.cameras), out)
-        if own:
-            drop_frames(out, len(files))
-        made = write_film(files, along.fps)
-        for film in film_files(out) if own else ():
-            if film != made:  # Of other frames.
-                film.unlink(missing_ok=True)
+        with relisted(folder, *((_below(folder, out),) if own else ())):
+            with torch.no_grad():
+                files = write_frames(map(draw, along.cameras), out)
+            if own:
+                drop_frames(out, len(files))
+            made = write_film(files, along.fps)
+            for film in film_files(out) if own else ():
+                if film != made:  # Of other frames.
+                    film.unlink(missing_ok=True)
         told = f"film {made}" if made else f"no film: too many or too large without {ENCODER}"
-        print(f"{count(len(files), 'frame')} in {out}, {told}")  # noqa: T201
+        print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
+
+
+def _below(folder: Path, place: Path) -> str:
+    return place.relative_to(folder).as_posix()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.opening import require_checkpoint
+from crossgrad_core.run.results.folder import clear_half_written
 from crossgrad_core.run.results.lock import RunInUseError, locked
 from crossgrad_core.run.results.scene_file import ACCEPTED
 from crossgrad_core.run.results.summary import summarised_step
@@ -26,6 +27,7 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
             _LOG.warning("%s%s: results are shown, and none is written there", error.what, found)
             yield False
         else:
+            clear_half_written(folder)
             yield True
 
 
@@ -38,6 +40,7 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
         return
     try:
         with locked(folder, doing):
+            clear_half_written(folder)
             yield
     except RunInUseError as error:
         raise UserError(

@@ -5,13 +5,12 @@
 """
 
 from collections.abc import Mapping
-from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.state import Json, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint.contents import Checkpoint
 from crossgrad_core.run.checkpoint.folders import (
@@ -19,10 +18,10 @@ from crossgrad_core.run.checkpoint.folders import (
     STATE,
     TENSORS,
     Keep,
-    complete_checkpoints,
     damaged,
     discard,
-    is_complete,
+    is_checkpoint,
+    named_checkpoints,
     scratch_folder,
 )
 from crossgrad_core.run.checkpoint.state import check_json, read_state, state_text
@@ -33,8 +32,8 @@ from crossgrad_core.run.checkpoint.tensors import (
     unpack,
     write_tensors,
 )
-from crossgrad_core.system.files import disk_errors, is_full, sync_file
-from crossgrad_core.system.input_files import open_file
+from crossgrad_core.system.checksums import digest_of
+from crossgrad_core.system.files import disk_errors, is_full, sync_file, write_atomically
 
 
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
@@ -75,14 +74,14 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
 def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
     with scratch_folder(final) as scratch:
         write_tensors(scratch / TENSORS, tensors)
-        text = state_text({"sha256": _digest(scratch / TENSORS), **state})
+        text = state_text({"sha256": digest_of(scratch / TENSORS), **state})
         (scratch / STATE).write_text(text, encoding="utf-8")
         sync_file(scratch / STATE)
 
 
 def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
     """Deletes the checkpoints not worth keeping beside those that are coming; whether any was."""
-    steps = complete_checkpoints(folder)
+    steps = named_checkpoints(folder)
     doomed = [steps[step] for step in keep.drops([*steps, *coming]) if step in steps]
     for each in doomed:
         discard(each)
@@ -100,12 +99,12 @@ def load_latest(run: Path) -> Checkpoint:
         try:
             return load(folder)
         except (UserError, OSError):
-            if is_complete(folder):
+            if folder.is_dir():
                 raise
 
 
 def latest(run: Path) -> Path:
-    """The newest complete checkpoint of a run.
+    """Return the newest checkpoint of a run, whole or damaged.
 
     Args:
         run: The run's folder, its folder `checkpoints`, or one checkpoint.
@@ -113,10 +112,10 @@ def latest(run: Path) -> Path:
     Raises:
         UserError: There is none.
     """
-    if is_complete(run):
+    if is_checkpoint(run):
         return run
     for folder in (run / CHECKPOINTS, run):
-        steps = complete_checkpoints(folder)
+        steps = named_checkpoints(folder)
         if steps:
             return steps[max(steps)]
     raise UserError(
@@ -130,7 +129,7 @@ def latest(run: Path) -> Path:
 
 def drop_later(run: Path, step: int) -> None:
     """Deletes checkpoints beyond `step`, from which a resumed run would no longer follow."""
-    for later, folder in complete_checkpoints(run / CHECKPOINTS).items():
+    for later, folder in named_checkpoints(run / CHECKPOINTS).items():
         if later > step:
             discard(folder)
 
@@ -144,7 +143,7 @@ def load(folder: Path) -> Checkpoint:
     state = read_state(folder)
     if not (folder / TENSORS).is_file():
         raise damaged(folder, f"no {TENSORS}")
-    if _digest(folder / TENSORS) != state["sha256"]:
+    if digest_of(folder / TENSORS) != state["sha256"]:
         raise damaged(folder, f"{TENSORS} is not what was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
@@ -167,6 +166,17 @@ def load(folder: Path) -> Checkpoint:
         raise damaged(folder, f"{type(error).__name__}: {error}") from error
 
 
+def renew_scalars(folder: Path, scalars: Mapping[str, Json]) -> None:
+    """Replace some scalars of a checkpoint on the disk.
+
+    Raises:
+        UserError: It is damaged, or the disk is full.
+    """
+    state = read_state(folder)
+    text = state_text({**state, "scalars": {**state["scalars"], **scalars}})
+    write_atomically(folder / STATE, text.encode())
+
+
 def _plain_state(checkpoint: Checkpoint, tensors: list[str]) -> dict[str, Any]:
     return {
         "step": checkpoint.step,
@@ -176,8 +186,3 @@ def _plain_state(checkpoint: Checkpoint, tensors: list[str]) -> dict[str, Any]:
         "generators": {name: dict(rng) for name, rng in checkpoint.generators.items()},
         "plugins": {name: dict(plugin.values) for name, plugin in checkpoint.plugins.items()},
     }
-
-
-def _digest(path: Path) -> str:
-    with open_file(path) as file:
-        return file_digest(file, "sha256").hexdigest()

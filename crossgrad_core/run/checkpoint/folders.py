@@ -36,24 +36,33 @@ class Keep:
         return [step for step in old if self.every is None or step % self.every]
 
 
+def is_checkpoint(folder: Path) -> bool:
+    """Whether this is the folder of a checkpoint, of which files may have been lost since."""
+    return _STEP.fullmatch(folder.name) is not None and folder.is_dir()
+
+
 def is_complete(folder: Path) -> bool:
-    """Whether this is a checkpoint that was written to the end."""
-    named = _STEP.fullmatch(folder.name) is not None
-    return named and (folder / STATE).is_file() and (folder / TENSORS).is_file()
+    """Whether all files of a checkpoint are there."""
+    return (folder / STATE).is_file() and (folder / TENSORS).is_file()
 
 
-def complete_checkpoints(folder: Path) -> dict[int, Path]:
-    """Step -> folder of the complete checkpoints in `folder`, in the order of steps."""
+def named_checkpoints(folder: Path) -> dict[int, Path]:
+    """Return step -> folder of the checkpoints in `folder`, in the order of steps.
+
+    A checkpoint gets its name when all of its files are there. One that lacks a file is damaged. It
+    is not passed over, because an older one would then be taken in its place without a word.
+    """
     if not folder.is_dir():
         return {}
-    found = [path for path in folder.iterdir() if is_complete(path)]
+    found = [path for path in folder.iterdir() if is_checkpoint(path)]
     by_step = {int(path.name.removeprefix("step-")): path for path in found}
     return dict(sorted(by_step.items()))
 
 
 def damaged(folder: Path, found: str) -> UserError:
     """The error for a checkpoint that cannot be used; points to another one if there is one."""
-    others = [p for p in complete_checkpoints(folder.parent).values() if p.name != folder.name]
+    named = named_checkpoints(folder.parent).values()
+    others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
         "damaged checkpoint",
         where=folder,

@@ -19,7 +19,8 @@ _DIGEST = "state_sha256"
 
 def state_text(state: Mapping[str, Any]) -> str:
     """The content of state.json: `state`, the versions that wrote it, and a digest of all that."""
-    whole = {"format": FORMAT, "crossgrad": VERSION, **state}
+    rest = {key: value for key, value in state.items() if key != _DIGEST}
+    whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
     return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
 
 

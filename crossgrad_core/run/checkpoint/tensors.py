@@ -10,6 +10,7 @@ from urllib.parse import quote, unquote
 from torch import Tensor
 
 from crossgrad_core.system.files import sync_file
+from crossgrad_core.wording import showable
 
 if TYPE_CHECKING:
     from crossgrad_core.run.checkpoint.contents import Checkpoint
@@ -107,9 +108,11 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         ValueError: It is not a readable safetensors file.
     """
     from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors.torch import load, load_file
 
     try:
+        if showable(str(path)) != str(path):  # The library opens names in UTF-8 only.
+            return load(path.read_bytes())
         # Clones, because the library maps the file, which a later checkpoint may delete.
         return {key: tensor.clone() for key, tensor in load_file(path).items()}
     except SafetensorError as error:

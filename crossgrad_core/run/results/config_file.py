@@ -7,7 +7,7 @@ from typing import Any, Final
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.migration import NOTES, marked, migrated
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 from crossgrad_core.wording import listed
 
@@ -20,7 +20,7 @@ def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> 
     """Writes what repeats the run, with its first notes; one that follows the clock renews it."""
     config = config.model_copy(update={"stop_after": None})  # It is about one start alone.
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
-    write_atomically(folder / FILE, f"{as_yaml(config)}{noted}".encode())
+    write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))
 
 
 def read_config(folder: Path) -> dict[str, Any]:

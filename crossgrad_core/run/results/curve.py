@@ -10,6 +10,7 @@ import numpy as np
 
 from crossgrad_core.run.results.metrics_csv import Row
 from crossgrad_core.system.files import write_atomically
+from crossgrad_core.wording import one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,7 +100,7 @@ def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> st
 
 def _literal(text: str) -> str:
     """Text that matplotlib shows as it is: it hides a leading _ and reads formulas between $."""
-    text = text.replace("$", r"\$")
+    text = one_line(text).replace("$", r"\$")
     return f"'{text}'" if text.startswith("_") else text
 
 

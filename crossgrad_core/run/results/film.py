@@ -12,6 +12,7 @@ from torch import Tensor
 from crossgrad_core.contract.images import eight_bit
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
+from crossgrad_core.system.interrupts import HELPERS
 
 #: A program that writes films; where there is none, Pillow writes an animated picture.
 ENCODER: Final = "ffmpeg"
@@ -85,12 +86,19 @@ def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
     # Players want even sides and this pixel format.
     shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
     command = [encoder, "-y", "-loglevel", "error", *source, *count, *shape, "-f", "mp4"]
-    ended = subprocess.run([*command, str(target)], capture_output=True, text=True, check=False)
-    if ended.returncode != 0:
+    process = subprocess.Popen(
+        [*command, str(target)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    HELPERS.add(process.pid)
+    try:
+        _, said = process.communicate()
+    finally:
+        HELPERS.discard(process.pid)
+    if process.returncode != 0:
         raise UserError(
             "the film could not be written",
             where=frames[0].parent,
-            found=ended.stderr.strip()[-300:],
+            found=said.strip()[-300:],
             todo="the frames are there",
         )
 

@@ -10,7 +10,14 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import writer_of
-from crossgrad_core.system.files import disk_errors, disk_full, free_bytes, is_leftover
+from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
+from crossgrad_core.system.files import (
+    clear_leftovers,
+    disk_errors,
+    disk_full,
+    free_bytes,
+    is_leftover,
+)
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
@@ -80,8 +87,11 @@ def check_out(out: Path | None) -> None:
     Raises:
         UserError: `out` is a file or is not empty.
     """
-    if out is None or not out.exists():
+    if out is None:
         return
+    with disk_errors(out):
+        if not out.exists():
+            return
     if not out.is_dir():
         raise UserError(
             "the output folder is a file", where=out, todo="choose another --out, or remove it"
@@ -97,6 +107,13 @@ def check_out(out: Path | None) -> None:
             todo="choose another --out"
             + (", or continue that run with --resume" if CONFIG in there else ""),
         )
+
+
+def clear_half_written(folder: Path) -> None:
+    """Delete what killed processes left half-written in the locked folder of a run."""
+    renders = (path for path in (folder / RENDERS).rglob("*") if path.is_dir())
+    for place in (folder, folder / RENDERS, *renders):
+        clear_leftovers(place)
 
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:

@@ -8,6 +8,7 @@ from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepReco
 from crossgrad_core.contract.marks import hookimpl
 from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
 from crossgrad_core.system.writability import check_own
+from crossgrad_core.wording import showable
 
 FILE = "log.txt"
 #: Progress goes into the log so many times in a run.
@@ -45,7 +46,7 @@ class RunLog:
         """
         stamp = self._clock().strftime("%H:%M:%S")
         gap = [f"(lines are missing here: {self._missing})"] if self._missing else []
-        lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *text.splitlines())]
+        lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *showable(text).splitlines())]
         try:
             # Opened for every entry, so that the file is complete whenever the run is interrupted.
             with self._path.open("a", encoding="utf-8", errors="backslashreplace") as file:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.system.checksums import check_unchanged
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -17,6 +18,7 @@ FOLDER = "renders"
 _NARROWEST = 360
 _SMALLEST_FONT, _LARGEST_FONT, _FONTS_PER_WIDTH = 12, 26, 38
 _COLUMNS = ("photo", "render", "error")
+_TODO = "draw the panels again: crossgrad render RUN, or remove the file"
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,8 @@ def read_panel(path: Path) -> "dict[str, Image]":
     """
     from PIL import Image
 
+    run = path.parents[2]
+    check_unchanged(run, [path.relative_to(run).as_posix()], _TODO)
     try:
         with Image.open(path, formats=["PNG"]) as file:
             panel = file.convert("RGB")
@@ -128,5 +132,5 @@ def _unreadable(path: Path, found: str) -> UserError:
         "unreadable panel",
         where=path,
         found=found,
-        todo="draw the panels again: crossgrad render RUN, or remove the file",
+        todo=_TODO,
     )

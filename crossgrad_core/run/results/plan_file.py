@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def write_plan(folder: Path, plan: "Mapping[str, Json] | None") -> None:
     """
     if plan is not None:
         text = json.dumps(dict(plan), indent=2, ensure_ascii=False)
-        write_atomically(folder / FILE, f"{text}\n".encode())
+        write_atomically(folder / FILE, text_bytes(f"{text}\n"))
 
 
 def read_plan(folder: Path) -> "Mapping[str, Json] | None":

@@ -7,20 +7,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config
+from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.per_view import FILE as PER_VIEW
 from crossgrad_core.run.results.per_view import read_per_view
 from crossgrad_core.run.results.summary import FILE as SUMMARY
 from crossgrad_core.run.results.summary import read_summary
+from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
 #: What the scene of a run is known by; results/scene_file.py writes it.
 SCENE = "scene.json"
+#: What is read of a run.
+_READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,7 @@ def read_run(folder: Path) -> RunResults:
     Raises:
         UserError: It is not the folder of a run, or one of its files is damaged.
     """
+    check_unchanged(folder, _READ, f"restore it, or let crossgrad run --resume {folder} repair it")
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
     views = () if summary is None else read_per_view(folder)
     return RunResults(folder, read_config(folder), read_metrics(folder), summary, views)

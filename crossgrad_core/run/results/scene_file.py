@@ -11,6 +11,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.reading import SCENE as FILE
 from crossgrad_core.scene.differences import Weight, differences
 from crossgrad_core.scene.fingerprint import Fingerprint
+from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 
@@ -43,14 +44,15 @@ def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
 def read_scene_file(folder: Path) -> Fingerprint | None:
     """The scene that a run was trained on; None, with a note, where that cannot be told."""
     path = folder / FILE
+    why = f"{path} is damaged, or of another version"
     try:
         fingerprint = Fingerprint.model_validate_json(read_file(path))
+        if not changed_files(folder, [FILE]):
+            return fingerprint
     except OSError:
-        why = f"{folder} has no {FILE}: the run is of an older version"
+        why = f"{folder} has no {FILE}: the run is of an older version, or somebody removed it"
     except ValidationError:
-        why = f"{path} is damaged, or of another version"
-    else:
-        return fingerprint
+        pass
     _LOG.warning("%s; whether its scene is still the same cannot be told", why)
     return None
 

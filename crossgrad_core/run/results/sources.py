@@ -7,7 +7,7 @@ from json import dumps
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 
 #: Which name stands for which place.
@@ -34,7 +34,7 @@ def name_for(folder: Path, name: str, source: Path) -> str:
         taken = f"{name}-{number}"
     if taken not in known:
         content = dumps({**known, taken: place}, indent=1, ensure_ascii=False)
-        write_atomically(folder / FILE, f"{content}\n".encode())
+        write_atomically(folder / FILE, text_bytes(f"{content}\n"))
     return taken
 
 

@@ -12,7 +12,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.results.metrics_csv import Row
 from crossgrad_core.run.results.totals import Totals
-from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 from crossgrad_core.training.clock import Clock
 
@@ -67,7 +67,7 @@ def write_summary(folder: Path, summary: Summary) -> None:
         UserError: The disk is full.
     """
     text = json.dumps(_finite(_as_data(summary)), indent=2, ensure_ascii=False, default=str)
-    write_atomically(folder / FILE, (text + "\n").encode())
+    write_atomically(folder / FILE, text_bytes(text + "\n"))
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

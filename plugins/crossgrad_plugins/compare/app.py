@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import Progress, UserError, count, table_bytes
+from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes, text_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
@@ -70,7 +70,7 @@ def compare(
     figures = drawn_figures(comparison)
     notes = (*comparison.notes, *differing_code(comparison.main), *unreadable)
     page = page_of(comparison, figures, pictured, views, notes, version("crossgrad"))
-    files = {PAGE: page.encode()}
+    files = {PAGE: text_bytes(page)}
     files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}
     files |= {f"{FIGURES}/{figure.name}.png": figure.png for figure in figures}
     files |= {
@@ -78,8 +78,9 @@ def compare(
     }
     write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):
-        print(line)  # noqa: T201 - the result of the command
-    print(f"\npage, figures and tables in {folder}: open {folder / PAGE}")  # noqa: T201
+        print(one_line(line))  # noqa: T201 - the result of the command
+    shown, page = one_line(folder), one_line(folder / PAGE)
+    print(f"\npage, figures and tables in {shown}: open {page}")  # noqa: T201
 
 
 def _check_numbers(options: Options) -> None:

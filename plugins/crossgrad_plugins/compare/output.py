@@ -7,6 +7,7 @@ from typing import Final
 from crossgrad_core.commands import (
     UserError,
     check_folder,
+    clear_half_written,
     disk_errors,
     is_leftover,
     write_atomically,
@@ -78,5 +79,7 @@ def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) 
         for name in owned:
             if name not in files:
                 (folder / name).unlink(missing_ok=True)
+    for place in (folder, folder / FIGURES):
+        clear_half_written(place, shared=True)
     for name in sorted(files, key=lambda name: name == PAGE):
         write_atomically(folder / name, files[name])

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crossgrad_core.commands import count
+from crossgrad_core.commands import count, one_line, showable
 from crossgrad_plugins.compare import words
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
@@ -69,7 +69,7 @@ def page_of(
     from markupsafe import Markup
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-                              lstrip_blocks=True)  # fmt: skip
+                              lstrip_blocks=True, finalize=_shown)  # fmt: skip
     template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
     return template.render(
         mark=Markup(MARK),
@@ -97,6 +97,13 @@ def page_of(
         colors={arm: _variable(comparison, arm) for arm in comparison.ranking},
         limits={"bootstrap": BOOTSTRAP_FROM, "holm": UNCORRECTED, "open": OPEN_ROWS},
     )
+
+
+def _shown(value: object) -> object:
+    """Return a text with its control characters as escapes, and all else as it is."""
+    if not isinstance(value, str):
+        return value
+    return one_line(value) if type(value) is str else type(value)(showable(value))
 
 
 def arm_rows(comparison: Comparison) -> list[ArmRow]:

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BaseModel, Field, ValidationError
 
-from crossgrad_core.commands import RunConfig, UserError, find_runs, read_results, read_rows
+from crossgrad_core.commands import (
+    RunConfig,
+    UserError,
+    check_unchanged,
+    find_runs,
+    read_results,
+    read_rows,
+)
 from crossgrad_plugins.compare.run import Run
 
 if TYPE_CHECKING:
@@ -274,6 +281,8 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
     plan = folder.parent / _PLAN
     if not plan.is_file():
         return {}
+    todo = "remove it: the command of the sweep writes it again"
+    check_unchanged(plan.parent, [plan.name], todo)
     header, *lines = read_rows(plan, "the table of the sweep", "restore it, or remove it") or [[]]
     if not {_ID, _LABEL} <= set(header):
         return {}

@@ -14,6 +14,7 @@ from crossgrad_core.commands import (
     check_new,
     configured,
     disk_errors,
+    one_line,
     open_run,
 )
 from crossgrad_plugins.diagnostics.command import Options, diagnose_run, diagnose_scene
@@ -93,5 +94,5 @@ def _write(report: Report, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     report.write(folder)
     for line in report.lines():
-        print(line)  # noqa: T201 - the result of the command
-    print(f"\ntables and {PICTURE} in {folder}")  # noqa: T201
+        print(one_line(line))  # noqa: T201 - the result of the command
+    print(f"\ntables and {PICTURE} in {one_line(folder)}")  # noqa: T201

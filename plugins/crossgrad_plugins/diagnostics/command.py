@@ -18,6 +18,7 @@ from crossgrad_core.commands import (
     model_of,
     read_scene,
     take_steps,
+    text_bytes,
     with_steps,
     write_atomically,
 )
@@ -147,5 +148,5 @@ def _write_signature(model: Model, path: Path, seed: int) -> str:
     rng = np.random.default_rng(seed)
     rule = grouping.fit(scene, rng, ModelProbe(model, rng))
     lines = [f"{view.name},{rule.label(view)}" for view in scene.views]
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    write_atomically(path, text_bytes("\n".join(lines) + "\n"))
     return f"labels of conflict-signature in {path} (--grouping lists --set grouping.file={path})"

@@ -12,11 +12,13 @@ from crossgrad_core.plugin import (
     Pace,
     RunInfo,
     StepRecord,
+    controls_of,
     evaluation_line,
     figures,
     hookimpl,
     length_lines,
     progress_line,
+    showable,
     shows_bar,
 )
 
@@ -134,7 +136,7 @@ class Progress(Observer):
                 unit="step",
                 bar_format=_BAR,
                 dynamic_ncols=True,
-                file=sys.stderr,
+                file=controls_of(sys.stderr),
             )
         self._bar.set_postfix_str(", ".join(figures(self._pace)), refresh=False)
         self._bar.update(record.step - self._bar.n)
@@ -145,4 +147,4 @@ class Progress(Observer):
             sys.stderr.flush()
         else:
             # The bar would otherwise be torn by the line.
-            self._bar.write(text, file=sys.stderr)
+            self._bar.write(showable(text), file=controls_of(sys.stderr))

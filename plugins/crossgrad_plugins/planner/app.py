@@ -11,6 +11,7 @@ from crossgrad_core.commands import (
     check_file,
     configured,
     merged,
+    one_line,
     read_scene,
     write_settings,
 )
@@ -95,11 +96,11 @@ def _word(value: object) -> str:
 def show(made: Plan, way: str, *, as_json: bool) -> None:
     """Prints a plan, and the command that carries it out."""
     if as_json:
-        print(json.dumps(made.as_data(), indent=2, ensure_ascii=False))  # noqa: T201
+        print(json.dumps(made.as_data(), indent=2))  # noqa: T201
         return
     for line in lines_of(made, get_terminal_size((_COLUMNS, 0)).columns):
-        print(line)  # noqa: T201 - the result of the command
-    print(way)  # noqa: T201
+        print(one_line(line))  # noqa: T201 - the result of the command
+    print(one_line(way))  # noqa: T201
 
 
 def _check_free(file: Path) -> None:

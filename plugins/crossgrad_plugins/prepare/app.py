@@ -14,6 +14,8 @@ from crossgrad_core.commands import (
     disk_errors,
     entries,
     locked,
+    one_line,
+    text_bytes,
     way_on,
     write_atomically,
 )
@@ -43,11 +45,11 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
-        print(line)  # noqa: T201 - the result of the command
-    print(f"scene in {scene}; the report is {scene / 'report.md'}")  # noqa: T201
+        print(one_line(line))  # noqa: T201 - the result of the command
+    print(one_line(f"scene in {scene}; the report is {scene / 'report.md'}"))  # noqa: T201
     length, command = advised(scene)
     print(f"planned length: {length}")  # noqa: T201
-    print(f"next: {command}")  # noqa: T201
+    print(one_line(f"next: {command}"))  # noqa: T201
 
 
 def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:
@@ -172,5 +174,5 @@ def _write_report(layout: Layout, report: Report) -> None:
         write_atomically(layout.georef, content.encode())
     picture = draw(report, pycolmap.Reconstruction(layout.placed))
     write_atomically(layout.scene / "report.png", picture)
-    write_atomically(layout.scene / "report.md", page_of(report).encode())
+    write_atomically(layout.scene / "report.md", text_bytes(page_of(report)))
     write_atomically(layout.report, json.dumps(data_of(report), indent=1).encode())

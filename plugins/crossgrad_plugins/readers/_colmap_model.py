@@ -37,5 +37,12 @@ def read_model(folder: Path) -> ColmapModel:
     return read_binary(folder) if _has(folder, "bin") else read_text(folder)
 
 
+def model_files(folder: Path) -> tuple[Path, ...]:
+    """Return the files that `read_model` reads."""
+    suffix = "bin" if _has(folder, "bin") else "txt"
+    paths = (folder / f"{name}.{suffix}" for name in ("cameras", "images", "points3D"))
+    return tuple(path for path in paths if path.is_file())
+
+
 def _has(folder: Path, suffix: str) -> bool:
     return all((folder / f"{name}.{suffix}").is_file() for name in ("cameras", "images"))

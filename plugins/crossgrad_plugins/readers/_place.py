@@ -187,6 +187,7 @@ def by_file(scene: Scene, file: Path) -> Scene:
         expected = "rows of a right-handed similarity, the last one 0, 0, 0, 1"
         fields.wrong("transform", expected)
     told = fields.inner("residuals_m") if "residuals_m" in fields else Fields({}, file)
+    scene = replace(scene, files=(*scene.files, file))
     residuals = {name: told.number(name) for name in RESIDUALS if name in told}
     return at(scene, OnEarth(origin_of(fields.inner("origin")), frame, file.name, residuals))
 

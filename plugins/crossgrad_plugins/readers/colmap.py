@@ -18,7 +18,7 @@ from crossgrad_plugins.readers._colmap_folder import (
     choose_model,
     find_models,
 )
-from crossgrad_plugins.readers._colmap_model import read_model
+from crossgrad_plugins.readers._colmap_model import model_files, read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
 from crossgrad_plugins.readers._place import by_code, by_file, by_gps
 
@@ -108,6 +108,7 @@ def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
         points=model.points,
         point_colors=model.colors,
         notes=tuple(notes),
+        files=model_files(folder),
     )
 
 

@@ -11,12 +11,14 @@ from crossgrad_core.commands import (
     UserError,
     check_file,
     check_folder,
+    clear_half_written,
     count,
     exit_code,
     finish,
     is_leftover,
     listed,
     locked,
+    one_line,
     write_mapping,
     writer_of,
 )
@@ -121,7 +123,7 @@ class Sweep:
         if self.request.engine == "slurm":
             from crossgrad_plugins.sweep.engines.slurm import script
 
-            _say(["", script(self._work(found))])
+            _say(["", *script(self._work(found)).splitlines()])
         return 0
 
     def write_best(self, path: Path) -> int:
@@ -158,6 +160,8 @@ class Sweep:
                 _note(
                     "the file system has no locks: nothing keeps a second sweep out of the folder"
                 )
+            for place in (self.layout.out, self.layout.out / "settings"):
+                clear_half_written(place)
             write_plan(self.layout, self.plan.cells)
             found = self.standings(alive=False)
             _note(self._forecast([each for each in found if each.state != "finished"]))
@@ -259,9 +263,9 @@ def _refuse_what_is_no_sweep(layout: Layout) -> None:
 
 
 def _note(line: str) -> None:
-    print(line, file=sys.stderr)  # noqa: T201
+    print(one_line(line), file=sys.stderr)  # noqa: T201
 
 
 def _say(lines: Iterable[str]) -> None:
     for line in lines:
-        print(line)  # noqa: T201 - the result of the command
+        print(one_line(line))  # noqa: T201 - the result of the command

@@ -6,7 +6,7 @@ from shutil import get_terminal_size
 from time import monotonic
 from typing import Final
 
-from crossgrad_core.commands import is_live
+from crossgrad_core.commands import controls_of, is_live, one_line
 from crossgrad_plugins.sweep.estimate import duration, estimated
 from crossgrad_plugins.sweep.records import Record, read_records
 from crossgrad_plugins.sweep.watch import UnderWay, Watch
@@ -41,7 +41,7 @@ class Screen:
             self._draw([*self._table(), *self._failures()])
         else:
             for record in ends:
-                _write(f"... {self._end(record)}\n")
+                _write(f"... {one_line(self._end(record))}\n")
 
     def close(self) -> None:
         """Shows the last state; a live table stays on the screen."""
@@ -50,7 +50,7 @@ class Screen:
     def _draw(self, lines: list[str]) -> None:
         width = get_terminal_size().columns
         up = f"\x1b[{self._lines}F" if self._lines else ""
-        shown = "".join(f"\x1b[K{line[: width - 1]}\n" for line in lines)
+        shown = "".join(f"\x1b[K{one_line(line)[: width - 1]}\n" for line in lines)
         _write(f"{up}{shown}\x1b[J")
         self._lines = len(lines)
 
@@ -84,5 +84,6 @@ def _line(each: UnderWay) -> str:
 
 
 def _write(text: str) -> None:
-    sys.stderr.write(text)
-    sys.stderr.flush()
+    stream = controls_of(sys.stderr)
+    stream.write(text)
+    stream.flush()

@@ -3,7 +3,15 @@
 from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, stdev
 
-from crossgrad_core.commands import UserError, listed, read_rows, write_table
+from crossgrad_core.commands import (
+    UserError,
+    check_unchanged,
+    drop_checksums,
+    listed,
+    read_rows,
+    write_checksums,
+    write_table,
+)
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
@@ -76,7 +84,9 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
         for run, scene, label, seed in _read_plan(layout, writes=True)
         if run not in known and layout.run(run).is_dir()
     ]
+    drop_checksums(layout.out)
     write_table(layout.plan, [dict(zip(_COLUMNS, row, strict=True)) for row in rows])
+    write_checksums(layout.out, [layout.plan])
 
 
 def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
@@ -104,6 +114,7 @@ def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
     """
     if not layout.plan.is_file():
         return []
+    check_unchanged(layout.out, [layout.plan.name], "remove it: the same sweep writes it again")
     header, *rows = read_rows(layout.plan, "the table of runs", "remove it") or [[]]
     if writes and tuple(header) != _COLUMNS:
         raise UserError(

@@ -2,6 +2,8 @@
 
 import csv
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -222,3 +224,63 @@ def test_costs_are_those_of_the_scenes_that_all_arms_have(tmp_path):
         "views=1": ("1,000", 2),
         "views=2": ("1,000", 1),
     }
+
+
+EVIL = "<img src=x onerror=alert(1)>\"'\n\x1b[31m</title></style><script>alert(1)</script>"
+
+
+class Elements(HTMLParser):
+    """Collects each kind of element with the names of its attributes, and the text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.kinds: set[tuple[str, ...]] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.kinds.add((tag, *(name for name, _ in attrs)))
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def page_with(folder, capsys, name):
+    for seed in range(2):
+        for views in (1, 2):
+            run = RunFolder(
+                scene=name,
+                seed=seed,
+                views_per_step=views,
+                final=20.0 + views,
+                held_out=(name, "b"),
+                regimes={name: 1.0, "near": -1.0},
+            )
+            run.write(folder / f"{views}-{seed}")
+    options = Options(names=(f"views=1:{name}",))
+    app.compare([folder], options, folder / "out", skip_broken=False)
+    said = capsys.readouterr()
+    return (folder / "out" / "index.html").read_text(), said.out + said.err
+
+
+def test_names_make_no_element_and_no_attribute(tmp_path, capsys):
+    plain, _ = page_with(tmp_path / "plain", capsys, "a harmless name")
+    page, said = page_with(tmp_path / "evil", capsys, EVIL)
+    found = Elements(page)
+    assert found.kinds == Elements(plain).kinds
+    assert r"\n\x1b[31m</title></style><script>alert(1)</script>" in found.text
+    assert "\x1b" not in page + said
+    for table in (tmp_path / "evil" / "out").glob("*.csv"):
+        with table.open(newline="", encoding="utf-8") as file:
+            assert len({len(row) for row in csv.reader(file, strict=True)}) == 1, table
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no Chromium")
+def test_a_browser_runs_nothing_of_a_name(tmp_path, capsys):
+    page_with(tmp_path, capsys, EVIL.replace("alert(1)", "document.title='run'"))
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000")
+    page = (tmp_path / "out" / "index.html").as_uri()
+    shown = subprocess.run(
+        ["chromium", *options, "--dump-dom", page], capture_output=True, text=True, check=True
+    )
+    assert "crossgrad compare" in shown.stdout and "<title>run</title>" not in shown.stdout

@@ -127,13 +127,21 @@ def test_latest_takes_run_folder_or_checkpoint(tmp_path: Path):
 
 def test_latest_skips_what_is_incomplete(tmp_path: Path):
     good = save(tmp_path, make_checkpoint(100))
-    (tmp_path / "checkpoints" / "step-000200").mkdir()
     (tmp_path / "checkpoints" / "step-000300").write_text("")
     broken = tmp_path / "checkpoints" / ".scratch-step-000400"
     broken.mkdir()
     (broken / "state.json").write_text("{}")
     (broken / "tensors.safetensors").write_bytes(b"")
     assert latest(tmp_path) == good
+
+
+@pytest.mark.parametrize("name", ["state.json", "tensors.safetensors"])
+def test_a_checkpoint_that_lost_a_file_is_not_passed_over(tmp_path: Path, name: str):
+    save(tmp_path, make_checkpoint(100))
+    (save(tmp_path, make_checkpoint(200)) / name).unlink()
+    with pytest.raises(UserError, match="damaged checkpoint") as told:
+        load_latest(tmp_path)
+    assert told.value.found == f"no {name}" and "goes on from step-000100" in told.value.todo
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "checkpoints"])

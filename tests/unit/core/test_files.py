@@ -1,6 +1,9 @@
 """Files that appear complete or not at all."""
 
 import errno
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -91,3 +94,20 @@ def test_what_a_killed_process_left_half_written_is_cleared(tmp_path: Path):
     (tmp_path / ".my.tmp").write_text("not ours")
     clear_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".my.tmp", "a.png"]
+
+
+def test_in_a_shared_folder_the_files_of_living_processes_stay(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        dead.wait()
+    names = [f".a.png.{number}.tmp" for number in (dead.pid, os.getpid(), os.getppid())]
+    for name in names:
+        (tmp_path / name).touch()
+    clear_leftovers(tmp_path, shared=True)
+    assert [path.name for path in tmp_path.iterdir()] == names[2:]
+    clear_leftovers(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_is_too_long_is_an_error_of_the_user(tmp_path):
+    with pytest.raises(UserError, match="the path is too long"):
+        write_atomically(tmp_path / ("a" * 250), b"")

@@ -119,7 +119,13 @@ def _trained(run: Run) -> frozenset[str]:
 
 
 def _photos(run: Run) -> str:
-    return repr(sorted((n, v.get("photo"), v.get("mask")) for n, v in _views(run).items()))
+    views = _views(run).items()
+    return repr(sorted((n, _mark(v.get("photo")), _mark(v.get("mask"))) for n, v in views))
+
+
+def _mark(file: object) -> object:
+    """Return what runs of all versions know a file by: its size and the digest of its ends."""
+    return [file.get("bytes"), file.get("sha256")] if isinstance(file, dict) else file
 
 
 def _sizes(run: Run) -> str:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from crossgrad_core.commands import one_line, showable
 from crossgrad_plugins.compare.figures.fonts import fall_back, family
 
 if TYPE_CHECKING:
@@ -178,7 +179,8 @@ def variables() -> dict[str, str]:
 
 
 def literal(text: str) -> str:
-    """Text for a legend, which hides what begins with an underscore."""
+    """Return text for a legend, which hides what begins with an underscore."""
+    text = showable(text)
     return f"'{text}'" if text.startswith("_") else text
 
 
@@ -186,7 +188,7 @@ def panel_title(ax: "Axes", scene: str) -> None:
     """Writes a scene's name above its panel, on several lines where the panel is too narrow."""
     place = ax.get_subplotspec()
     beside = 1 if place is None else place.get_gridspec().ncols
-    ax.set_title(wrapped(literal(scene), _LETTERS // beside - _BESIDE), loc="left")
+    ax.set_title(wrapped(literal(one_line(scene)), _LETTERS // beside - _BESIDE), loc="left")
 
 
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:

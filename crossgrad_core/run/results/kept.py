@@ -1,0 +1,82 @@
+"""Files of a run that its checkpoints hold too, so that damage is repaired or noticed."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+from crossgrad_core.contract.state import Json
+from crossgrad_core.run.migration import NOTES
+from crossgrad_core.run.results.config_file import FILE as CONFIG
+from crossgrad_core.run.results.metrics_csv import FILE as METRICS
+from crossgrad_core.run.results.plan_file import FILE as PLAN
+from crossgrad_core.run.resumable import CHANGEABLE
+from crossgrad_core.system.files import write_atomically
+from crossgrad_core.system.input_files import read_file
+from crossgrad_core.system.yaml_values import read_mapping, read_yaml
+from crossgrad_core.wording import listed
+
+#: The scalar of a checkpoint that holds the texts: name of a file -> its content.
+KEY: Final = "files"
+#: What a run that follows the clock writes anew.
+_REVISED: Final = frozenset({"steps", "revisions"})
+
+
+def kept_files(folder: Path) -> dict[str, Json]:
+    """Return the texts of the files that a checkpoint holds, as far as they are there."""
+    found = {name: _content(folder / name) for name in (CONFIG, METRICS, PLAN)}
+    return {name: text.decode(errors="replace") for name, text in found.items() if text is not None}
+
+
+def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
+    """Bring metrics.csv and plan.json to what they were at a checkpoint.
+
+    Rows that were added to metrics.csv later are dropped.
+
+    Args:
+        folder: The run's folder.
+        scalars: The scalars of the checkpoint.
+        step: Its step.
+
+    Returns:
+        A note on each file that was damaged.
+    """
+    notes = []
+    texts = scalars.get(KEY) or {}
+    for name in (METRICS, PLAN):
+        if name not in texts:
+            continue  # There was none, or the checkpoint is of an earlier version.
+        content = texts[name].encode()
+        found = _content(folder / name)
+        if found == content:
+            continue
+        write_atomically(folder / name, content)
+        if found is None or name != METRICS or not found.startswith(content):
+            was = "was gone" if found is None else "was damaged"
+            notes.append(f"{name} {was}: it is restored as it was at step {step}")
+    return tuple(notes)
+
+
+def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a note where config.yaml has other contents than when the checkpoint was written."""
+    text = (scalars.get(KEY) or {}).get(CONFIG)
+    if text is None:
+        return ()
+    was = cast("dict[str, Any]", read_yaml(text))
+    now = read_mapping(folder / CONFIG, "the configuration of the run", "restore the file")
+    names = (was.keys() | now.keys()) - _REVISED - CHANGEABLE
+    changed = sorted(name for name in names if was.get(name) != now.get(name))
+    if not changed:
+        return ()
+    parts = (name if name == NOTES else _difference(name, was, now) for name in changed)
+    return (f"{CONFIG} was edited since its run wrote it: {listed(parts)}",)
+
+
+def _difference(name: str, was: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    return f"{name} {was.get(name)} is now {now.get(name)}"
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return read_file(path)
+    except OSError:
+        return None

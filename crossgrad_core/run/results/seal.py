@@ -1,0 +1,31 @@
+"""SHA256SUMS of a run's folder, written when the run ends."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS
+from crossgrad_core.run.results.lock import FILE as LOCK
+from crossgrad_core.run.results.log import FILE as LOG
+from crossgrad_core.run.results.sources import FILE as SOURCES
+from crossgrad_core.system.checksums import SUMS, write_checksums
+from crossgrad_core.system.files import is_leftover
+
+#: What is written after the run ends, and the checkpoints, which have digests of their own.
+_UNSEALED: Final = frozenset({SUMS, LOCK, LOG, CHECKPOINTS, SOURCES})
+
+
+def seal(folder: Path) -> None:
+    """Write SHA256SUMS with all files of a run that has ended.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    write_checksums(folder, _final_files(folder))
+
+
+def _final_files(folder: Path) -> Iterator[Path]:
+    for path in folder.rglob("*"):
+        own = path.relative_to(folder).parts[0]
+        if path.is_file() and own not in _UNSEALED and not is_leftover(path):
+            yield path

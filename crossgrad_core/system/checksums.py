@@ -1,0 +1,171 @@
+"""SHA256SUMS: the digests of files that are final, in the format of the program `sha256sum`.
+
+A file that was damaged or edited afterwards is found by its digest. A folder without the file, or a
+file that it does not list, is not checked.
+"""
+
+import logging
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import file_digest
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import disk_errors, write_atomically
+from crossgrad_core.system.input_files import open_file, read_file
+from crossgrad_core.wording import one_line
+
+_LOG = logging.getLogger(__name__)
+#: The file in a folder of results.
+SUMS: Final = "SHA256SUMS"
+_LINE: Final = re.compile(r"([0-9a-f]{64})  (.+)")
+#: Names with these signs would need escapes in the file.
+_UNLISTED: Final = re.compile(r"[\n\r\\]")
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with open_file(path) as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+def write_checksums(folder: Path, paths: Iterable[Path]) -> None:
+    """Write SHA256SUMS with the digests of these files, which are below the folder.
+
+    Raises:
+        UserError: The disk is full, or the folder may not be written to.
+    """
+    with disk_errors(folder / SUMS):
+        digests = {path.relative_to(folder).as_posix(): digest_of(path) for path in paths}
+    _write(folder, digests)
+
+
+def drop_checksums(folder: Path) -> None:
+    """Remove SHA256SUMS, before files in the folder change."""
+    with disk_errors(folder / SUMS):
+        (folder / SUMS).unlink(missing_ok=True)
+
+
+@contextmanager
+def relisted(folder: Path, *names: str) -> Iterator[None]:
+    """Let the block replace files of the folder; SHA256SUMS lists what they are afterwards.
+
+    A process that is killed inside the block leaves the files unlisted. A folder without SHA256SUMS
+    gets none.
+
+    Args:
+        folder: The folder.
+        names: Files and folders that the block writes, as paths below the folder.
+    """
+    listed = (folder / SUMS).is_file()
+    rest = {
+        path: digest
+        for path, digest in (read_checksums(folder) if listed else {}).items()
+        if not any(path == name or path.startswith(f"{name}/") for name in names)
+    }
+    if listed:
+        _write(folder, rest)
+    yield
+    if listed:
+        _write(folder, {**rest, **_digests(folder, names)})
+
+
+def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the digests of some files, and of those in some folders."""
+    places = [folder / name for name in names]
+    found = [path for place in places for path in (place, *place.rglob("*")) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): digest_of(path) for path in found}
+
+
+def read_checksums(folder: Path) -> dict[str, str]:
+    """Return name -> digest of the listed files; empty where there is no SHA256SUMS.
+
+    Raises:
+        UserError: A line is not one of `sha256sum`.
+    """
+    path = folder / SUMS
+    try:
+        text = os.fsdecode(read_file(path))
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise _unreadable(path, error.strerror or str(error)) from error
+    found = {}
+    for line in text.splitlines():
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise _unreadable(path, one_line(line))
+        found[match[2]] = match[1]
+    return found
+
+
+def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]:
+    """Return the listed files that are gone or have another digest.
+
+    Args:
+        folder: The folder.
+        names: The files to look at; all that are listed by default.
+
+    Raises:
+        UserError: SHA256SUMS or a file cannot be read.
+    """
+    sums = read_checksums(folder)
+    wanted = sums if names is None else [name for name in names if name in sums]
+    return [name for name in wanted if not _is(folder / name, sums[name])]
+
+
+def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
+    """Refuse files that are not what SHA256SUMS says.
+
+    Args:
+        folder: The folder.
+        names: The files that are going to be read; those that are not listed pass.
+        todo: How to get them again.
+
+    Raises:
+        UserError: Names the first of them.
+    """
+    for name in changed_files(folder, names):
+        raise UserError(
+            f"{name} is not what was written",
+            where=folder / name,
+            expected=f"the SHA-256 that {SUMS} has",
+            found="another one" if (folder / name).is_file() else "no such file",
+            todo=f"{todo}; remove {SUMS} to take the file as it is",
+        )
+
+
+def warn_if_changed(path: Path) -> None:
+    """Warn of a file that differs from the SHA256SUMS beside it; another program may edit it."""
+    if changed_files(path.parent, [path.name]):
+        _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
+
+
+def _is(path: Path, digest: str) -> bool:
+    try:
+        return digest_of(path) == digest
+    except OSError:
+        return False
+
+
+def _write(folder: Path, digests: Mapping[str, str]) -> None:
+    listed = {name: digest for name, digest in digests.items() if not _UNLISTED.search(name)}
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(listed.items()))
+    write_atomically(folder / SUMS, os.fsencode(text))
+
+
+def _unreadable(path: Path, found: str) -> UserError:
+    return UserError(
+        f"unreadable {SUMS}",
+        where=path,
+        expected="lines of a SHA-256 in hexadecimal digits, two spaces and a name",
+        found=found,
+        todo="restore the file from a copy, or remove it: then nothing is checked against it",
+    )
