@@ -79,6 +79,11 @@ class _Bounded(BufferedReader):
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
+def has_alpha(image: "Image") -> bool:
+    """Whether pixels of a photo may be transparent."""
+    return "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
+
+
 def rows_of(image: "Image", top: int, end: int) -> bytes:
     """The pixels of some rows of a photo that has been opened; decodes it if nobody has yet."""
     image.load()

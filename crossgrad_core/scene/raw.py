@@ -46,6 +46,7 @@ class RawScene:
         split: Names of the training and of the test views where the input itself prescribes them.
         background: RGB in [0, 1] to put behind photos with an alpha channel; None where pixels with
             alpha below a half do not count.
+        files: Files that the reader used, except photos and masks.
     """
 
     root: Path
@@ -56,3 +57,4 @@ class RawScene:
     notes: tuple[str, ...] = ()
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background: tuple[float, float, float] | None = None
+    files: tuple[Path, ...] = ()

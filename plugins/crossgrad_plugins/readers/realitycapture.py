@@ -78,8 +78,9 @@ class RealityCaptureReader(Reader):
         inside = Inside(path)
         file = _CSV.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
-        photos = PhotoNames.of(path / images)
-        views = tuple(_view(inside, images, row, photos) for row in _rows(file))
+        rows = _rows(file)
+        photos = PhotoNames.of(path / images, (row.name for row in rows))
+        views = tuple(_view(inside, images, row, photos) for row in rows)
         points = find_points(inside, self.points, "reader.points")
         check_seen(points, views, file)
         posed = f"{count(len(views), 'posed image')} from {file.name}"
@@ -142,8 +143,7 @@ def _wrong(file: Path, expected: str, found: str) -> UserError:
 
 
 def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
-    where = row.fields.where(_NAME)
-    name = photos.full(inside.name(row.name, where))
+    name = photos.full(row.name, inside, row.fields.where(_NAME))
     x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))
