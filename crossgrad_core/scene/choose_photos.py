@@ -8,6 +8,7 @@ from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.decode import FULL_16_BIT
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.ledger import note_unused
 from crossgrad_core.scene.mask_files import check_masks, find_mask_folder, pair_masks
@@ -98,7 +99,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
             distorted=None if fitted.is_pinhole else fitted,
             target=target,
             reduction=reduction,
-            white=white,
+            white=white if header.deep else FULL_16_BIT,
         )
     for name, mask in masks.items():
         source = sources[name]

@@ -41,21 +41,25 @@ def decode_photo(
     Args:
         path: The file.
         reduction: 2, 4 or 8 decode a JPEG file with its sides divided by so much.
-        white: The value of white in a grey photo of 16 bits.
+        white: The value of white in a photo of 16 bits.
 
     Raises:
         UserError: The photo is damaged or of a kind that cannot be shown.
     """
-    return _decode(path, lambda image: _read_photo(image, white), reduction)
+    if white == FULL_16_BIT:
+        return _decode(path, _read_photo, reduction)
+    colors, alpha = _decode_deep(path)
+    scaled = np.rint(colors * (_FULL_8_BIT / white)).clip(0, _FULL_8_BIT).astype(np.uint8)
+    return np.repeat(scaled, 3 // scaled.shape[2], axis=2), alpha
 
 
 def brightest(path: Path) -> int:
-    """Return the largest value of a grey photo of 16 bits.
+    """Return the largest value of a photo of 16 bits.
 
     Raises:
         UserError: The photo is damaged or of a kind that cannot be shown.
     """
-    return int(_decode(path, _read_grey).max())
+    return int(_decode_deep(path)[0].max())
 
 
 def decode_mask(path: Path) -> Pixels:
@@ -140,9 +144,23 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
         return read(image)
 
 
-def _read_photo(image: "Image", white: int) -> tuple[Pixels, Pixels | None]:
+def _decode_deep(path: Path) -> tuple[NDArray[np.int32], Pixels | None]:
+    """Grey [H, W, 1] or RGB [H, W, 3] of a photo of 16 bits, and its alpha in 8 bits, if any."""
+    upper = _decode(path, np.array)
+    if upper.ndim == 2:  # noqa: PLR2004 - grey, which Pillow decodes to 16 bits
+        return upper[..., None].astype(np.int32), None
+    values = upper[..., :3].astype(np.int32) * 256 + _decode(path, _read_lower)[..., :3]
+    return values, upper[..., 3] if upper.shape[2] > 3 else None  # noqa: PLR2004 - alpha
+
+
+def _read_lower(image: "Image") -> Pixels:
+    pillow.take_lower_bytes(image)
+    return np.array(image)
+
+
+def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
     if image.mode.startswith("I"):
-        grey = np.rint(_read_grey(image) * (_FULL_8_BIT / white)).clip(0, _FULL_8_BIT)
+        grey = np.rint(_read_grey(image) * (_FULL_8_BIT / FULL_16_BIT)).clip(0, _FULL_8_BIT)
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), None
     if image.mode == "F":
         raise ValueError("pixels are floating-point numbers; save it as 8 or 16-bit")

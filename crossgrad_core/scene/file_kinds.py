@@ -16,16 +16,19 @@ PHOTO, COPY, MASK, DEPTH = "photo", "smaller copy of a photo", "mask", "depth or
 RAW, POINTS, TABLE = "raw photo", "point file", "CSV file"
 
 _BY_SUFFIX: Final = {
-    **dict.fromkeys((".exr", ".npy", ".npz", ".pfm"), DEPTH),
+    **dict.fromkeys((".exr", ".pfm"), DEPTH),
     **dict.fromkeys((".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"), RAW),
     **dict.fromkeys((".e57", ".las", ".laz", ".pcd", ".ply", ".pts", ".ptx", ".xyz"), POINTS),
     ".csv": TABLE,
 }
 _WORDS: Final = {
-    MASK: frozenset("alpha mask masks matte mattes seg segmentation silhouette silhouettes".split()),
-    DEPTH: frozenset("depth depths disparity normal normals".split()),
+    **dict.fromkeys(("alpha", "mask", "masks", "matte", "mattes", "seg", "segmentation"), MASK),
+    **dict.fromkeys(("silhouette", "silhouettes"), MASK),
+    **dict.fromkeys(("depth", "depths", "disparity", "normal", "normals"), DEPTH),
 }
-_COPIES: Final = re.compile(r".*[a-z]_[248]", re.IGNORECASE)
+_COPIES: Final = re.compile(r"(images|photos|rgb)_[248]")
+#: Files of numbers, of any kind unless a word says which.
+_ARRAYS: Final = frozenset({".npy", ".npz"})
 
 
 def kind_of(name: str) -> str | None:
@@ -35,9 +38,10 @@ def kind_of(name: str) -> str | None:
     """
     path = PurePosixPath(name)
     suffix = path.suffix.lower()
-    if suffix not in IMAGES:
+    if suffix not in IMAGES | _ARRAYS:
         return _BY_SUFFIX.get(suffix)
-    words = {word for part in path.parts for word in re.split("[^a-z]+", part.lower())}
-    said = next((kind for kind, known in _WORDS.items() if words & known), None)
-    copies = any(_COPIES.fullmatch(folder) for folder in path.parts[:-1])
-    return said or (COPY if copies else PHOTO)
+    words = (word for part in path.parts for word in re.split("[^a-z]+", part.lower()))
+    said = next((_WORDS[word] for word in words if word in _WORDS), None)
+    if said or suffix in _ARRAYS:
+        return said
+    return COPY if any(map(_COPIES.fullmatch, path.parts[:-1])) else PHOTO

@@ -5,13 +5,14 @@ import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import TypeAlias
 
 from crossgrad_core.scene.file_kinds import IMAGES
 
 #: How much a file's path is like a name: same folders, number of shared folders at the end, one
-#: path ends with the other, same base name up to letter case, same base name. Greater is more alike.
+#: path ends with the other, same base name up to letter case, same base name. Greater is more.
 _Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]
 
 
@@ -106,7 +107,8 @@ class FileNames:
         """How much a file's path is like a name; None if the folder of the name is there."""
         call = self._called[file]
         own, other = _folders(name), _folders(call)
-        shared = len(os.path.commonprefix([own[::-1], other[::-1]]))
+        pairs = zip(reversed(own), reversed(other), strict=False)
+        shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
         ends = shared in {len(own), len(other)}
         missing = shared < len(own) and own[-1 - shared] in self._folders
         if own != other and (missing or self._aside(file)):

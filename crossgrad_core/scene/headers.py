@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.pillow import has_alpha, opened
+from crossgrad_core.scene.pillow import has_alpha, is_deep, opened
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -32,7 +32,7 @@ class PhotoHeader:
         alpha: Whether pixels may be transparent.
         grey: Whether the photo has no colour.
         reducible: Whether it can be decoded at a reduced size in less memory.
-        deep: Whether it is grey with 16 bits.
+        deep: Whether it is grey, RGB or RGBA with 16 bits a channel.
     """
 
     width: int
@@ -82,7 +82,7 @@ def _describe(image: "Image") -> PhotoHeader:
     grey = image.mode in {"1", "L", "LA", "La", "F"} or image.mode.startswith("I")
     reducible = image.format in {"JPEG", "MPO"} and not image.info.get("progressive")
     return PhotoHeader(
-        *(image.width, image.height, has_alpha(image), grey, reducible, image.mode.startswith("I"))
+        *(image.width, image.height, has_alpha(image), grey, reducible, is_deep(image))
     )
 
 

@@ -15,7 +15,7 @@ from crossgrad_core.scene.wording import count, name_some
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
 #: Folders with a note of their own.
-_MOST: Final = 6
+_MOST: Final = 8
 
 
 def note_unused(raw: RawScene, used: Collection[Path], masks: Path | None) -> list[str]:
@@ -42,13 +42,17 @@ def note_unused(raw: RawScene, used: Collection[Path], masks: Path | None) -> li
     for name, reason in reasons.items():
         path = PurePosixPath(name)
         groups[path.parent.as_posix(), reason].append(path.name)
+    listed = sorted(groups.items())
     notes = [
         f"unused: {count(len(names), 'file')} in {_shown(raw, folder)} "
         f"({name_some(sorted(names))}), {reason}"
-        for (folder, reason), names in sorted(groups.items())
+        for (folder, reason), names in listed[:_MOST]
     ]
-    rest = len(notes) - _MOST
-    return notes if rest <= 1 else [*notes[:_MOST], f"unused: files of {rest} more kinds or folders"]
+    if rest := listed[_MOST:]:
+        number = sum(len(names) for _, names in rest)
+        folders = sorted({_shown(raw, folder) for (folder, _), _ in rest})
+        notes.append(f"unused: {count(number, 'more file')} in {name_some(folders)}")
+    return notes
 
 
 def _files(root: Path) -> Iterator[str]:

@@ -37,6 +37,9 @@ def with_photo_names(raw: RawScene) -> RawScene:
         if which
     ]
     views = tuple(replace(view, name=moved.get(view.name, view.name)) for view in raw.views)
+    if raw.split is not None:
+        train, test = (frozenset(moved.get(name, name) for name in part) for part in raw.split)
+        raw = replace(raw, split=(train, test))
     return replace(raw, views=views, notes=(*raw.notes, *notes))
 
 

@@ -54,7 +54,7 @@ class PhotoSource:
         distorted: The calibration to undistort with, in the size above; None for a pinhole.
         target: (width, height) as trained.
         reduction: What the file's width and height are divided by while it is decoded.
-        white: The value of white if the file is grey with 16 bits.
+        white: The value of white, if the file has 16 bits a channel.
     """
 
     path: Path

@@ -1,6 +1,8 @@
 """Photo files through Pillow: which formats, how many pixels, and every fault as one error."""
 
 import os
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
@@ -23,6 +25,7 @@ MOST_PIXELS: Final = 178_956_970
 # What cameras and tools for masks write. Pillow knows more, among them formats that run programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
 _LOCK = Lock()
+_DEEP = re.compile("RGBA?;16[BLN]")
 
 
 @contextmanager
@@ -82,6 +85,30 @@ class _Bounded(BufferedReader):
 def has_alpha(image: "Image") -> bool:
     """Whether pixels of a photo may be transparent."""
     return "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
+
+
+def is_deep(image: "Image") -> bool:
+    """Whether a photo, not decoded yet, is grey, RGB or RGBA with 16 bits a channel."""
+    return image.mode.startswith("I") or any(map(_DEEP.fullmatch, _stored_modes(image)))
+
+
+def take_lower_bytes(image: "Image") -> None:
+    """Let a colour photo of 16 bits be decoded to its lower bytes; by default the upper are taken.
+
+    Pillow knows no colours of 16 bits. It takes the other byte where the byte order is the other.
+    """
+    other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
+    image.tile = [
+        (*place, other_mode if isinstance(args, str) else (other_mode, *args[1:]))
+        for (*place, args), mode in zip(image.tile, _stored_modes(image), strict=True)
+        for other_mode in (mode[:-1] + other[mode[-1]],)
+    ]
+
+
+def _stored_modes(image: "Image") -> list[str]:
+    """How the pixels of each part of a photo are stored, such as `RGB;16B`."""
+    arguments = (tile[3] for tile in getattr(image, "tile", ()))
+    return [str(args[0] if isinstance(args, tuple) and args else args) for args in arguments]
 
 
 def rows_of(image: "Image", top: int, end: int) -> bytes:

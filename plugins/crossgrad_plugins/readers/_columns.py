@@ -28,7 +28,8 @@ class Columns:
         Comments may come before that line.
         """
         head = head_of(path)
-        text = head.decode("utf-16" if head[:2] in {b"\xff\xfe", b"\xfe\xff"} else "utf-8", "replace")
+        wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
+        text = head.decode("utf-16" if wide else "utf-8", "replace")
         tables = (cls(column_names(line.split(sign)), sign)
                   for line in text.splitlines() for sign in _DELIMITERS)  # fmt: skip
         return max(tables, key=lambda each: len(known & {*each.names}), default=cls((), ","))
