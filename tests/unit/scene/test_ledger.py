@@ -1,4 +1,4 @@
-"""Every photo, mask, depth map, point file and table of a scene is used, or listed with a reason."""
+"""Photos, masks, depth, points and tables of a scene are used, or listed with a reason."""
 
 import shutil
 
