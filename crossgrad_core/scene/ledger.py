@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -18,7 +18,7 @@ _OWN_FILES: Final = frozenset({"report.png"})
 _MOST: Final = 8
 
 
-def note_unused(raw: RawScene, used: Collection[Path], masks: Path | None) -> list[str]:
+def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list[str]:
     """Return a note for each folder and reason: photos, masks, depth, points and tables not used.
 
     Photos without a pose in the photo folder are left out: they have a note of their own.
@@ -28,18 +28,8 @@ def note_unused(raw: RawScene, used: Collection[Path], masks: Path | None) -> li
         used: Files that are used, in addition to those of the reader.
         masks: The folder of the masks, if any.
     """
-    known = {os.path.abspath(path) for path in (*used, *raw.files)}
-    files = [name for name in _files(raw.root) if os.path.abspath(raw.root / name) not in known]
-    reasons = {name: reason for name in files if (reason := _reason(name, raw, masks))}
-    if reasons:
-        true = set(map(os.path.realpath, known))
-        reasons = {
-            name: reason
-            for name, reason in reasons.items()
-            if os.path.realpath(raw.root / name) not in true
-        }
     groups = defaultdict[tuple[str, str], list[str]](list)
-    for name, reason in reasons.items():
+    for name, reason in _unused(raw, [*used, *raw.files], masks).items():
         path = PurePosixPath(name)
         groups[path.parent.as_posix(), reason].append(path.name)
     listed = sorted(groups.items())
@@ -55,6 +45,21 @@ def note_unused(raw: RawScene, used: Collection[Path], masks: Path | None) -> li
     return notes
 
 
+def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str, str]:
+    """Files that are not used, as they are or through links, and the reasons."""
+    known, home = set(map(os.path.abspath, used)), os.path.abspath(raw.root)
+    files = [name for name in _files(raw.root) if os.path.join(home, name) not in known]
+    reasons = {name: reason for name in files if (reason := _reason(name, raw, masks))}
+    if not reasons:
+        return {}
+    true = set(map(os.path.realpath, known))
+    return {
+        name: reason
+        for name, reason in reasons.items()
+        if os.path.realpath(os.path.join(home, name)) not in true
+    }
+
+
 def _files(root: Path) -> Iterator[str]:
     """Paths of the files below a scene, without hidden ones and what crossgrad writes."""
     for below, folders, files in walked(root):
@@ -64,7 +69,7 @@ def _files(root: Path) -> Iterator[str]:
         folders[:] = [name for name in folders if not name.startswith((".", "__"))]
         for name in files:
             if not name.startswith(".") and name not in _OWN_FILES:
-                yield (PurePosixPath(below) / name).as_posix()
+                yield name if below == "." else f"{below}/{name}"
 
 
 def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:

@@ -23,7 +23,6 @@ class PhotoFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.names = tuple(sorted(_list_photos(path)))
-        self._files = FileNames(self.names, aside=lambda name: kind_of(name) is not PHOTO)
 
     def pair(self, names: Collection[str]) -> Pairs:
         """Find the photo of each posed image; see `FileNames`.
@@ -32,7 +31,11 @@ class PhotoFolder:
             names: What the poses call the photos.
         """
         there = {name: name for name in names if self._holds(name)}
-        pairs = self._files.pair([name for name in names if name not in there], there)
+        rest = [name for name in names if name not in there]
+        if not rest:
+            return Pairs(there, {})
+        files = FileNames(self.names, aside=lambda name: kind_of(name) is not PHOTO)
+        pairs = files.pair(rest, there)
         return replace(pairs, files={**there, **pairs.files})
 
     def _holds(self, name: str) -> bool:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 from typing_extensions import override
 
@@ -98,10 +98,11 @@ def take_lower_bytes(image: "Image") -> None:
     Pillow knows no colours of 16 bits. It takes the other byte where the byte order is the other.
     """
     other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
-    image.tile = [
-        (*place, other_mode if isinstance(args, str) else (other_mode, *args[1:]))
-        for (*place, args), mode in zip(image.tile, _stored_modes(image), strict=True)
-        for other_mode in (mode[:-1] + other[mode[-1]],)
+    modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
+    file: Any = image  # Types of Pillow know `tile` for opened files alone.
+    file.tile = [
+        (*tile[:3], mode if isinstance(tile[3], str) else (mode, *tile[3][1:]))
+        for tile, mode in zip(file.tile, modes, strict=True)
     ]
 
 
