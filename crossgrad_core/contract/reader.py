@@ -18,6 +18,13 @@ class Reader(Component):
     def accepts(self, path: Path) -> bool:
         """Whether the folder looks like something this reader can read."""
 
+    def nearly_accepts(self, path: Path) -> bool:
+        """Whether a file in the folder is nearly of this reader's format.
+
+        It is asked if no reader accepts the folder. `read` then says what the file lacks.
+        """
+        return False
+
     @abstractmethod
     def read(self, path: Path, options: SceneOptions) -> Scene:
         """The scene.

@@ -1,7 +1,7 @@
 """From a configuration to a Setup: read, select, object, or say what was left out."""
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,15 +65,25 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
                 found=f"files of the readers {listed(able)}",
                 todo=f"choose one, such as --reader {able[0]}",
             )
-        # No reader recognises it: the default one explains what it misses.
-        name = able[0] if able else READER
+        # If no reader recognises the folder, one of them explains what it misses.
+        near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
+        name = (*able, *near, READER)[0]
     return build(Reader, name, config.reader.options).read(path, config.reading), name
 
 
 def accepts(name: str, path: Path) -> bool:
     """Whether a reader takes the folder; one that fails does not keep the others from it."""
+    return _answer(name, lambda reader: reader.accepts(path))
+
+
+def nearly_accepts(name: str, path: Path) -> bool:
+    """Whether a file in the folder is nearly of a reader's format; see `accepts`."""
+    return _answer(name, lambda reader: reader.nearly_accepts(path))
+
+
+def _answer(name: str, question: Callable[[Reader], bool]) -> bool:
     try:
-        return build(Reader, name, {}).accepts(path)
+        return question(build(Reader, name, {}))
     except Exception as error:
         _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
         return False

@@ -12,6 +12,7 @@ from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene.blank_photos import without_blank_photos
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
+from crossgrad_core.scene.photo_names import with_photo_names
 from crossgrad_core.scene.photo_store import PhotoStore, store_folder
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
 from crossgrad_core.scene.raw import RawScene, RawView
@@ -36,6 +37,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     Raises:
         UserError: The input cannot be trained on; says what is wrong, where, and what to do.
     """
+    raw = with_photo_names(raw)
     check_views(raw)
     points, point_notes = check_points(raw)
     photos = choose_photos(raw, options)

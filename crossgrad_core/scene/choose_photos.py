@@ -8,14 +8,12 @@ from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.decode import FULL_16_BIT
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
-from crossgrad_core.scene.photo_files import (
-    PhotoFolder,
-    check_masks,
-    find_mask,
-    find_mask_folder,
-    find_photo_folders,
-)
+from crossgrad_core.scene.ledger import note_unused
+from crossgrad_core.scene.mask_files import check_masks, find_mask_folder, pair_masks
+from crossgrad_core.scene.photo_bits import white_of
+from crossgrad_core.scene.photo_files import PhotoFolder, find_photo_folders
 from crossgrad_core.scene.photo_notes import (
     note_kinds,
     note_links,
@@ -39,7 +37,7 @@ class ChosenPhotos:
     Attributes:
         sources: View name -> how its photo is decoded; views without a photo are not in it.
         pinholes: View name -> calibration of the photo as trained.
-        notes: What was left out, undistorted, resized or masked.
+        notes: What was left out, undistorted, resized or masked, and files that are not used.
     """
 
     sources: Mapping[str, PhotoSource]
@@ -74,6 +72,7 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
     full = _read_full(folders[0], names)
     found, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
     masks = _find_masks(raw, options, tuple(found.paths))
+    white, white_notes = white_of([found.paths[n] for n, h in found.headers.items() if h.deep])
     sources: dict[str, PhotoSource] = {}
     pinholes: dict[str, Pinhole] = {}
     shared: dict[Calibration, Calibration] = {}
@@ -100,19 +99,24 @@ def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
             distorted=None if fitted.is_pinhole else fitted,
             target=target,
             reduction=reduction,
+            white=white if header.deep else FULL_16_BIT,
         )
     for name, mask in masks.items():
         source = sources[name]
         check_mask(mask, (source.width, source.height), may_turn=source.orientation != 1)
+    used = [*full.paths.values(), *found.paths.values(), *masks.values()]
+    started = [options.init_file] if options.init_file else []
     notes = (
-        *note_pairing(full.folder, full.paths, names),
+        *note_pairing(full.folder, full.paths, names, used),
         *note_links(raw.root, sources),
         *reduced_notes,
         *note_undistortion(sources),
         *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),
         *note_reductions(sources),
+        *white_notes,
         *note_kinds(sources, found.headers, raw.background),
         *note_memory(sources, options),
+        *note_unused(raw, [*used, *started], find_mask_folder(options.masks, raw.root)),
     )
     return ChosenPhotos(sources, pinholes, notes)
 
@@ -139,9 +143,7 @@ def _read_found(folder: PhotoFolder, paths: Mapping[str, Path]) -> _Found:
 
 
 def _pair(folder: PhotoFolder, names: Sequence[str]) -> dict[str, Path]:
-    posed = frozenset(names)
-    pairs = ((name, folder.find(name, posed)) for name in names)
-    return {name: path for name, path in pairs if path is not None}
+    return {name: folder.path / file for name, file in folder.pair(names).files.items()}
 
 
 def _prefer_reduced(
@@ -207,7 +209,6 @@ def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> d
     named = {view.name: view.mask for view in raw.views if view.mask and view.name in found}
     if folder is None or (named and options.masks is None):
         return named
-    pairs = ((name, find_mask(folder, name)) for name in names)
-    masks = {name: path for name, path in pairs if path is not None}
+    masks = pair_masks(folder, names)
     check_masks(folder, options.masks, len(masks), names)
     return masks

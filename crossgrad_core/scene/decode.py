@@ -20,14 +20,20 @@ Pixels = NDArray[np.uint8]
 
 RESIZE_FILTER = "scikit-image resize, anti-aliased"
 
-_FULL_8_BIT, _FULL_16_BIT = 255, 65535
+_FULL_8_BIT, FULL_16_BIT = 255, 65535
+#: White of files that store 1, 8, 10, 12, 14 or 16 bits.
+WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
+#: A mask of black and white has at most this share of pixels farther than a tenth from both.
+_MOST_GREY = 0.05
 #: Bytes of a photo that are taken over at once: they stay in the processor's cache.
 _BAND = 1 << 19
 #: Standard deviations at which SciPy cuts its Gaussians off.
 _WIDTHS = 4.0
 
 
-def decode_photo(path: Path, reduction: int = 1) -> tuple[Pixels, Pixels | None]:
+def decode_photo(
+    path: Path, reduction: int = 1, white: int = FULL_16_BIT
+) -> tuple[Pixels, Pixels | None]:
     """A photo as [H, W, 3] RGB and, where it has any, its [H, W] alpha channel.
 
     Grey, palette, CMYK and 16-bit photos become 8-bit RGB. EXIF rotation is not applied.
@@ -35,24 +41,38 @@ def decode_photo(path: Path, reduction: int = 1) -> tuple[Pixels, Pixels | None]
     Args:
         path: The file.
         reduction: 2, 4 or 8 decode a JPEG file with its sides divided by so much.
+        white: The value of white in a photo of 16 bits.
 
     Raises:
         UserError: The photo is damaged or of a kind that cannot be shown.
     """
-    return _decode(path, _read_photo, reduction)
+    if white == FULL_16_BIT:
+        return _decode(path, _read_photo, reduction)
+    colors, alpha = _decode_deep(path)
+    scaled = np.rint(colors * (_FULL_8_BIT / white)).clip(0, _FULL_8_BIT).astype(np.uint8)
+    return np.repeat(scaled, 3 // scaled.shape[2], axis=2), alpha
+
+
+def brightest(path: Path) -> int:
+    """Return the largest value of a photo of 16 bits.
+
+    Raises:
+        UserError: The photo is damaged or of a kind that cannot be shown.
+    """
+    return int(_decode_deep(path)[0].max())
 
 
 def decode_mask(path: Path) -> Pixels:
     """A mask as [H, W], 255 where the pixel counts: where it is at least half white.
 
-    White is 1 in a mask whose values are only 0 and 1.
+    White is the value of a full pixel in the fewest bits that hold all values: 1, 255, 4095 ...
+    If transparency varies and the colours are not black and white, opaque is white.
 
     Raises:
         UserError: The mask is damaged or of a kind that cannot be shown.
     """
-    grey = _decode(path, _read_grey)
-    top = int(grey.max())
-    white = 1 if top <= 1 else _FULL_8_BIT if top <= _FULL_8_BIT else _FULL_16_BIT
+    grey = _decode(path, _read_mask)
+    white = next(white for white in WHITES if white >= min(grey.max(), FULL_16_BIT))
     return np.where(grey >= (white + 1) // 2, _FULL_8_BIT, 0).astype(np.uint8)
 
 
@@ -124,13 +144,27 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
         return read(image)
 
 
+def _decode_deep(path: Path) -> tuple[NDArray[np.int32], Pixels | None]:
+    """Grey [H, W, 1] or RGB [H, W, 3] of a photo of 16 bits, and its alpha in 8 bits, if any."""
+    upper = _decode(path, np.array)
+    if upper.ndim == 2:  # noqa: PLR2004 - grey, which Pillow decodes to 16 bits
+        return upper[..., None].astype(np.int32), None
+    values = upper[..., :3].astype(np.int32) * 256 + _decode(path, _read_lower)[..., :3]
+    return values, upper[..., 3] if upper.shape[2] > 3 else None  # noqa: PLR2004 - alpha
+
+
+def _read_lower(image: "Image") -> Pixels:
+    pillow.take_lower_bytes(image)
+    return np.array(image)
+
+
 def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
     if image.mode.startswith("I"):
-        grey = np.rint(_read_grey(image) * (_FULL_8_BIT / _FULL_16_BIT)).clip(0, _FULL_8_BIT)
+        grey = np.rint(_read_grey(image) * (_FULL_8_BIT / FULL_16_BIT)).clip(0, _FULL_8_BIT)
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), None
     if image.mode == "F":
         raise ValueError("pixels are floating-point numbers; save it as 8 or 16-bit")
-    if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}:
+    if pillow.has_alpha(image):
         rgba = np.array(image.convert("RGBA"))
         return rgba[..., :3].copy(), rgba[..., 3].copy()
     return _colours(image if image.mode == "RGB" else image.convert("RGB")), None
@@ -151,3 +185,20 @@ def _read_grey(image: "Image") -> NDArray[np.int32]:
     """[H, W], in the file's own range: up to 255, or up to 65535."""
     wide = image if image.mode.startswith("I") else image.convert("L")
     return np.array(wide).astype(np.int32)
+
+
+def _read_mask(image: "Image") -> NDArray[np.int32]:
+    """[H, W] grey, or alpha if it varies and the colours are not black and white."""
+    if image.mode.startswith("I") or not pillow.has_alpha(image):
+        return _read_grey(image)
+    grey, alpha = (np.array(part).astype(np.int32) for part in image.convert("LA").split())
+    if alpha.min() == alpha.max() or _is_black_and_white(grey):
+        return grey
+    return alpha
+
+
+def _is_black_and_white(grey: NDArray[np.int32]) -> bool:
+    """Whether both are there, and hardly anything between them."""
+    black, white = grey < _FULL_8_BIT // 10, grey > _FULL_8_BIT - _FULL_8_BIT // 10
+    neither = 1.0 - float(black.mean() + white.mean())
+    return bool(black.any() and white.any() and neither <= _MOST_GREY)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.pillow import opened
+from crossgrad_core.scene.pillow import has_alpha, is_deep, opened
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -32,6 +32,7 @@ class PhotoHeader:
         alpha: Whether pixels may be transparent.
         grey: Whether the photo has no colour.
         reducible: Whether it can be decoded at a reduced size in less memory.
+        deep: Whether it is grey, RGB or RGBA with 16 bits a channel.
     """
 
     width: int
@@ -39,6 +40,7 @@ class PhotoHeader:
     alpha: bool
     grey: bool
     reducible: bool = False
+    deep: bool = False
 
     def reduced(self, by: int) -> "PhotoHeader":
         """The photo decoded with each side divided by 1, 2, 4 or 8."""
@@ -77,10 +79,11 @@ def read_quarter_turn(path: Path) -> int | None:
 
 
 def _describe(image: "Image") -> PhotoHeader:
-    alpha = "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
     grey = image.mode in {"1", "L", "LA", "La", "F"} or image.mode.startswith("I")
     reducible = image.format in {"JPEG", "MPO"} and not image.info.get("progressive")
-    return PhotoHeader(image.width, image.height, alpha, grey, reducible)
+    return PhotoHeader(
+        *(image.width, image.height, has_alpha(image), grey, reducible, is_deep(image))
+    )
 
 
 def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:

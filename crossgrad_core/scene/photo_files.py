@@ -1,33 +1,15 @@
-"""Finding the file of every posed photo, and of its mask, by name."""
+"""Finding the file of every posed photo by name."""
 
 import os
-import unicodedata
-from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.heif import SUFFIXES
-from crossgrad_core.scene.wording import name_some
+from crossgrad_core.scene.file_kinds import IMAGES, PHOTO, kind_of
+from crossgrad_core.scene.file_names import FileNames, Pairs, is_absolute
 from crossgrad_core.system.input_files import is_file
 
-_SUFFIXES = frozenset(
-    {
-        ".avif",
-        ".bmp",
-        ".gif",
-        ".jp2",
-        ".jpeg",
-        ".jpg",
-        ".pgm",
-        ".png",
-        ".ppm",
-        ".tif",
-        ".tiff",
-        ".webp",
-    }
-    | {*SUFFIXES}
-)
 _REDUCED = (2, 4, 8)
 
 
@@ -40,28 +22,26 @@ class PhotoFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.names = _list_photos(path)
-        self._exact = frozenset(self.names)
-        self._loose: Mapping[str, list[str]] = defaultdict(list)
-        for name in self.names:
-            self._loose[_fold(name)].append(name)
+        self.names = tuple(sorted(_list_photos(path)))
 
-    def find(self, name: str, posed: Container[str]) -> Path | None:
-        """The photo of that name; failing that, the only one that differs in suffix or case.
+    def pair(self, names: Collection[str]) -> Pairs:
+        """Find the photo of each posed image; see `FileNames`.
 
         Args:
-            name: What the pose calls the photo.
-            posed: All names with a pose: their own photos stand in for no other.
+            names: What the poses call the photos.
         """
-        if name in self._exact or is_file(self.path / name):
-            return self.path / name
-        alike = [other for other in self._loose.get(_fold(name), ()) if other not in posed]
-        return self.path / alike[0] if len(alike) == 1 else None
+        there = {name: name for name in names if self._holds(name)}
+        rest = [name for name in names if name not in there]
+        if not rest:
+            return Pairs(there, {})
+        files = FileNames(self.names, aside=lambda name: kind_of(name) is not PHOTO)
+        pairs = files.pair(rest, there)
+        return replace(pairs, files={**there, **pairs.files})
 
-    def others(self, used: Iterable[Path]) -> list[str]:
-        """Names of the photos that are not among `used`."""
-        known = set(used)
-        return [name for name in self.names if self.path / name not in known]
+    def _holds(self, name: str) -> bool:
+        """Whether a file of that name is there, whatever its suffix says."""
+        inside = not is_absolute(name) and ".." not in PurePosixPath(name).parts
+        return inside and is_file(self.path / name)
 
 
 def find_photo_folders(images: Path) -> list[PhotoFolder]:
@@ -81,57 +61,6 @@ def find_photo_folders(images: Path) -> list[PhotoFolder]:
             todo=f"put the photos into {images.name}/, or name their folder",
         )
     return folders
-
-
-def mask_names(name: str) -> tuple[str, ...]:
-    """What the mask of a photo may be called in a folder of masks, the first that is there.
-
-    `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
-    `aerial/0001_mask.png` (Metashape) or `aerial/0001.jpg`.
-    """
-    stem = str(PurePosixPath(name).with_suffix(""))
-    return f"{name}.png", f"{stem}.png", f"{stem}_mask.png", name
-
-
-def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of a photo; None where it has none."""
-    return next(filter(is_file, (folder / each for each in mask_names(name))), None)
-
-
-def find_mask_folder(option: Path | None, root: Path) -> Path | None:
-    """The mask folder: the option's, as given or within the scene; else `<scene>/masks`, if any.
-
-    Raises:
-        UserError: The option names a folder that is not there.
-    """
-    if option is None:
-        return root / "masks" if (root / "masks").is_dir() else None
-    for folder in (option, root / option):
-        if folder.is_dir():
-            return folder
-    raise UserError(
-        "the mask folder is not there",
-        where=option,
-        todo="name a folder, as it is or within the scene: --set reading.masks=FOLDER",
-    )
-
-
-def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[str]) -> None:
-    """Refuses a mask folder that was asked for and fits no photo.
-
-    Raises:
-        UserError: No photo has a mask in it.
-    """
-    if option is None or found:
-        return
-    there = PhotoFolder(folder).names
-    raise UserError(
-        "no photo has a mask in the mask folder",
-        where=folder,
-        expected=f"{names[0]}.png for the photo {names[0]}",
-        found=name_some(there) or "no mask",
-        todo="name the masks after their photos, or leave reading.masks out",
-    )
 
 
 def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -164,16 +93,10 @@ def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list
         yield Path(base).relative_to(folder).as_posix(), folders, files
 
 
-def _list_photos(folder: Path) -> tuple[str, ...]:
-    """Names of all photos below a folder, sorted, with forward slashes."""
-    names = []
+def _list_photos(folder: Path) -> list[str]:
+    """Names of all photos below a folder, with forward slashes."""
+    names: list[str] = []
     for below, _, files in walked(folder):
         prefix = "" if below == "." else below + "/"
-        names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in _SUFFIXES]
-    return tuple(sorted(names))
-
-
-def _fold(name: str) -> str:
-    """What two spellings of one photo's name share: neither suffix, case nor Unicode form."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    return unicodedata.normalize("NFC", stem).casefold()
+        names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in IMAGES]
+    return names

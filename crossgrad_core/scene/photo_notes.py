@@ -2,12 +2,13 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.scene import pillow
 from crossgrad_core.scene.decode import RESIZE_FILTER
+from crossgrad_core.scene.file_kinds import PHOTO, kind_of
 from crossgrad_core.scene.headers import PhotoHeader
 from crossgrad_core.scene.photo_files import PhotoFolder
 from crossgrad_core.scene.photos import PhotoSource
@@ -19,10 +20,14 @@ _SHOWN_SIZES = 3
 Sources = Mapping[str, PhotoSource]
 
 
-def note_pairing(folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str]) -> list[str]:
+def note_pairing(
+    folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str], used: Collection[Path]
+) -> list[str]:
     """Posed images without a photo, photos without a pose, and pairs that differ in spelling."""
     absent = [name for name in names if name not in paths]
-    spare = folder.others(paths.values())
+    known = frozenset(used)
+    others = [name for name in folder.names if folder.path / name not in known]
+    spare = [name for name in others if kind_of(name) is PHOTO]
     renamed = [name for name, path in paths.items() if path != folder.path / name]
     told = (
         (absent, "posed image", "left out, the photo is missing"),
@@ -102,7 +107,12 @@ def note_kinds(
         (sum(header.grey for header in headers.values()), "photos", "grey: three equal channels"),
         (sum(s.mask is not None for s in sources.values()), "masks", "have one: white counts"),
     )
-    return [f"{topic}: {number} of {total} {what}" for number, topic, what in told if number]
+    bare = [name for name, source in sorted(sources.items()) if source.mask is None]
+    missing = f"{len(bare)} of {total} have none, all of their pixels count: {name_some(bare)}"
+    return [
+        *(f"{topic}: {number} of {total} {what}" for number, topic, what in told if number),
+        *([f"masks: {missing}"] if bare and len(bare) < total else []),
+    ]
 
 
 def note_memory(sources: Sources, options: SceneOptions) -> list[str]:

@@ -16,7 +16,15 @@ from typing_extensions import override
 from crossgrad_core.contract.scene import Photo
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.decode import Pixels, blend, decode_mask, decode_photo, resize, turn
+from crossgrad_core.scene.decode import (
+    FULL_16_BIT,
+    Pixels,
+    blend,
+    decode_mask,
+    decode_photo,
+    resize,
+    turn,
+)
 from crossgrad_core.scene.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.shapes import is_turned
 
@@ -46,6 +54,7 @@ class PhotoSource:
         distorted: The calibration to undistort with, in the size above; None for a pinhole.
         target: (width, height) as trained.
         reduction: What the file's width and height are divided by while it is decoded.
+        white: The value of white, if the file has 16 bits a channel.
     """
 
     path: Path
@@ -58,6 +67,7 @@ class PhotoSource:
     distorted: Calibration | None
     target: tuple[int, int]
     reduction: int = 1
+    white: int = FULL_16_BIT
 
     @property
     def may_mask(self) -> bool:
@@ -98,7 +108,7 @@ class PhotoSource:
         Raises:
             UserError: The photo or its mask is damaged or has changed its size.
         """
-        rgb, alpha = decode_photo(self.path, self.reduction)
+        rgb, alpha = decode_photo(self.path, self.reduction, self.white)
         rgb = turn(rgb, self.orientation)
         self._check_size(rgb)
         keep = self._decode_mask()

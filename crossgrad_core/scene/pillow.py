@@ -1,12 +1,14 @@
 """Photo files through Pillow: which formats, how many pixels, and every fault as one error."""
 
 import os
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 from typing_extensions import override
 
@@ -23,6 +25,7 @@ MOST_PIXELS: Final = 178_956_970
 # What cameras and tools for masks write. Pillow knows more, among them formats that run programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
 _LOCK = Lock()
+_DEEP = re.compile("RGBA?;16[BLN]")
 
 
 @contextmanager
@@ -77,6 +80,36 @@ class _Bounded(BufferedReader):
         """The next bytes; all that are left where no number is given."""
         left = max(0, self._size - self.tell())
         return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def has_alpha(image: "Image") -> bool:
+    """Whether pixels of a photo may be transparent."""
+    return "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
+
+
+def is_deep(image: "Image") -> bool:
+    """Whether a photo, not decoded yet, is grey, RGB or RGBA with 16 bits a channel."""
+    return image.mode.startswith("I") or any(map(_DEEP.fullmatch, _stored_modes(image)))
+
+
+def take_lower_bytes(image: "Image") -> None:
+    """Let a colour photo of 16 bits be decoded to its lower bytes; by default the upper are taken.
+
+    Pillow knows no colours of 16 bits. It takes the other byte where the byte order is the other.
+    """
+    other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
+    modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
+    file: Any = image  # Types of Pillow know `tile` for opened files alone.
+    file.tile = [
+        (*tile[:3], mode if isinstance(tile[3], str) else (mode, *tile[3][1:]))
+        for tile, mode in zip(file.tile, modes, strict=True)
+    ]
+
+
+def _stored_modes(image: "Image") -> list[str]:
+    """How the pixels of each part of a photo are stored, such as `RGB;16B`."""
+    arguments = (tile[3] for tile in getattr(image, "tile", ()))
+    return [str(args[0] if isinstance(args, tuple) and args else args) for args in arguments]
 
 
 def rows_of(image: "Image", top: int, end: int) -> bytes:

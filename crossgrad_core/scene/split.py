@@ -8,6 +8,7 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.file_names import FileNames
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_core.system.input_files import read_file
 
@@ -174,7 +175,7 @@ def has_lists(root: Path) -> bool:
 
 def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], frozenset[str]] | None:
     """The lists that are there; where there is only one, the other is the rest of the views."""
-    train, test = _read_list(root / TRAIN_LIST), _read_list(root / TEST_LIST)
+    train, test = (_read_list(root / file, names) for file in (TRAIN_LIST, TEST_LIST))
     if train is None and test is None:
         return None
     if train is None or test is None:
@@ -183,7 +184,8 @@ def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], froze
     return train, test
 
 
-def _read_list(path: Path) -> frozenset[str] | None:
+def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
+    """The names in a list, if it is there; those that stand for a view as the view's name."""
     if not path.is_file():
         return None
     try:
@@ -195,5 +197,7 @@ def _read_list(path: Path) -> frozenset[str] | None:
             found=str(error),
             todo="save it as text in UTF-8, one name a line, or remove it",
         ) from error
-    names = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
-    return frozenset(name for name in names if name and not name.startswith("#"))
+    cleaned = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
+    names = [name for name in cleaned if name and not name.startswith("#")]
+    found = FileNames(views).pair(names).files
+    return frozenset(found.get(name, name) for name in names)

@@ -17,7 +17,9 @@ _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
 
-def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[list[str]]:
+def read_rows(
+    path: Path, what: str, todo: str, *, whole: bool = False, delimiter: str = ","
+) -> list[list[str]]:
     """The rows of a CSV file in UTF-8; empty lines are rows without cells.
 
     Args:
@@ -25,14 +27,16 @@ def read_rows(path: Path, what: str, todo: str, *, whole: bool = False) -> list[
         what: What cannot be read, should it be so, such as `the list of labels`.
         todo: What to do about it.
         whole: Leave out a last line that has no end.
+        delimiter: The sign between two cells.
 
     Raises:
         UserError: The file is missing or is not CSV, or too large.
     """
     try:
-        content = read_file(path, _CSV)
+        content = read_file(path, {**_CSV, delimiter.encode(): _CSV[b","]})
         text = (content[: content.rfind(b"\n") + 1] if whole else content).decode("utf-8-sig")
-        return list(csv.reader(io.StringIO(text, newline=""), strict=True))
+        lines = io.StringIO(text, newline="")
+        return list(csv.reader(lines, delimiter=delimiter, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         found = getattr(error, "strerror", None) or str(error)
         raise UserError(f"{what} cannot be read", where=path, found=found, todo=todo) from error

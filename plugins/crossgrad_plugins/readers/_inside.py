@@ -8,10 +8,13 @@ import posixpath
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 from typing import Final
 
-from crossgrad_core.plugin import UserError
+from crossgrad_core.plugin import UserError, is_file
+from crossgrad_core.scene.file_kinds import MASK, PHOTO, POINTS, kind_of
+from crossgrad_core.scene.file_names import FileNames, is_absolute, same_spelling
+from crossgrad_core.scene.photo_files import walked
 from crossgrad_core.scene.raw_checks import LONGEST_NAME, LONGEST_PART, is_possible_name
 
 #: Folders that tell training views from held-out ones and nothing else.
@@ -32,6 +35,27 @@ class Inside:
     def _true(self) -> str:
         return os.path.realpath(self.scene)
 
+    @cached_property
+    def _files(self) -> list[str]:
+        """Paths of all files below the scene."""
+        tree = ((PurePosixPath(below), files) for below, _, files in walked(self.scene))
+        return [(below / file).as_posix() for below, files in tree for file in files]
+
+    @cached_property
+    def photos(self) -> FileNames:
+        """The photos of the scene, to be found by the end of their path."""
+        return FileNames(name for name in self._files if kind_of(name) == PHOTO)
+
+    @cached_property
+    def masks(self) -> FileNames:
+        """The masks of the scene, likewise."""
+        return FileNames(name for name in self._files if kind_of(name) == MASK)
+
+    @cached_property
+    def points(self) -> FileNames:
+        """The point files of the scene, likewise."""
+        return FileNames(name for name in self._files if kind_of(name) == POINTS)
+
     def name(self, text: str, where: object, base: str = "") -> str:
         """A name relative to the folder `base` of the scene, as a plain one below the scene.
 
@@ -40,12 +64,34 @@ class Inside:
         """
         if not is_possible_name(text):
             raise _impossible(where, text)
-        slashed = text.replace("\\", "/")
-        plain = posixpath.normpath(posixpath.join(base, slashed))
-        absolute = slashed.startswith("/") or PureWindowsPath(text).drive
-        if absolute or plain in {".", ".."} or plain.startswith("../"):
+        plain = self._plain(text, base)
+        if plain is None:
             raise _outside(where, repr(text))
         return plain
+
+    def found(self, text: str, where: object, base: str, files: FileNames) -> str:
+        """Like `name`; a name of no file stands for the one whose path ends as the name does.
+
+        Raises:
+            UserError: There is no such file, and the name leads out of the scene.
+        """
+        plain = self._plain(text, base)
+        if plain is None or not is_file(self.scene / plain):
+            other = files.find(plain or text)
+            # Suffix and case are left as they are: the photo is paired and noted later.
+            if other is not None and (plain is None or not same_spelling(plain, other)):
+                return other
+        return self.name(text, where, base)
+
+    def _plain(self, text: str, base: str) -> str | None:
+        """A name as a plain one below the scene; None where it leads out of the scene."""
+        slashed = text.replace("\\", "/")
+        for root in (os.path.abspath(self.scene), self._true):
+            if slashed.startswith(os.path.join(root, "")):
+                slashed, base = os.path.relpath(slashed, root), ""
+        plain = posixpath.normpath(posixpath.join(base, slashed))
+        leads_out = is_absolute(slashed) or plain in {".", ".."} or plain.startswith("../")
+        return None if leads_out else plain
 
     def file(self, name: str, where: object) -> Path:
         """The file of a plain name, there or not; may be a link, for folders that are made of them.

@@ -1,40 +1,32 @@
 """Photos of a folder by what other programs call them: with or without folder or suffix."""
 
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from crossgrad_core.scene.photo_files import walked
+from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_plugins.readers._inside import Inside
 
 
 @dataclass(frozen=True)
 class PhotoNames:
-    """Names of the files below a folder.
+    """Names that a file of poses gives to the photos of a folder.
 
     Attributes:
-        exact: All of them.
-        short: Names without folders, with and without suffix -> the names that they can stand for.
+        files: Such a name -> the one photo below the folder that it stands for.
     """
 
-    exact: frozenset[str]
-    short: Mapping[str, frozenset[str]]
+    files: Mapping[str, str]
 
     @classmethod
-    def of(cls, folder: Path) -> "PhotoNames":
-        """The files below a folder; none where it is not there."""
-        exact, short = set(), defaultdict(set)
-        for below, _, files in walked(folder):
-            for file in files:
-                name = (PurePosixPath(below) / file).as_posix()
-                exact.add(name)
-                for spelling in {file, PurePosixPath(file).stem}:
-                    short[spelling].add(name)
-        return cls(frozenset(exact), {key: frozenset(names) for key, names in short.items()})
+    def of(cls, folder: Path, names: Iterable[str]) -> "PhotoNames":
+        """The photos below a folder; none where it is not there."""
+        return cls(PhotoFolder(folder).pair(frozenset(names)).files)
 
-    def full(self, name: str) -> str:
-        """The one file that a name stands for; the name itself where there is none, or several."""
-        if name in self.exact:
-            return name
-        alike = self.short.get(PurePosixPath(name).name, frozenset())
-        return min(alike) if len(alike) == 1 else name
+    def full(self, name: str, inside: Inside, where: object) -> str:
+        """The photo that a name stands for; the plain name itself where there is none, or several.
+
+        Raises:
+            UserError: There is none, and the name leads out of the scene.
+        """
+        return self.files.get(name) or inside.name(name, where)

@@ -67,7 +67,7 @@ def find_points(
         UserError: The named file leads out of the scene, is not there or cannot be read.
     """
     if named is not None:
-        name = inside.name(named, where, base)
+        name = inside.found(named, where, base, inside.points)
         return _placed(read_points(inside.file(name, where), name), frame)
     for usual in USUAL:
         name = inside.name(usual, where, base)

@@ -30,6 +30,7 @@ def raw_scene(
         points=points.positions,
         point_colors=points.colors,
         notes=notes,
+        files=(inside.scene / points.source,) if points.source else (),
     )
 
 

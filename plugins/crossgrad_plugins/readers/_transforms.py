@@ -67,7 +67,7 @@ def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
     Raises:
         UserError: It leads out of the scene.
     """
-    name = inside.name(text, where, base)
+    name = inside.found(text, where, base, inside.photos)
     bare = not PurePosixPath(name).suffix
     if not is_file(inside.scene / name) and (bare or is_file(inside.scene / f"{name}.png")):
         name += ".png"
@@ -92,7 +92,8 @@ def read_frame(
     photo = photo_name(inside, frame.text("file_path"), frame.where("file_path"), base)
     mask = None
     if "mask_path" in frame:
-        name = inside.name(frame.text("mask_path"), frame.where("mask_path"), base)
+        where = frame.where("mask_path")
+        name = inside.found(frame.text("mask_path"), where, base, inside.masks)
         mask = _existing(inside.scene / name, frame)
     matrix = transform_of(frame, "transform_matrix")
     rotation = rotation_of(matrix[:, :3])
@@ -165,7 +166,8 @@ def _says_fisheye(fields: Fields) -> bool | None:
 def _size(inside: Inside, holder: Callable[[str], Fields], photo: str) -> tuple[int, int]:
     if "w" in holder("w") and "h" in holder("h"):
         return holder("w").side("w"), holder("h").side("h")
-    header = read_header(inside.scene / photo)
+    there = is_file(inside.scene / photo)
+    header = read_header(inside.scene / (photo if there else inside.photos.find(photo) or photo))
     return header.width, header.height
 
 

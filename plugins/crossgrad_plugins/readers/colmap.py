@@ -11,6 +11,7 @@ from typing_extensions import override
 from crossgrad_core.numerics.rotations import matrix_rows
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, is_file
 from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.photo_names import with_photo_names
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import (
@@ -101,14 +102,16 @@ def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
         f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
         f"{os.path.relpath(folder, path)} ({form})"
     )
-    return RawScene(
-        root=path,
-        images=path / images,
-        views=_make_views(model, folder),
-        points=model.points,
-        point_colors=model.colors,
-        notes=tuple(notes),
-        files=model_files(folder),
+    return with_photo_names(
+        RawScene(
+            root=path,
+            images=path / images,
+            views=_make_views(model, folder),
+            points=model.points,
+            point_colors=model.colors,
+            notes=tuple(notes),
+            files=model_files(folder),
+        )
     )
 
 

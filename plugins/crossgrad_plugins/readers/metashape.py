@@ -95,7 +95,7 @@ class MetashapeReader(Reader):
         cameras, notes = _cameras(chunk, file)
         world, where, place = _world(chunk, file, cameras, self.frame)
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
-        photos = PhotoNames.of(path / images)
+        photos = PhotoNames.of(path / images, (camera.label for camera in cameras))
         views = tuple(_view(inside, each, sensors, photos, world) for each in cameras)
         points = find_points(inside, self.points, "reader.points")
         other = "chunk" if self.frame == "local" else "local"
@@ -308,7 +308,7 @@ def _view(
     fields = camera.fields
     if camera.sensor not in sensors:
         fields.wrong("sensor_id", "a sensor of the file")
-    name = photos.full(inside.name(camera.label, fields.where("label")))
+    name = photos.full(camera.label, inside, fields.where("label"))
     return raw_view(
         name, sensors[camera.sensor], from_opencv(camera.rotation, camera.center, world)
     )

@@ -68,7 +68,7 @@ class OpenSfmReader(Reader):
         images = inside.name(self.images, "reader.images")
         cameras = {name: _camera(fields) for name, fields in chosen.members("cameras").items()}
         shots = chosen.members("shots")
-        photos = PhotoNames.of(path / images)
+        photos = PhotoNames.of(path / images, shots)
         views = tuple(_view(inside, photos, each, cameras) for each in shots.items())
         points = _points(chosen)
         head = (
@@ -167,7 +167,7 @@ def _view(
     camera = shot.text("camera")
     if camera not in cameras:
         shot.wrong("camera", f"a camera of the file, such as {min(cameras, default='(none)')}")
-    return raw_view(photos.full(inside.name(name, shot.here)), cameras[camera], _pose(shot))
+    return raw_view(photos.full(name, inside, shot.here), cameras[camera], _pose(shot))
 
 
 def _pose(shot: Fields) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ pitch 0 looking down, in degrees; x east, y north, alt up.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +23,7 @@ from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._columns import Columns, column_names
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
 from crossgrad_plugins.readers._kind import Kind
@@ -32,11 +33,13 @@ from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
-from crossgrad_plugins.readers._sniff import head_of
 
-_NAME: Final = "#name"
+_NAME: Final = "name"
 _POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_NEEDED: Final = frozenset({_NAME, *_POSE, "f"})
+#: A file with this many of the columns is meant to be one of RealityCapture.
+_NEARLY: Final = 5
 _SENSOR: Final = 36.0  # mm
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
@@ -44,13 +47,17 @@ _TODO: Final = (
 
 
 def _has_columns(path: Path) -> bool:
-    line = head_of(path).decode("utf-8-sig", errors="replace").partition("\n")[0]
-    return {_NAME, *_POSE, "f"} <= {cell.strip(' "\r') for cell in line.split(",")}
+    return {*Columns.of(path, _NEEDED).names} >= _NEEDED
+
+
+def _has_most_columns(path: Path) -> bool:
+    return len(_NEEDED & {*Columns.of(path, _NEEDED).names}) >= _NEARLY
 
 
 _CSV: Final = Kind(
     *("CSV", "RealityCapture", ".csv", _has_columns),
-    f"one file with the columns {_NAME}, {', '.join((*_POSE, 'f'))} ...",
+    f"one file with the columns #{_NAME}, {', '.join((*_POSE, 'f'))} ...",
+    _has_most_columns,
 )
 
 
@@ -73,18 +80,24 @@ class RealityCaptureReader(Reader):
         return bool(_CSV.find(Inside(path), self.file))
 
     @override
+    def nearly_accepts(self, path: Path) -> bool:
+        return bool(_CSV.find_near(Inside(path)))
+
+    @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
         file = _CSV.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
-        photos = PhotoNames.of(path / images)
-        views = tuple(_view(inside, images, row, photos) for row in _rows(file))
+        rows = _rows(file)
+        photos = PhotoNames.of(path / images, (row.name for row in rows))
+        views = tuple(_view(inside, images, row, photos) for row in rows)
         points = find_points(inside, self.points, "reader.points")
         check_seen(points, views, file)
         posed = f"{count(len(views), 'posed image')} from {file.name}"
         note = f"RealityCapture: {posed}, {points.note}"
         raw = raw_scene(inside, images, views, points, note)
+        raw = replace(raw, files=(*raw.files, file))
         return by_gps(build_scene(raw, options), raw)
 
 
@@ -97,35 +110,44 @@ class _Row:
 
 
 def _rows(file: Path) -> list[_Row]:
-    """The rows with photos; empty ones are passed over.
+    """The rows with photos; empty ones and comments are passed over.
 
     Raises:
         UserError: The file cannot be read, lacks a column, or a row has another number of cells.
     """
-    rows = read_rows(file, "the CSV of RealityCapture", _TODO)
-    header = [cell.strip() for cell in rows[0]] if rows else []
-    missing = [name for name in (_NAME, *_POSE, "f") if name not in header]
+    columns = Columns.of(file, _NEEDED)
+    rows = read_rows(file, "the CSV of RealityCapture", _TODO, delimiter=columns.delimiter)
+    header = columns.names
+    missing = [name for name in (f"#{_NAME}", *_POSE, "f") if name.strip("#") not in header]
     if missing:
         raise _wrong(file, f"a column {missing[0]}", ", ".join(header) or "an empty file")
     twice = [name for name in header if name and header.count(name) > 1]
     if twice:
         raise _wrong(file, "a name for each column", f"two columns {twice[0]}")
+    first = next((i for i, row in enumerate(rows) if column_names(row) == header), None)
+    if first is None:
+        raise _wrong(file, "a header without quotes", "quotes before the header, or in it")
     found = []
-    for number, row in enumerate(rows[1:], 2):
-        if len(row) != len(header) and row:
+    for number, row in enumerate(rows[first + 1 :], first + 2):
+        cells = [cell.strip(' "') for cell in row]
+        if not any(cells) or (cells[0].startswith("#") and len(cells) != len(header)):
+            continue
+        if len(cells) < len(header) or any(cells[len(header) :]):
             raise _wrong(file, f"{len(header)} cells in line {number}", f"{len(row)} cells")
-        if row:
-            cells = dict(zip(header, row, strict=True))
-            found.append(_Row(cells[_NAME], _numbers(cells, file, number)))
+        named = dict(zip(header, cells, strict=False))
+        found.append(_Row(named[_NAME], _numbers(named, file, number)))
     return found
 
 
 def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
-    """The cells of a row with what is a number as one; others are refused when they are used."""
+    """The cells of a row with what is a number as one; others are refused when they are used.
+
+    Numbers may have a comma in place of the decimal point.
+    """
     values: dict[str, object] = {}
     for name, cell in cells.items():
         try:
-            values[name] = float(cell) if "_" not in cell else cell
+            values[name] = float(cell.replace(",", ".")) if "_" not in cell else cell
         except ValueError:
             values[name] = cell
     return Fields(values, file, f"line {number}")
@@ -142,8 +164,7 @@ def _wrong(file: Path, expected: str, found: str) -> UserError:
 
 
 def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
-    where = row.fields.where(_NAME)
-    name = photos.full(inside.name(row.name, where))
+    name = photos.full(row.name, inside, row.fields.where(_NAME))
     x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))

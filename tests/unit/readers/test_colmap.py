@@ -247,6 +247,7 @@ class TestPhotos:
         path = make()
         (path / "images").rename(path / "moved")
         (path / "images").mkdir()
+        shutil.copytree(path / "moved", path / "images" / "cam1")
         (path / "moved").rename(path / "images" / "cam0")
         refuses(path, "no posed image has a photo", "0000.png", "cam0/0000.png")
 

@@ -78,6 +78,29 @@ def test_masks_keep_white(mask, mode, tmp_path):
     np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), np.where(GREY > 127, 255, 0))
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_white_of_a_mask_is_that_of_the_bits_it_uses(bits, tmp_path):
+    wide = np.where(GREY > 127, 2**bits - 1, 0).astype(np.uint16)
+    Image.fromarray(wide).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), np.where(GREY > 127, 255, 0))
+
+
+@pytest.mark.parametrize("colors", ["white", "black", "the photo"])
+def test_the_mask_is_the_alpha_if_only_alpha_is_black_and_white(colors, tmp_path):
+    alpha = np.where(GREY > 127, 255, 0).astype(np.uint8)
+    rgb = {"white": RGB * 0 + 255, "black": RGB * 0, "the photo": RGB}[colors]
+    Image.fromarray(np.dstack([rgb, alpha]).astype(np.uint8)).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), alpha)
+
+
+@pytest.mark.parametrize("alpha", [255, 128, GREY])
+def test_a_mask_in_black_and_white_is_no_matter_of_its_alpha(alpha, tmp_path):
+    mask = np.where(GREY > 127, 255, 0).astype(np.uint8)
+    layers = np.dstack([mask, mask, mask, np.broadcast_to(alpha, mask.shape)])
+    Image.fromarray(layers.astype(np.uint8)).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), mask)
+
+
 def test_a_black_mask_keeps_nothing(tmp_path):
     Image.new("L", (60, 40)).save(tmp_path / "m.png")
     assert not decode_mask(tmp_path / "m.png").any()

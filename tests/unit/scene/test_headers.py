@@ -90,7 +90,8 @@ def test_a_photo_that_may_not_be_read_is_named(tmp_path):
 )
 def test_transparency_and_grey_are_seen(mode, alpha, grey, tmp_path):
     Image.new(mode, (60, 40)).save(tmp_path / "a.png")
-    assert read_header(tmp_path / "a.png") == PhotoHeader(60, 40, alpha, grey)
+    header = PhotoHeader(60, 40, alpha, grey, deep=mode == "I;16")
+    assert read_header(tmp_path / "a.png") == header
 
 
 @pytest.mark.parametrize(("orientation", "turn"), [(1, None), (3, None), (6, 6), (8, 8), (0, None)])

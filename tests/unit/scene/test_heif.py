@@ -41,7 +41,7 @@ def test_photos_are_found_by_the_suffix(tmp_path):
     (tmp_path / "IMG_1.HEIC").write_bytes(HEAD)
     folder = PhotoFolder(tmp_path)
     assert folder.names == ("IMG_1.HEIC",)
-    assert folder.find("img_1.jpg", {"img_1.jpg"}) == tmp_path / "IMG_1.HEIC"
+    assert folder.pair(["img_1.jpg"]).files == {"img_1.jpg": "IMG_1.HEIC"}
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 import pytest
 from PIL import Image
 
-from crossgrad_core.scene.photo_files import PhotoFolder, find_mask
+from crossgrad_core.scene.mask_files import find_mask
+from crossgrad_core.scene.photo_files import PhotoFolder
 
 LONGEST = "a" * 251 + ".png"
 
@@ -15,8 +16,7 @@ def test_a_name_without_room_for_a_suffix_has_no_mask_of_that_name(tmp_path):
 
 
 def test_a_name_that_is_too_long_has_no_photo(tmp_path):
-    assert PhotoFolder(tmp_path).find("a" * 300 + ".png", ()) is None
-    assert PhotoFolder(tmp_path).find("a/" * 3000 + "b.png", ()) is None
+    assert not PhotoFolder(tmp_path).pair(["a" * 300 + ".png", "a/" * 3000 + "b.png"]).files
 
 
 def test_a_mask_is_called_as_other_programs_call_it_the_first_that_is_there(tmp_path):
@@ -30,4 +30,4 @@ def test_a_mask_is_called_as_other_programs_call_it_the_first_that_is_there(tmp_
 @pytest.mark.parametrize("suffix", [".avif", ".gif", ".webp", ".JPG"])
 def test_a_photo_may_have_another_suffix_than_its_pose_says(tmp_path, suffix):
     (tmp_path / f"one{suffix}").touch()
-    assert PhotoFolder(tmp_path).find("one.png", ()) == tmp_path / f"one{suffix}"
+    assert PhotoFolder(tmp_path).pair(["one.png"]).files == {"one.png": f"one{suffix}"}

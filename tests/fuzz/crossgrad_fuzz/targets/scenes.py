@@ -10,7 +10,15 @@ import numpy as np
 from PIL import Image
 
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.scene import build, calibration, choose_photos, frame, photo_files, raw_checks
+from crossgrad_core.scene import (
+    build,
+    calibration,
+    choose_photos,
+    frame,
+    mask_files,
+    photo_files,
+    raw_checks,
+)
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import camera_centers, make_frame
 from crossgrad_core.scene.raw import RawScene, RawView
@@ -174,7 +182,8 @@ SCENE = Target(
     parser={
         _colmap_folder: ("check_scene_folder", "_check_not_within_sparse", "_similar_folder"),
         build: (),
-        photo_files: ("find_mask", "find_mask_folder", "check_masks", "find_photo_folders"),
+        mask_files: ("find_mask", "find_mask_folder", "check_masks"),
+        photo_files: ("find_photo_folders",),
         choose_photos: ("_find_masks", "_prefer_reduced"),
     },
     words=(

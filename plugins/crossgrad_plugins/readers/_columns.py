@@ -1,0 +1,43 @@
+"""The header of a table in a text file: its line, its separator and the names of its columns."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crossgrad_plugins.readers._sniff import head_of
+
+_DELIMITERS: Final = (",", ";", "\t")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a table.
+
+    Attributes:
+        names: In lower case, without a `#` before the first one.
+        delimiter: The sign between two cells.
+    """
+
+    names: tuple[str, ...]
+    delimiter: str
+
+    @classmethod
+    def of(cls, path: Path, known: frozenset[str]) -> "Columns":
+        """The columns of a file: of the line among its first ones with most of the known names.
+
+        Comments may come before that line.
+        """
+        head = head_of(path)
+        wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
+        text = head.decode("utf-16" if wide else "utf-8", "replace")
+        tables = (cls(column_names(line.split(sign)), sign)
+                  for line in text.splitlines() for sign in _DELIMITERS)  # fmt: skip
+        return max(tables, key=lambda each: len(known & {*each.names}), default=cls((), ","))
+
+
+def column_names(cells: list[str]) -> tuple[str, ...]:
+    """The names of columns in the cells of a header, without empty ones at the end."""
+    names = [cell.strip(' "\r\ufeff').lstrip("#").strip().lower() for cell in cells]
+    while names and not names[-1]:
+        names.pop()
+    return tuple(names)
