@@ -114,12 +114,17 @@ class Calibration:
         extra = [self.params[i] for i in self._camera.extra_params_idxs()]
         return self.model in _PINHOLE_AT_ZERO and not any(extra)
 
+    @property
+    def without_distortion(self) -> Pinhole:
+        """The focal lengths and the principal point alone."""
+        return self._read_pinhole(self._camera)
+
     def resized(self, width: int, height: int) -> "Calibration":
         """The calibration of the same photos resampled to `width` x `height`."""
         if (width, height) == (self.width, self.height):
             return self
         if self.is_pinhole:
-            pinhole = self._read_pinhole(self._camera).resized(width, height)
+            pinhole = self.without_distortion.resized(width, height)
             params = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)
             return Calibration("PINHOLE", width, height, params)
         camera = self._make_camera()
@@ -134,7 +139,7 @@ class Calibration:
             UserError: The model has no pinhole equivalent.
         """
         if self.is_pinhole:
-            return self._read_pinhole(self._camera)
+            return self.without_distortion
         whole, (left, top, right, bottom) = self._whole, self._box
         return replace(
             whole,
@@ -183,7 +188,7 @@ class Calibration:
     def reached(self) -> NDArray[np.bool_]:
         """[H, W] whether a pixel of `pinhole` shows the photo, and no ray beyond a fold."""
         white = np.full((self.height, self.width), _WHITE, dtype=np.uint8)
-        shown = self.undistort(white) == _WHITE
+        shown: NDArray[np.bool_] = self.undistort(white) == _WHITE
         return shown & self._reach.mask(self.pinhole) if self._reach.folds else shown
 
     @cached_property

@@ -127,7 +127,7 @@ def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> Lens
     areas = 0.5 * np.abs(down[..., 0] * across[..., 1] - down[..., 1] * across[..., 0])
     middles = 0.25 * (plane[1:, 1:] + plane[:-1, :-1] + plane[1:, :-1] + plane[:-1, 1:])
     beyond = reach.beyond(middles)
-    corners = np.isfinite(pixels).all(axis=2)
+    corners = np.asarray(np.isfinite(pixels).all(axis=2))
     whole = corners[1:, 1:] & corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:]
     shown = float(areas[whole & ~beyond].sum()) / (camera.width * camera.height)
     x = [-frame.cx / frame.fx, (frame.width - frame.cx) / frame.fx]
@@ -170,7 +170,7 @@ def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
         around = np.roll(pixels, -1, axis=0)[:, 1:] - pixels[:, 1:]
         turned = along[..., 0] * around[..., 1] - along[..., 1] * around[..., 0]
         grows = (radius[:, 1:] > radius[:, :-1]) & (turned > 0.0)
-    return np.where(grows.all(axis=1), grows.shape[1], np.argmin(grows, axis=1))
+    return np.asarray(np.where(grows.all(axis=1), grows.shape[1], np.argmin(grows, axis=1)))
 
 
 def _seen(

@@ -20,6 +20,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.ellipsoid import place_at
@@ -32,7 +33,7 @@ from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import at, by_gps
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opencv
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import head_of
@@ -97,7 +98,7 @@ class MetashapeReader(Reader):
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
         photos = PhotoNames.of(path / images)
         views = tuple(_view(inside, each, sensors, photos, world) for each in cameras)
-        points = find_points(inside, self.points, "reader.points")
+        points = find_points(inside, options, self.points, "reader.points")
         other = "chunk" if self.frame == "local" else "local"
         check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
         head = f"Metashape: {count(len(views), 'posed image')} from {file.name}, {points.note}"

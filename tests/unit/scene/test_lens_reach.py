@@ -66,7 +66,7 @@ def test_pixels_beyond_the_fold_do_not_count(
     assert not calibration.fills_frame
     assert not counted[radius >= fold].any()
     # All but the last pixel of the photo before the fold, which many undistorted pixels share.
-    camera = calibration._camera  # noqa: SLF001
+    camera = calibration._camera
     rim = camera.img_from_cam(np.array([[fold, 0.0, 1.0]]))[0, 0] - WIDTH / 2
     steps = np.linspace(0.0, fold, 2000)
     rays = np.stack([steps, np.zeros_like(steps), np.ones_like(steps)], 1)
@@ -102,7 +102,7 @@ def test_each_counted_pixel_of_any_lens_is_the_first_to_show_its_place(seed: int
     ends = np.stack([(columns + 0.5 - frame.cx) / frame.fx, (rows + 0.5 - frame.cy) / frame.fy], 1)
     steps = np.linspace(0.0, 1.0, 100)[:, None, None]
     rays = np.concatenate([steps * ends, np.ones((100, len(ends), 1))], 2).reshape(-1, 3)
-    pixels = calibration._camera.img_from_cam(rays).reshape(100, -1, 2)  # noqa: SLF001
+    pixels = calibration._camera.img_from_cam(rays).reshape(100, -1, 2)
     radius = np.linalg.norm((pixels - pixels[0]) / [100, 105], axis=2)
     assert (np.diff(radius, axis=0) > 0.0).all()
     inside = (pixels[-1] >= 0.0) & (pixels[-1] <= [WIDTH, HEIGHT])
