@@ -36,7 +36,7 @@ def read(path, **options):
     return ColmapReader().read(path, SceneOptions(**options))
 
 
-def write_ply(path, xyz=XYZ, rgb=RGB, kind="double", color="uchar", form="ascii", faces=False):
+def write_ply(path, xyz=XYZ, rgb=RGB, *, kind="double", color="uchar", form="ascii", faces=False):
     """A PLY of points as scanners and other programs write them."""
     scale = {"uchar": 1, "ushort": 257, "float": 1 / 255}
     names = [(kind, axis) for axis in "xyz"]
@@ -66,7 +66,9 @@ def write_ply(path, xyz=XYZ, rgb=RGB, kind="double", color="uchar", form="ascii"
 @pytest.mark.parametrize("kind", ["float", "double"])
 @pytest.mark.parametrize("color", ["uchar", "ushort", "float"])
 def test_plys_of_all_kinds_have_the_same_points(form, kind, color, tmp_path):
-    cloud = read_cloud(write_ply(tmp_path / "a.ply", XYZ, RGB, kind, color, form, True), "a.ply")
+    cloud = read_cloud(
+        write_ply(tmp_path / "a.ply", kind=kind, color=color, form=form, faces=True), "a.ply"
+    )
     np.testing.assert_array_equal(cloud.positions, XYZ)
     np.testing.assert_array_equal(cloud.colors, RGB)
 
