@@ -1,4 +1,4 @@
-"""The rays that a lens maps to pixels one to one, and what undistortion to a pinhole loses."""
+"""The rays that a lens maps to pixels one to one, and the losses of undistortion to a pinhole."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -100,7 +100,7 @@ class LensReach:
 
 @dataclass(frozen=True)
 class LensCost:
-    """What undistortion to a pinhole camera loses.
+    """The losses of undistortion to a pinhole camera.
 
     Attributes:
         seen: Degrees that the photo sees along its longer side.
@@ -116,7 +116,7 @@ class LensCost:
 
 
 def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> LensCost:
-    """What a camera loses where its photos are undistorted to `frame`."""
+    """Return the losses of a camera whose photos are undistorted to `frame`."""
     u = np.linspace(0.0, frame.width, _CELLS + 1)
     v = np.linspace(0.0, frame.height, _CELLS + 1)
     plane = _plane(frame, *np.meshgrid(u, v))

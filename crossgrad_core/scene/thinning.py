@@ -13,6 +13,8 @@ FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
 #: Cubes of this many sizes are tried, until at least this share of the wanted points is left.
 _TRIES, _ENOUGH = 12, 0.8
+#: Points that are looked at to find how large a cloud is.
+_SAMPLED: Final = 100_000
 #: Points on surfaces: their number falls with the square of the side.
 _SURFACE: Final = 2.0
 #: Rows and layers of cubes, as odd factors of a hash.
@@ -33,17 +35,19 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
     rows, side = _one_per_cube(points.xyz, most)
     chosen = np.zeros(count, dtype=np.bool_)
     chosen[rows] = True
-    note = (
-        f"points: {len(rows):,} of {count:,} kept, one from each cube with a side of {side:.3g} "
-        "input units (--set reading.max_points=N keeps more)"
-    )
-    return points.selected(chosen), [note]
+    how = f"from each cube with a side of {side:.3g} input units" if side else "of so many"
+    kept = f"{len(rows):,} of {count:,} kept, one {how}"
+    return points.selected(chosen), [f"points: {kept} (--set reading.max_points=N keeps more)"]
 
 
 def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64], float]:
-    """Rows of the first point in each cube, at most `most`, and the side of the cubes."""
-    low = np.percentile(xyz, 1.0, axis=0)
-    span = float((np.percentile(xyz, 99.0, axis=0) - low).max())
+    """Rows of the first point in each cube, at most `most`, and the side of the cubes.
+
+    Where no cubes are that few, the points are evenly spread over the file, and the side is 0.
+    """
+    sample = xyz[:: -(-len(xyz) // _SAMPLED)]
+    low, high = np.percentile(sample, [1.0, 99.0], axis=0)
+    span = float((high - low).max())
     side = max(span, _SMALLEST) / most ** (1.0 / _SURFACE)
     best = np.arange(0, len(xyz), -(-len(xyz) // most))
     best_side, few, many = 0.0, np.inf, 0.0

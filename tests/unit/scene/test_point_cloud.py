@@ -184,6 +184,7 @@ def test_thinning_copes_with_odd_clouds(odd):
     else:
         xyz[:, 1:] = 0.0
     points = CheckedPoints(xyz, np.zeros((5000, 3), dtype=np.uint8), np.arange(5000))
+    assert len(thinned(points, 1)[0].xyz) == 1
     kept, notes = thinned(points, 100)
     assert 1 <= len(kept.xyz) <= 100
     assert odd == "one place" or len(kept.xyz) >= 50
