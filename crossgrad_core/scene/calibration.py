@@ -206,10 +206,10 @@ class Calibration:
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        if self._reach.folds or self._reach.wide:
-            smallest = self._undistorted(options)
-            if smallest.width <= options.min_scale * self.width:
-                options.min_scale = 1.0
+        # This also refuses models without a pinhole, before their reach is asked for.
+        smallest = self._undistorted(options).width <= options.min_scale * self.width
+        if smallest and (self._reach.folds or self._reach.wide):
+            options.min_scale = 1.0
         return options
 
     @cached_property
