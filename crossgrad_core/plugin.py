@@ -99,6 +99,7 @@ from crossgrad_core.run.results.lines import (
 from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 from crossgrad_core.system.files import atomic_file, size_text
 from crossgrad_core.system.input_files import is_file, open_file, read_file
+from crossgrad_core.system.ply_table import read_vertices, vertex_properties
 from crossgrad_core.system.terminal import controls_of, shows_bar
 from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.wording import listed, showable
@@ -225,6 +226,7 @@ __all__ = [
     "read_file",
     "read_json",
     "read_rows",
+    "read_vertices",
     "screen_statistics",
     "set_for_nothing",
     "shortness",
@@ -233,5 +235,6 @@ __all__ = [
     "size_text",
     "transformed",
     "unit_range",
+    "vertex_properties",
     "without_rounding",
 ]

@@ -32,8 +32,19 @@ class SceneOptions(BaseModel):
     )
     init: Annotated[str, Flag("points|random|PLY", SCENE)] = Field(
         "points",
-        description="Where training starts: the scene's points, random ones, or a PLY file. "
-        "Default: points.",
+        description="Where training starts: the scene's points, random ones, or a PLY of "
+        "Gaussians. Default: points.",
+    )
+    points: Annotated[Path | None, Flag("FILE", SCENE)] = Field(
+        None,
+        description="Point cloud (PLY, LAS, LAZ) in place of the scene's points, in the "
+        "coordinates of its cameras.",
+    )
+    max_points: int | None = Field(
+        None,
+        ge=1,
+        description="most points that are taken of a point cloud, which is thinned evenly; default "
+        "1,000 per photo, at least 100,000",
     )
     cache_mib: int = Field(1280, ge=16, description="memory for decoded photos, MiB")
     disk_mib: int = Field(

@@ -66,7 +66,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     Raises:
         UserError: It cannot be read, lies elsewhere, or the run was trained on all of its views.
     """
-    reading = {"split": "none", "masks": None, "init": "random"}  # It need not have any.
+    reading = {"split": "none", "masks": None, "init": "random", "points": None}
     config = setup.config.model_copy(
         update={
             "reading": setup.config.reading.model_copy(update=reading),

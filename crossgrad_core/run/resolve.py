@@ -30,8 +30,12 @@ def resolved(setup: Setup) -> RunConfig:
     if "grouping" in components:
         chosen["grouping"] = _choice(names["grouping"], components["grouping"])
     scene = None if config.scene is None else Path(config.scene).resolve()
-    path = config.reading.init_file
-    init = config.reading.init if path is None else str(path.resolve())
+    reading, path = config.reading, config.reading.init_file
+    located = {
+        "init": reading.init if path is None else str(path.resolve()),
+        "points": _located(reading.points),
+        "masks": _located(reading.masks),
+    }
     known = config.exposure_from
     return config.model_copy(
         update={
@@ -41,7 +45,7 @@ def resolved(setup: Setup) -> RunConfig:
             "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,
-            "reading": config.reading.model_copy(update={"init": init}),
+            "reading": reading.model_copy(update=located),
             "exposure_from": None if known is None else known.resolve(),
             "out": None,
             "views_per_step": selection.views.setting,
@@ -55,6 +59,11 @@ def resolved(setup: Setup) -> RunConfig:
             "max_gaussians": bound_of(setup),
         }
     )
+
+
+def _located(path: Path | None) -> Path | None:
+    """The whole path of what is there; any other path is one within the scene."""
+    return path.resolve() if path is not None and path.exists() else path
 
 
 def _final_decay(config: RunConfig, setup: Setup) -> float:

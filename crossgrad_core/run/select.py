@@ -1,5 +1,6 @@
 """The components of a run: those it names and the usual ones, fitted to its scene."""
 
+from pathlib import Path
 from typing import Any, TypeVar
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
@@ -36,6 +37,7 @@ from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_densifier import usual_densifier
 from crossgrad_core.run.usual_resolution import usual_resolution
 from crossgrad_core.run.usual_views import operator_of, usual_views
+from crossgrad_core.scene.point_cloud import CLOUDS
 from crossgrad_core.wording import listed, singular
 
 #: The base class of a slot.
@@ -139,9 +141,18 @@ def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
         raise UserError(
             "the scene has no SfM points to start from",
             where=config.scene or scene.name,
-            todo=f"find some in the photos (--start {START_ALONE}), or start from random ones "
-            "(--init random) or from those of a file (--init FILE.ply)",
+            found=_clouds_in(config.scene),
+            todo=f"find some in the photos (--start {START_ALONE}), or start from those of a point "
+            "cloud (--points FILE), from the Gaussians of a file (--init FILE.ply) or from random "
+            "points (--init random)",
         )
+
+
+def _clouds_in(folder: Path | None) -> str:
+    """Names of files in the scene's folder that may be point clouds."""
+    files = sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
+    names = [file.name for file in files if file.suffix.lower() in CLOUDS]
+    return f"point clouds that are not used: {listed(names)}" if names else "no point cloud"
 
 
 def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None:

@@ -212,6 +212,8 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
     asked = config.start is not None and config.start.name != BARE_START
     if asked and config.reading.init != "points":
         yield "start", f"--init {config.reading.init} has points of its own; leave one of them out"
+    if config.reading.points is not None and config.reading.init != "points":
+        yield "reading.points", f"--init {config.reading.init} starts from other points"
 
 
 def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

@@ -15,6 +15,7 @@ from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
 from crossgrad_core.scene.photo_names import with_photo_names
 from crossgrad_core.scene.photo_store import PhotoStore, store_folder
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
+from crossgrad_core.scene.point_option import with_points_of_file
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.raw_checks import (
     CheckedPoints,
@@ -24,6 +25,7 @@ from crossgrad_core.scene.raw_checks import (
 )
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
 from crossgrad_core.scene.split import Label, split_views
+from crossgrad_core.scene.thinning import FEWEST, PER_PHOTO, thinned
 from crossgrad_core.wording import one_line
 
 
@@ -39,7 +41,12 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     """
     raw = with_photo_names(raw)
     check_views(raw)
+    raw = with_points_of_file(raw, options.points)
     points, point_notes = check_points(raw)
+    if not any(len(view.seen) for view in raw.views):
+        most = options.max_points or max(FEWEST, PER_PHOTO * len(raw.views))
+        points, thin_notes = thinned(points, most)
+        point_notes += thin_notes
     photos = choose_photos(raw, options)
     label = _labels(raw, photos, points)
     split = split_views(sorted(photos.sources), options, raw.root, raw.split, label)

@@ -1,6 +1,6 @@
 """Camera calibrations in COLMAP's terms, and their undistortion through pycolmap."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.lens_reach import LensCost, LensReach, cost_of, source_pixels
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ _ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 # Beyond these nothing can be computed with a camera in single precision.
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
+_WHITE = 255
 _AGAIN = "repair the camera, or export the model again"
 
 
@@ -112,12 +114,17 @@ class Calibration:
         extra = [self.params[i] for i in self._camera.extra_params_idxs()]
         return self.model in _PINHOLE_AT_ZERO and not any(extra)
 
+    @property
+    def without_distortion(self) -> Pinhole:
+        """The focal lengths and the principal point alone."""
+        return self._read_pinhole(self._camera)
+
     def resized(self, width: int, height: int) -> "Calibration":
         """The calibration of the same photos resampled to `width` x `height`."""
         if (width, height) == (self.width, self.height):
             return self
         if self.is_pinhole:
-            pinhole = self._read_pinhole(self._camera).resized(width, height)
+            pinhole = self.without_distortion.resized(width, height)
             params = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)
             return Calibration("PINHOLE", width, height, params)
         camera = self._make_camera()
@@ -132,19 +139,15 @@ class Calibration:
             UserError: The model has no pinhole equivalent.
         """
         if self.is_pinhole:
-            return self._read_pinhole(self._camera)
-        guard_pycolmap()
-        import pycolmap
-
-        try:
-            camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera)
-        except (RuntimeError, ValueError) as error:
-            raise UserError(
-                f"photos of camera model {self.model} cannot be undistorted to a pinhole",
-                found=str(error),
-                todo="export perspective photos, for example with COLMAP's image undistorter",
-            ) from error
-        return self._read_pinhole(camera)
+            return self.without_distortion
+        whole, (left, top, right, bottom) = self._whole, self._box
+        return replace(
+            whole,
+            width=right - left,
+            height=bottom - top,
+            cx=whole.cx - left,
+            cy=whole.cy - top,
+        )
 
     @cached_property
     def fills_frame(self) -> bool:
@@ -156,11 +159,16 @@ class Calibration:
         v = np.arange(frame.height) + 0.5
         rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
         columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
-        plane = np.concatenate(rows + columns) - [frame.cx, frame.cy]
-        rays = np.column_stack([plane / [frame.fx, frame.fy], np.ones(len(plane))])
+        plane = (np.concatenate(rows + columns) - [frame.cx, frame.cy]) / [frame.fx, frame.fy]
         # Bilinear interpolation needs a pixel centre on either side.
-        pixels = np.asarray(self._camera.img_from_cam(rays), dtype=float) - 0.5
-        return bool(((pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])).all())
+        pixels = source_pixels(self._camera, plane) - 0.5
+        inside = (pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])
+        return bool(inside.all() and not self._reach.beyond(plane).any())
+
+    @cached_property
+    def cost(self) -> LensCost | None:
+        """What undistortion loses; None for a pinhole."""
+        return None if self.is_pinhole else cost_of(self._camera, self._reach, self.pinhole)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A photo in the pixels of `pinhole`, bilinear; black where nothing was seen.
@@ -172,9 +180,72 @@ class Calibration:
         import pycolmap
 
         bitmap, _ = pycolmap.undistort_image(
-            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(image), self._camera
+            self._options, pycolmap.Bitmap.from_array(image), self._camera
         )
-        return np.asarray(bitmap.to_array())
+        left, top, right, bottom = self._box
+        return np.asarray(bitmap.to_array())[top:bottom, left:right]
+
+    def reached(self) -> NDArray[np.bool_]:
+        """[H, W] whether a pixel of `pinhole` shows the photo, and no ray beyond a fold."""
+        white = np.full((self.height, self.width), _WHITE, dtype=np.uint8)
+        shown: NDArray[np.bool_] = self.undistort(white) == _WHITE
+        return shown & self._reach.mask(self.pinhole) if self._reach.folds else shown
+
+    @cached_property
+    def _reach(self) -> LensReach:
+        return LensReach.of(self._camera)
+
+    @cached_property
+    def _options(self) -> "pycolmap.UndistortCameraOptions":
+        """How pycolmap undistorts.
+
+        Borders of a photo that no ray below 90 degrees hits give the undistorted photo the smallest
+        size that pycolmap allows. It gets at least the size of the photo then.
+        """
+        guard_pycolmap()
+        import pycolmap
+
+        options = pycolmap.UndistortCameraOptions()
+        # This also refuses models without a pinhole, before their reach is asked for.
+        smallest = self._undistorted(options).width <= options.min_scale * self.width
+        if smallest and (self._reach.folds or self._reach.wide):
+            options.min_scale = 1.0
+        return options
+
+    @cached_property
+    def _whole(self) -> Pinhole:
+        """The undistorted calibration before it is cut."""
+        return self._undistorted(self._options)
+
+    def _undistorted(self, options: "pycolmap.UndistortCameraOptions") -> Pinhole:
+        guard_pycolmap()
+        import pycolmap
+
+        try:
+            camera = pycolmap.undistort_camera(options, self._camera)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(
+                f"photos of camera model {self.model} cannot be undistorted to a pinhole",
+                found=str(error),
+                todo="export perspective photos, for example with COLMAP's image undistorter",
+            ) from error
+        return self._read_pinhole(camera)
+
+    @cached_property
+    def _box(self) -> tuple[int, int, int, int]:
+        """Left, top, right and bottom border of `pinhole` in the pixels of `_whole`.
+
+        Where the model folds over inside the photo, pixels around all that counts are cut off.
+        """
+        whole = self._whole
+        if not self._reach.folds:
+            return 0, 0, whole.width, whole.height
+        low_x, high_x, low_y, high_y = self._reach.box
+        left = int(np.clip(whole.cx + low_x * whole.fx, 0, whole.width - 1))
+        top = int(np.clip(whole.cy + low_y * whole.fy, 0, whole.height - 1))
+        right = int(np.clip(whole.cx + high_x * whole.fx + 1, left + 1, whole.width))
+        bottom = int(np.clip(whole.cy + high_y * whole.fy + 1, top + 1, whole.height))
+        return left, top, right, bottom
 
     @cached_property
     def _camera(self) -> "pycolmap.Camera":

@@ -59,6 +59,11 @@ class FileNames:
         """Return the one file that a name stands for; None if there is none, or several."""
         return self.pair((name,)).files.get(name)
 
+    def fitting(self, name: str) -> list[str]:
+        """Return the files that fit a name equally well, sorted."""
+        pairs = self.pair((name,))
+        return sorted(pairs.ambiguous.get(name) or filter(None, [pairs.files.get(name)]))
+
     def pair(self, names: Collection[str], taken: Container[str] = ()) -> Pairs:
         """Find the file of each name. A file belongs to the name that is most like its path.
 

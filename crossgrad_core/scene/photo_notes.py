@@ -13,9 +13,12 @@ from crossgrad_core.scene.headers import PhotoHeader
 from crossgrad_core.scene.photo_files import PhotoFolder
 from crossgrad_core.scene.photos import PhotoSource
 from crossgrad_core.scene.wording import count, megapixels, name_some
+from crossgrad_core.wording import listed
 
 _MIB = 2**20
 _SHOWN_SIZES = 3
+#: Undistortion of ordinary lenses loses less than this share of the pixels.
+_WORTH_A_NOTE = 0.1
 
 Sources = Mapping[str, PhotoSource]
 
@@ -62,7 +65,41 @@ def note_undistortion(sources: Sources) -> list[str]:
         return []
     kinds = ", ".join(f"{number} {model}" for model, number in sorted(models.items()))
     total = count(models.total(), "photo")
-    return [f"photos: {total} undistorted to PINHOLE with pycolmap ({kinds})"]
+    return [f"photos: {total} undistorted to PINHOLE with pycolmap ({kinds})", *_costs(sources)]
+
+
+def _costs(sources: Sources) -> list[str]:
+    """What undistortion loses of lenses that fold over or see far more than a pinhole camera."""
+    lenses = [source.distorted for source in sources.values() if source.distorted is not None]
+    found = [(lens, cost) for lens in lenses if (cost := lens.cost) is not None]
+    folded = [(lens.model, cost.beyond) for lens, cost in found if cost.beyond > 0.0]
+    wide = [cost for _, cost in found if cost.lost >= _WORTH_A_NOTE]
+    notes = []
+    if folded:
+        models = listed(sorted({model for model, _ in folded}))
+        notes.append(
+            f"photos: camera model {models} folds over inside the frame of "
+            f"{count(len(folded), 'photo')}; {_percent([share for _, share in folded])} of the "
+            "undistorted pixels lie beyond the fold and do not count"
+        )
+    if wide:
+        notes.append(
+            f"photos: the lens of {count(len(wide), 'photo')} sees "
+            f"{_degrees([cost.seen for cost in wide])} degrees across; undistortion keeps "
+            f"{_degrees([cost.kept for cost in wide])} of these and loses "
+            f"{_percent([cost.lost for cost in wide])} of the pixels"
+        )
+    return notes
+
+
+def _percent(shares: Sequence[float]) -> str:
+    return f"{_degrees([100.0 * share for share in shares])} %"
+
+
+def _degrees(values: Sequence[float]) -> str:
+    """Whole numbers from the least to the most."""
+    low, high = (f"{value:.0f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def note_sizes(

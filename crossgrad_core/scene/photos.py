@@ -164,8 +164,7 @@ class PhotoSource:
             keep = distorted.undistort(keep)
         if distorted.fills_frame:
             return keep
-        reached = distorted.undistort(np.full((self.height, self.width), _OPAQUE, dtype=np.uint8))
-        return _both(keep, np.where(reached < _OPAQUE, 0, _OPAQUE).astype(np.uint8))
+        return _both(keep, np.where(distorted.reached(), _OPAQUE, 0).astype(np.uint8))
 
 
 #: Hashable, and equal where the outcome is.

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.plugin import SceneOptions
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.readers.colmap import read_raw
 
@@ -53,7 +54,10 @@ class Written:
 
         Rotations are, to the last bit, those that the reader of COLMAP makes of quaternions.
         """
-        exact = {v.name: v.world_to_camera for v in read_raw(self.folder, "images", None).views}
+        exact = {
+            v.name: v.world_to_camera
+            for v in read_raw(self.folder, "images", None, SceneOptions()).views
+        }
         found = []
         for _, image in sorted(self.model.images.items()):
             pose = np.eye(4)

@@ -24,10 +24,10 @@ from crossgrad_core.scene.decode import decode_photo
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.split import _read_list as read_list
 from crossgrad_core.system import input_files
+from crossgrad_core.system.ply_table import read_vertices
 from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.system.yaml_values import read_mapping
 from crossgrad_core.training.photo_file import read_values
-from crossgrad_plugins.exporters.ply_format.table import read_vertices
 from crossgrad_plugins.readers import _json, _xml
 
 #: What the address space may grow by, and how long one file may take.

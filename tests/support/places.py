@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from crossgrad_core.plugin import SceneOptions
 from crossgrad_plugins.georeference.ellipsoid import Place, place_at
 from crossgrad_plugins.georeference.frames import Frame3D
 from crossgrad_plugins.readers.colmap import read_raw
@@ -24,7 +25,7 @@ _STEP = 10**7
 
 def centers_of(scene: Path) -> dict[str, NDArray[np.float64]]:
     """Name -> camera centre of a COLMAP scene, in its coordinates."""
-    views = read_raw(scene, "images", None).views
+    views = read_raw(scene, "images", None, SceneOptions()).views
     poses = {view.name: view.world_to_camera for view in views}
     return {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in poses.items()}
 

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_plugins.readers._inside import Inside, place_of
-from crossgrad_plugins.readers._points import Points
 
 
 def raw_scene(
-    inside: Inside, images: str, views: tuple[RawView, ...], points: Points, *notes: str
+    inside: Inside, images: str, views: tuple[RawView, ...], points: PointCloud, *notes: str
 ) -> RawScene:
     """The scene of some views, without a split or a background of its own.
 

@@ -9,11 +9,12 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import read_object
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
@@ -61,7 +62,7 @@ class BlenderReader(Reader):
         images, views = raw_views([*train, *test])
         names = [view.name for view in views]
         asked = self.points if self.points is None else inside.name(self.points, "reader.points")
-        points = find_points(inside, asked, "reader.points", base="" if asked else base)
+        points = find_points(inside, options, asked, "reader.points", base="" if asked else base)
         check_seen(points, views, path / file)
         behind = f", photos with transparency over {self.background} (see --background)"
         note = f"blender: {count(len(views), 'posed image')}, {points.note}{behind}"

@@ -12,6 +12,8 @@ from crossgrad_core.numerics.rotations import matrix_rows
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, is_file
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.photo_names import with_photo_names
+from crossgrad_core.scene.point_cloud import NO_POINTS, PointCloud
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import (
@@ -21,7 +23,9 @@ from crossgrad_plugins.readers._colmap_folder import (
 )
 from crossgrad_plugins.readers._colmap_model import model_files, read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
+from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._place import by_code, by_file, by_gps
+from crossgrad_plugins.readers._points import find_points
 
 #: The place on Earth, beside a model or in the scene's folder.
 _GEOREF = "georef.json"
@@ -58,7 +62,7 @@ class ColmapReader(Reader):
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        raw = read_raw(path, self.images, self.model)
+        raw = read_raw(path, self.images, self.model, options)
         return self.placed(build_scene(raw, options), raw)
 
     def placed(self, scene: Scene, raw: RawScene) -> Scene:
@@ -82,13 +86,16 @@ class ColmapReader(Reader):
         return by_gps(scene, raw, self.gps)
 
 
-def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
+def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions) -> RawScene:
     """A COLMAP scene as it is in its files.
+
+    Points that the model lacks come from a PLY beside it, or in a folder above within the scene.
 
     Args:
         path: The scene's folder.
         images: Folder of the photos within it.
         wanted: Folder of the model within it; None for the one with most images.
+        options: Where they name a file of points, no PLY is looked for.
 
     Raises:
         UserError: There is no model, or a file of it cannot be read.
@@ -102,17 +109,38 @@ def read_raw(path: Path, images: str, wanted: str | None) -> RawScene:
         f"{count(len(model.cameras), 'camera')}, {count(len(model.points), 'SfM point')} from "
         f"{os.path.relpath(folder, path)} ({form})"
     )
+    views = _make_views(model, folder)
+    points, files = PointCloud(model.points, model.colors), model_files(folder)
+    if not len(model.points):
+        points = _beside(path, folder, views, options)
+        if points.source:
+            notes.append(f"COLMAP: {points.note}")
+            files = (*files, path / points.source)
     return with_photo_names(
         RawScene(
             root=path,
             images=path / images,
-            views=_make_views(model, folder),
-            points=model.points,
-            point_colors=model.colors,
+            views=views,
+            points=points.positions,
+            point_colors=points.colors,
             notes=tuple(notes),
-            files=model_files(folder),
+            files=files,
         )
     )
+
+
+def _beside(
+    scene: Path, model: Path, views: tuple[RawView, ...], options: SceneOptions
+) -> PointCloud:
+    """The points of a PLY in the folder of the model, or in a folder above it within the scene."""
+    inside, base = Inside(scene), Path(os.path.relpath(model, scene))
+    places = [base, *base.parents] if ".." not in base.parts else []
+    for folder in places:
+        points = find_points(inside, options, None, scene, base=folder.as_posix())
+        if points.source:
+            check_seen(points, views, scene / points.source)
+            return points
+    return NO_POINTS
 
 
 def _make_views(model: ColmapModel, folder: Path) -> tuple[RawView, ...]:

@@ -15,12 +15,13 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.frames import rotation_of
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import holds
@@ -63,7 +64,7 @@ class MatrixCityReader(Reader):
             )
         frames = {name: _read(inside, name) for name in files}
         images, views = raw_views([frame for block in frames.values() for frame in block])
-        points = find_points(inside, self.points, "reader.points")
+        points = find_points(inside, options, self.points, "reader.points")
         check_seen(points, views, path)
         names = [view.name for view in views]
         held_out = [_is_test(name) for name in files for _ in frames[name]]

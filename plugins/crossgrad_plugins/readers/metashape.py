@@ -20,19 +20,23 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.raw import RawView
+from crossgrad_core.scene.file_names import FileNames
+from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.ellipsoid import place_at
 from crossgrad_plugins.georeference.frames import SAME, Frame3D, rotation_of
 from crossgrad_plugins.georeference.on_earth import OnEarth
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._equal_labels import Labelled, paired
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
 from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
-from crossgrad_plugins.readers._photos import PhotoNames
+from crossgrad_plugins.readers._metashape_numbers import numbers
+from crossgrad_plugins.readers._metashape_rig import Rig
 from crossgrad_plugins.readers._place import at, by_gps
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opencv
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import head_of
@@ -95,23 +99,27 @@ class MetashapeReader(Reader):
         cameras, notes = _cameras(chunk, file)
         world, where, place = _world(chunk, file, cameras, self.frame)
         sensors = _sensors(chunk, file, {camera.sensor for camera in cameras})
-        photos = PhotoNames.of(path / images, (camera.label for camera in cameras))
-        views = tuple(_view(inside, each, sensors, photos, world) for each in cameras)
-        points = find_points(inside, self.points, "reader.points")
+        names, pairs = _names(inside, chunk, cameras, sensors, path / images)
+        views = tuple(
+            raw_view(name, sensors[each.sensor], from_opencv(each.rotation, each.center, world))
+            for name, each in zip(names, cameras, strict=True)
+        )
+        points = find_points(inside, options, self.points, "reader.points")
         other = "chunk" if self.frame == "local" else "local"
         check_seen(points, views, file, f"try --set reader.frame={other}, or remove the file")
         head = f"Metashape: {count(len(views), 'posed image')} from {file.name}, {points.note}"
-        raw = raw_scene(inside, images, views, points, head, *notes, *where)
+        raw = raw_scene(inside, images, views, points, head, *notes, *pairs, *where)
         scene = build_scene(raw, options)
         return by_gps(scene, raw) if place is None else at(scene, place)
 
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """A posed camera: label, ids of sensor and component, camera to chunk, and its attributes."""
+    """A posed camera: label, sensor's id, group's label, component's id, pose and attributes."""
 
     label: str
     sensor: str
+    group: str
     component: str
     rotation: NDArray[np.float64]
     center: NDArray[np.float64]
@@ -135,29 +143,34 @@ def _missing(file: Path, what: str) -> UserError:
     )
 
 
-def _numbers(element: Element | None, count: int, file: Path, place: str) -> NDArray[np.float64]:
-    """[count] numbers in the text of an element."""
-    words = (element.text or "").split() if element is not None else []
-    values: list[object] = []
-    for word in words[: count + 1]:
-        try:
-            values.append(word if "_" in word else float(word))
-        except ValueError:
-            values.append(word)
-    return Fields({"text": values}, file, place).numbers("text", count)
-
-
 def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
     """The posed cameras of the largest component, and notes on those that are left out."""
     holder = chunk.find("cameras")
     if holder is None:
         raise _missing(file, "cameras")
     elements = list(holder.iter("camera"))
-    posed = [_camera(each, file, i) for i, each in enumerate(elements) if _is_posed(each)]
+    rig = Rig.of(chunk, elements, file)
+    groups = {each: group.get("label", "") for group in holder.iter("group")
+              for each in group.iter("camera")}  # fmt: skip
+    components = {each.get("id"): each.get("component_id", "") for each in elements}
+    posed, slaves = [], 0
+    for i, each in enumerate(elements):
+        pose = rig.pose(each) if each.get("enabled", "true") != "false" else None
+        if pose is None:
+            continue
+        component = each.get("component_id", components.get(each.get("master_id"), ""))
+        fields = Fields(dict(each.attrib), file, f"cameras.camera[{i}]")
+        posed.append(_camera(fields, groups.get(each, ""), component, pose))
+        slaves += rig.is_slave(each)
     sizes = Counter(camera.component for camera in posed)
     best = max(sizes, key=lambda component: sizes[component], default="")
     kept = [camera for camera in posed if camera.component == best]
     notes = []
+    if slaves:
+        notes.append(
+            f"Metashape: {count(slaves, 'slave camera')} posed by their masters and the offsets of "
+            "their sensors"
+        )
     if len(posed) < len(elements):
         notes.append(f"Metashape: {count(len(elements) - len(posed), 'camera')} without a pose")
     if len(kept) < len(posed):
@@ -168,23 +181,14 @@ def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
     return kept, notes
 
 
-def _is_posed(element: Element) -> bool:
-    return element.find("transform") is not None and element.get("enabled", "true") != "false"
-
-
-def _camera(element: Element, file: Path, index: int) -> _Camera:
-    place = f"cameras.camera[{index}]"
-    matrix = _numbers(element.find("transform"), 16, file, f"{place}.transform").reshape(4, 4)
-    rotation = rotation_of(matrix[:3, :3])
-    fields = Fields(dict(element.attrib), file, place)
-    if rotation is None:
-        fields.wrong("transform", "an orthonormal, right-handed rotation, and a shift", str(matrix))
+def _camera(fields: Fields, group: str, component: str, pose: NDArray[np.float64]) -> _Camera:
     return _Camera(
         label=fields.text("label"),
         sensor=fields.text("sensor_id"),
-        component=element.get("component_id", ""),
-        rotation=rotation,
-        center=matrix[:3, 3],
+        group=group,
+        component=component,
+        rotation=pose[:3, :3],
+        center=pose[:3, 3],
         fields=fields,
     )
 
@@ -225,13 +229,13 @@ def _similarity(element: Element, file: Path, place: str) -> Frame3D:
     turn, shift, size = (element.find(tag) for tag in ("rotation", "translation", "scale"))
     matrix = np.eye(3)
     if turn is not None:
-        matrix = _numbers(turn, 9, file, f"{place}.rotation").reshape(3, 3)
+        matrix = numbers(turn, 9, file, f"{place}.rotation").reshape(3, 3)
     rotation = rotation_of(matrix)
     fields = Fields({}, file, place)
     if rotation is None:
         fields.wrong("rotation", "an orthonormal, right-handed rotation", str(matrix.tolist()))
-    moved = np.zeros(3) if shift is None else _numbers(shift, 3, file, f"{place}.translation")
-    scale = 1.0 if size is None else float(_numbers(size, 1, file, f"{place}.scale")[0])
+    moved = np.zeros(3) if shift is None else numbers(shift, 3, file, f"{place}.translation")
+    scale = 1.0 if size is None else float(numbers(size, 1, file, f"{place}.scale")[0])
     if scale <= 0.0:
         fields.wrong("scale", "a number above zero", f"{scale:g}")
     return Frame3D(rotation, moved, scale)
@@ -298,17 +302,25 @@ def _lens(fields: Fields, kind: str) -> Calibration:
     return lens.brown((term["k1"], term["k2"], term["k3"]), (term["p2"], term["p1"]))
 
 
-def _view(
+def _names(
     inside: Inside,
-    camera: _Camera,
+    chunk: Element,
+    cameras: list[_Camera],
     sensors: dict[str, Calibration],
-    photos: PhotoNames,
-    world: Frame3D,
-) -> RawView:
-    fields = camera.fields
-    if camera.sensor not in sensors:
-        fields.wrong("sensor_id", "a sensor of the file")
-    name = photos.full(camera.label, inside, fields.where("label"))
-    return raw_view(
-        name, sensors[camera.sensor], from_opencv(camera.rotation, camera.center, world)
-    )
+    images: Path,
+) -> tuple[list[str], list[str]]:
+    """The photo of each camera below a folder, and notes on how they were found."""
+    labels = {
+        each.get("id", ""): each.get("label", "") for each in chunk.iterfind("sensors/sensor")
+    }
+    photos = FileNames(PhotoFolder(images).names)
+    labelled = []
+    for camera in cameras:
+        if camera.sensor not in sensors:
+            camera.fields.wrong("sensor_id", "a sensor of the file")
+        lens = sensors[camera.sensor]
+        label, size = camera.label, (lens.width, lens.height)
+        if not photos.fitting(label):
+            label = inside.name(label, camera.fields.where("label"))
+        labelled.append(Labelled(label, camera.group, labels[camera.sensor], size))
+    return paired(labelled, photos, images)

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.split import has_lists
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.georeference.frames import Frame3D, rotation_of
@@ -17,7 +18,7 @@ from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._place import by_gps
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._raw import raw_scene
 from crossgrad_plugins.readers._sniff import begins_with, holds
 from crossgrad_plugins.readers._transforms import (
@@ -63,7 +64,7 @@ class NerfstudioReader(Reader):
         world = _applied(whole).inverse
         frames = [read_frame(inside, each, whole, base, world) for each in whole.items("frames")]
         images, views = raw_views(frames)
-        points = find_points(inside, *self._points(whole, base), frame=world)
+        points = find_points(inside, options, *self._points(whole, base), frame=world)
         check_seen(points, views, whole.file)
         notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]
         if "fisheye_crop_radius" in whole:

@@ -19,6 +19,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.raw_checks import FARTHEST
 from crossgrad_core.scene.wording import count
@@ -30,7 +31,6 @@ from crossgrad_plugins.readers._json import Fields, read_json
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import at, by_gps, origin_of
-from crossgrad_plugins.readers._points import Points
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 from crossgrad_plugins.readers._sniff import begins_with
 
@@ -192,10 +192,10 @@ def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))
 
 
-def _points(chosen: Fields) -> Points:
+def _points(chosen: Fields) -> PointCloud:
     points = list(chosen.members("points").values()) if "points" in chosen else []
     colors = np.rint(_column(points, "color").clip(0.0, _BYTE)).astype(np.uint8)
-    return Points(_column(points, "coordinates"), colors, chosen.file.name)
+    return PointCloud(_column(points, "coordinates"), colors, chosen.file.name)
 
 
 def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:

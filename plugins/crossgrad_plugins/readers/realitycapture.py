@@ -20,6 +20,7 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, read_r
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
@@ -30,7 +31,7 @@ from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import by_gps
-from crossgrad_plugins.readers._points import check_seen, find_points
+from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 
@@ -92,7 +93,7 @@ class RealityCaptureReader(Reader):
         rows = _rows(file)
         photos = PhotoNames.of(path / images, (row.name for row in rows))
         views = tuple(_view(inside, images, row, photos) for row in rows)
-        points = find_points(inside, self.points, "reader.points")
+        points = find_points(inside, options, self.points, "reader.points")
         check_seen(points, views, file)
         posed = f"{count(len(views), 'posed image')} from {file.name}"
         note = f"RealityCapture: {posed}, {points.note}"

@@ -38,7 +38,7 @@ class UcGsReader(ColmapReader):
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        raw = read_raw(path, self.images, self.model)
+        raw = read_raw(path, self.images, self.model, options)
         test = frozenset(view.name for view in raw.views if is_test(view.name))
         train = frozenset(view.name for view in raw.views) - test
         views = tuple(replace(view, place=_place(view.name)) for view in raw.views)

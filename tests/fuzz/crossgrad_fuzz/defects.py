@@ -14,11 +14,10 @@ import numpy as np
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene import pillow, reduction
 from crossgrad_core.scene.headers import PhotoHeader
-from crossgrad_core.system import yaml_values
+from crossgrad_core.system import ply_table, yaml_values
+from crossgrad_core.system.ply_table import Element, Header
 from crossgrad_fuzz.targets import photos
 from crossgrad_plugins.exporters.ply_format import file as ply
-from crossgrad_plugins.exporters.ply_format import table as ply_table
-from crossgrad_plugins.exporters.ply_format.table import Element, Header
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.scene_file import read_scene_file
 from crossgrad_core.scene.split import _read_list as read_list
 from crossgrad_core.system.input_files import is_file, open_file, read_file
+from crossgrad_core.system.ply_table import read_vertices
 from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.system.yaml_values import read_mapping
 from crossgrad_core.training.photo_file import read_values
-from crossgrad_plugins.exporters.ply_format.table import read_vertices
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 

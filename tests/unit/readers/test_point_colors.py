@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crossgrad_plugins.readers._points import _colors
+from crossgrad_core.scene.point_cloud import _colors
 
 
 @pytest.mark.parametrize(

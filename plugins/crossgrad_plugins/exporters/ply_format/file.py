@@ -5,7 +5,7 @@ Source: 3DGS; the order `x y z nx ny nz f_dc f_rest opacity scale rot`, float32 
 """
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from math import floor, log10
 from pathlib import Path
 
@@ -13,9 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.spherical import COEFFICIENTS
-from crossgrad_core.plugin import COORDINATES_TAG, Rounding, Similarity, UserError, atomic_file
+from crossgrad_core.plugin import (
+    COORDINATES_TAG,
+    Rounding,
+    Similarity,
+    UserError,
+    atomic_file,
+    read_vertices,
+    vertex_properties,
+)
 from crossgrad_plugins.exporters.ply_format.cloud import REST, RenderMode, SplatCloud
-from crossgrad_plugins.exporters.ply_format.table import read_vertices, vertex_properties
 
 #: Property names in the order in which they are written.
 PROPERTIES = (
@@ -26,6 +33,7 @@ PROPERTIES = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
+_NEEDED = tuple(name for name in PROPERTIES if not name.startswith(("n", "f_rest_")))
 #: Rounding of positions to float32 may move a Gaussian by this much, in local units.
 POSITION_TOLERANCE = 1e-6
 
@@ -121,13 +129,10 @@ def read_ply(path: Path) -> SplatCloud:
     """
     vertices = read_vertices(path)
     _check_coordinates(vertices.comments, path)
+    _require_properties(vertices.columns, path)
     rest = _rest_names(vertices.columns, path)
-    wanted = [name for name in PROPERTIES if not name.startswith(("n", "f_rest_"))]
-    missing = [name for name in wanted if name not in vertices.columns]
-    if missing:
-        raise _no_gaussians(path, vertices.columns, missing)
     _require_gaussians(len(vertices.columns["x"]), path)
-    for name in (*wanted, *rest):
+    for name in (*_NEEDED, *rest):
         top = _LARGEST_LOG_SCALE if name.startswith("scale_") else _LARGEST
         _check_finite(vertices.columns[name], name, path, top)
 
@@ -156,9 +161,11 @@ def sh_degree_of(path: Path) -> int:
     """The SH degree that a PLY of Gaussians holds, from its header alone.
 
     Raises:
-        UserError: Not a PLY file, or an unusual number of coefficients.
+        UserError: Not a PLY file, no Gaussians in it, or an unusual number of coefficients.
     """
-    return COEFFICIENTS.index(1 + len(_rest_names(vertex_properties(path), path)) // 3)
+    properties = vertex_properties(path)
+    _require_properties(properties, path)
+    return COEFFICIENTS.index(1 + len(_rest_names(properties, path)) // 3)
 
 
 def _plain(value: float) -> str:
@@ -237,18 +244,24 @@ def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
         )
 
 
-def _no_gaussians(
-    path: Path, columns: Mapping[str, NDArray[np.generic]], missing: list[str]
-) -> UserError:
-    packed = "packed_position" in columns
-    return UserError(
+def _require_properties(names: Collection[str], path: Path) -> None:
+    missing = [name for name in _NEEDED if name not in names]
+    if not missing:
+        return
+    packed, points = "packed_position" in names, {"x", "y", "z"} <= set(names)
+    todo = (
+        "decompress it, e.g. with splat-transform"
+        if packed
+        else f"--points {path} starts from its points; --init takes a file of Gaussians"
+        if points
+        else "export the Gaussians, not the sparse points or a mesh"
+    )
+    raise UserError(
         "compressed PLY file" if packed else "PLY file without Gaussians",
         where=path,
         expected="the properties of a standard 3DGS PLY file",
         found=f"no {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}",  # noqa: PLR2004
-        todo="decompress it, e.g. with splat-transform"
-        if packed
-        else "export the Gaussians, not the sparse points or a mesh",
+        todo=todo,
     )
 
 

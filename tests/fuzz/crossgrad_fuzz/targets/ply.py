@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.system import ply_table
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 from crossgrad_plugins.exporters.ply_format import file as ply
-from crossgrad_plugins.exporters.ply_format import table as ply_table
 from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
 from crossgrad_plugins.exporters.ply_format.file import (
     PROPERTIES,

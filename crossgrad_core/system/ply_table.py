@@ -11,7 +11,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import UserError, is_file, listed, open_file, size_text
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import size_text
+from crossgrad_core.system.input_files import is_file, open_file
+from crossgrad_core.wording import listed
 
 #: PLY type name -> numpy type without byte order.
 _TYPES = {
@@ -99,7 +102,7 @@ def read_vertices(path: Path) -> Vertices:
         where=path,
         expected="an element called vertex",
         found=listed(element.name for element in header.elements),
-        todo="export the Gaussians as a PLY file of vertices",
+        todo="export the Gaussians or points as a PLY file of vertices",
     )
 
 
@@ -142,7 +145,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             "not a PLY file",
             where=path,
             expected="a first line that says ply",
-            todo="name a PLY file of Gaussians, such as the point_cloud.ply of a run",
+            todo="name a PLY file, such as the point_cloud.ply of a run",
         )
     lines = _header_lines(file, path)
     comments = [line.removeprefix("comment").strip() for line in lines if _keyword(line, "comment")]
@@ -202,7 +205,7 @@ def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
             "PLY file with lists where vertices are expected",
             where=path,
             found=f"list properties in the element {element.name}",
-            todo="export the Gaussians without faces",
+            todo="export the Gaussians or points without faces",
         )
     return np.dtype([(name, f"{header.byte_order}{kind}") for name, kind in element.fields])
 

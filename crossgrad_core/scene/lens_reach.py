@@ -1,0 +1,206 @@
+"""The rays that a lens maps to pixels one to one, and the losses of undistortion to a pinhole."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+from numpy.typing import NDArray
+
+from crossgrad_core.contract.scene import Pinhole
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Directions around the axis, and steps along each, for a first look and for a closer one.
+_FIRST, _CLOSER = (72, 128), (180, 360)
+#: The largest angle from the axis that is looked at: a pinhole camera ends at 90 degrees.
+_WIDEST: Final = np.deg2rad(89.5)
+#: The last pixel before a fold is smeared over many undistorted ones, so that it does not count.
+_RIM: Final = 1.0
+#: Cells along each side of a frame whose areas are added up, and rows that are masked at a time.
+_CELLS, _ROWS = 64, 256
+#: Degree of the polynomial by which the radius goes on beyond 90 degrees.
+_DEGREE: Final = 13
+
+
+@dataclass(frozen=True, eq=False)
+class LensReach:
+    """The rays that a lens maps to pixels one to one.
+
+    A distortion model folds over where the distorted radius stops growing with the undistorted one.
+    Rays beyond the fold hit pixels that nearer rays hit too, so that they show nothing.
+
+    Attributes:
+        limits: [A] tangent of the largest angle from the axis before the fold. The directions are
+            spread evenly over the circle, from the right side downwards.
+        folds: Whether the fold lies inside the photo in some direction.
+        wide: Whether the photo sees 90 degrees or more from the axis in some direction.
+        box: Smallest and largest x, then y, of the rays inside the photo, at distance 1.
+        seen: Degrees that the photo sees along its longer side.
+    """
+
+    limits: NDArray[np.float64]
+    folds: bool
+    wide: bool
+    box: tuple[float, float, float, float]
+    seen: float
+
+    @classmethod
+    def of(cls, camera: "pycolmap.Camera") -> "LensReach":
+        """The reach of a camera."""
+        first = cls._looked_at(camera, *_FIRST)
+        return cls._looked_at(camera, *_CLOSER) if first.folds or first.wide else first
+
+    @classmethod
+    def _looked_at(cls, camera: "pycolmap.Camera", directions: int, steps: int) -> "LensReach":
+        around = 2.0 * np.pi * np.arange(directions) / directions
+        angles = np.linspace(0.0, _WIDEST, steps)
+        plane = np.tan(angles)[:, None] * np.stack([np.cos(around), np.sin(around)], 1)[:, None]
+        pixels = source_pixels(camera, plane.reshape(-1, 2)).reshape(directions, steps, 2)
+        inside = _is_inside(pixels, camera)
+        rows = np.arange(directions)
+        last = _last_before_fold(pixels / [camera.focal_length_x, camera.focal_length_y])
+        ends_inside = inside[rows, last]
+        folded = ends_inside & (last < steps - 1)
+        rim = pixels[rows, last][:, None]
+        near_rim = (np.linalg.norm(pixels - rim, axis=2) < _RIM) | (
+            np.arange(steps) > last[:, None]
+        )
+        kept = np.where(folded, np.maximum(np.argmax(near_rim, axis=1) - 1, 0), last)
+        used = inside & (np.arange(steps) <= kept[:, None])
+        (left, top), (right, bottom) = (
+            plane[used].min(0, initial=0.0),
+            plane[used].max(0, initial=0.0),
+        )
+        return cls(
+            limits=np.tan(angles[kept]),
+            folds=bool(folded.any()),
+            wide=bool((ends_inside & ~folded).any()),
+            box=(left, right, top, bottom),
+            seen=_seen(camera, pixels, used, np.rad2deg(angles)),
+        )
+
+    def beyond(self, plane: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[...] whether rays through points [..., 2] at distance 1 lie beyond the fold."""
+        x, y = plane[..., 0], plane[..., 1]
+        around = 2.0 * np.pi * np.arange(len(self.limits)) / len(self.limits)
+        limits = np.interp(np.arctan2(y, x), around, self.limits, period=2.0 * np.pi)
+        return np.asarray(np.hypot(x, y) > limits)
+
+    def mask(self, frame: Pinhole) -> NDArray[np.bool_]:
+        """[H, W] whether a pixel of a pinhole camera lies before the fold."""
+        mask = np.empty((frame.height, frame.width), dtype=np.bool_)
+        x = np.arange(frame.width) + 0.5
+        for start in range(0, frame.height, _ROWS):
+            y = np.arange(start, min(start + _ROWS, frame.height)) + 0.5
+            mask[start : start + _ROWS] = ~self.beyond(_plane(frame, *np.meshgrid(x, y)))
+        return mask
+
+
+@dataclass(frozen=True)
+class LensCost:
+    """The losses of undistortion to a pinhole camera.
+
+    Attributes:
+        seen: Degrees that the photo sees along its longer side.
+        kept: Degrees of these that the undistorted photo shows.
+        lost: Share of the photo's pixels that the undistorted photo does not show.
+        beyond: Share of the undistorted photo's pixels that lie beyond the fold of the model.
+    """
+
+    seen: float
+    kept: float
+    lost: float
+    beyond: float
+
+
+def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> LensCost:
+    """Return the losses of a camera whose photos are undistorted to `frame`."""
+    u = np.linspace(0.0, frame.width, _CELLS + 1)
+    v = np.linspace(0.0, frame.height, _CELLS + 1)
+    plane = _plane(frame, *np.meshgrid(u, v))
+    pixels = source_pixels(camera, plane.reshape(-1, 2)).reshape(plane.shape)
+    bounds = [camera.width, camera.height]
+    within = np.clip(np.nan_to_num(pixels, posinf=0.0, neginf=0.0), 0.0, bounds)
+    down, across = within[1:, 1:] - within[:-1, :-1], within[1:, :-1] - within[:-1, 1:]
+    areas = 0.5 * np.abs(down[..., 0] * across[..., 1] - down[..., 1] * across[..., 0])
+    middles = 0.25 * (plane[1:, 1:] + plane[:-1, :-1] + plane[1:, :-1] + plane[:-1, 1:])
+    beyond = reach.beyond(middles)
+    corners = np.asarray(np.isfinite(pixels).all(axis=2))
+    whole = corners[1:, 1:] & corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:]
+    shown = float(areas[whole & ~beyond].sum()) / (camera.width * camera.height)
+    x = [-frame.cx / frame.fx, (frame.width - frame.cx) / frame.fx]
+    y = [-frame.cy / frame.fy, (frame.height - frame.cy) / frame.fy]
+    ends = np.degrees(np.arctan(x if camera.width >= camera.height else y))
+    return LensCost(
+        seen=reach.seen,
+        kept=min(reach.seen, float(ends[1] - ends[0])),
+        lost=max(0.0, 1.0 - shown),
+        beyond=float(beyond.mean()),
+    )
+
+
+def source_pixels(camera: "pycolmap.Camera", plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 2] pixels of rays through points [N, 2] at distance 1; NaN where there are none."""
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    return np.asarray(camera.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
+
+
+def _plane(frame: Pinhole, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[..., 2] points at distance 1 that pixels of a pinhole camera show."""
+    return np.stack([(u - frame.cx) / frame.fx, (v - frame.cy) / frame.fy], axis=-1)
+
+
+def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArray[np.bool_]:
+    """[...] whether pixels [..., 2] lie in the photo; NaN do not."""
+    within = (pixels >= 0.0) & (pixels <= [camera.width, camera.height])
+    return np.asarray(within.all(axis=-1))
+
+
+def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[A] the last step of each direction [A, N, 2] before the model folds over.
+
+    Up to there the distance from the middle grows with every step, and neighbouring directions keep
+    their order (the Jacobian's determinant is positive).
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        radius = np.linalg.norm(pixels - pixels[:, :1], axis=2)
+        along = pixels[:, 1:] - pixels[:, :-1]
+        around = np.roll(pixels, -1, axis=0)[:, 1:] - pixels[:, 1:]
+        turned = along[..., 0] * around[..., 1] - along[..., 1] * around[..., 0]
+        grows = (radius[:, 1:] > radius[:, :-1]) & (turned > 0.0)
+    return np.asarray(np.where(grows.all(axis=1), grows.shape[1], np.argmin(grows, axis=1)))
+
+
+def _seen(
+    camera: "pycolmap.Camera",
+    pixels: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    degrees: NDArray[np.float64],
+) -> float:
+    """Degrees that a photo sees along its longer side.
+
+    Models answer below 90 degrees from the axis only. Beyond, a polynomial in the angle goes on,
+    which fits the fisheye models to rounding.
+    """
+    axis = 0 if camera.width >= camera.height else 1
+    size = (camera.width, camera.height)[axis]
+    quarter, steps = len(pixels) // 4, len(degrees)
+    ahead, behind = axis * quarter, (axis + 2) * quarter
+    ends = [int(used[row].sum()) - 1 for row in (behind, ahead)]
+    if max(ends) < steps - 1:
+        return float(sum(degrees[max(end, 0)] for end in ends))
+    line = [pixels[behind, : ends[0] + 1, axis][::-1], pixels[ahead, 1 : ends[1] + 1, axis]]
+    angles = [-degrees[: ends[0] + 1][::-1], degrees[1 : ends[1] + 1]]
+    fit = Chebyshev.fit(np.concatenate(angles), np.concatenate(line), _DEGREE)
+    farther = np.arange(degrees[-1], 180.0, degrees[1])
+    seen = 0.0
+    for side, end in zip((-1.0, 1.0), ends, strict=True):
+        seen += float(degrees[max(end, 0)])
+        if end == steps - 1:
+            place = fit(side * farther)
+            goes_on = (side * np.diff(place) > 0.0) & (place[1:] >= 0.0) & (place[1:] <= size)
+            steps_on = len(goes_on) if goes_on.all() else int(np.argmin(goes_on))
+            seen += float(steps_on * degrees[1])
+    return seen

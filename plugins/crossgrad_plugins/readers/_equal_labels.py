@@ -1,0 +1,161 @@
+"""Photos of cameras with equal labels: folder, sensor or group tells which photo is meant."""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from crossgrad_core.plugin import UserError
+from crossgrad_core.scene.file_names import FileNames
+from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.wording import name_some
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A camera by its label.
+
+    Attributes:
+        label: As in the file; may have folders, and may lack the suffix of the photo.
+        group: Label of the camera's group; empty without one.
+        sensor: Label of its sensor.
+        size: Width and height of the sensor's photos.
+    """
+
+    label: str
+    group: str
+    sensor: str
+    size: tuple[int, int]
+
+    @property
+    def text(self) -> str:
+        """The camera for messages."""
+        group = f", group {self.group}" if self.group else ""
+        return f"{self.label} (sensor {self.sensor or 'without a label'}{group})"
+
+
+def paired(
+    cameras: Sequence[Labelled], photos: FileNames, folder: Path
+) -> tuple[list[str], list[str]]:
+    """The photo of each camera, and notes; the label itself if the photo is missing.
+
+    A label can stand for photos in several folders. Folders named in the label, the label of the
+    group and that of the sensor choose the folder of that name; then the size of the photo, and
+    what other cameras leave; at last the order, if groups or sensors are as many as folders.
+
+    Args:
+        cameras: All cameras, in the order of the file.
+        photos: Names below `folder`.
+        folder: The photos.
+
+    Raises:
+        UserError: Photos of some cameras stay open, or two cameras have one photo.
+    """
+    fits = [_candidates(camera, photos, folder) for camera in cameras]
+    _leave_to_others(cameras, fits)
+    notes = _by_order(cameras, fits)
+    unclear = [c.text for c, names in zip(cameras, fits, strict=True) if len(names) > 1]
+    counts = Counter(names[0] for names in fits if len(names) == 1)
+    twice = [
+        camera.text
+        for camera, names in zip(cameras, fits, strict=True)
+        if len(names) == 1 and counts[names[0]] > 1
+    ]
+    if unclear or twice:
+        found = next(names for names in fits if len(names) > 1) if unclear else sorted(counts)
+        raise UserError(
+            "several cameras or photos have one label"
+            if unclear
+            else "several cameras have one photo",
+            where=name_some(unclear or twice),
+            expected="labels with the folders of the photos, or sensors or groups called like "
+            "these folders",
+            found=f"photos {name_some(found)}",
+            todo="name the sensors or camera groups after the folders of their photos, and export "
+            "the cameras again",
+        )
+    labels = Counter(camera.label for camera in cameras)
+    missing = [
+        camera.label if labels[camera.label] == 1 else f"{camera.label} (camera {number})"
+        for number, camera in enumerate(cameras, 1)
+    ]
+    return [names[0] if names else name for names, name in zip(fits, missing, strict=True)], notes
+
+
+def _candidates(camera: Labelled, photos: FileNames, folder: Path) -> list[str]:
+    """Photos that the label can stand for, as few as folders and size leave."""
+    names = photos.fitting(camera.label)
+    for hints in (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,)):
+        names = _in_folders(names, hints) or names
+    if len(names) > 1:
+        names = [name for name in names if _size_of(folder / name) == camera.size] or names
+    return names
+
+
+def _in_folders(names: Sequence[str], hints: Sequence[str]) -> list[str]:
+    """The names in folders that have all of these names."""
+    wanted = {hint.casefold() for hint in hints}
+    return [
+        name
+        for name in names
+        if wanted <= {part.casefold() for part in PurePosixPath(name).parts[:-1]}
+    ]
+
+
+def _size_of(photo: Path) -> tuple[int, int]:
+    header = read_header(photo)
+    return header.width, header.height
+
+
+def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None:
+    """Takes a photo that belongs to one camera from all others with an equal label."""
+    alike: defaultdict[str, set[int]] = defaultdict(set)
+    for index, camera in enumerate(cameras):
+        alike[PurePosixPath(camera.label).name].add(index)
+    for indices in alike.values():
+        waiting = set(indices)
+        single = Counter(fits[i][0] for i in waiting if len(fits[i]) == 1)
+        decided = {
+            i
+            for i in waiting
+            if len(fits[i]) == 1 and (single[fits[i][0]] == 1 or _is_sure(cameras[i], fits[i][0]))
+        }
+        while decided:
+            taken = {fits[i][0] for i in decided}
+            waiting -= decided
+            for i in waiting:
+                fits[i] = [name for name in fits[i] if name not in taken]
+            decided = {i for i in waiting if len(fits[i]) == 1}
+
+
+def _is_sure(camera: Labelled, name: str) -> bool:
+    """Whether the label, the group or the sensor names the folder of a photo."""
+    hints = (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,))
+    return camera.label == name or any(
+        hint and all(hint) and _in_folders([name], hint) for hint in hints
+    )
+
+
+def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
+    """Pairs groups or sensors with folders in their order; a note where that was needed."""
+    unclear = [i for i, names in enumerate(fits) if len(names) > 1]
+    folders = sorted({_folder(name) for i in unclear for name in fits[i]})
+    for of in ("group", "sensor"):
+        owners = list(dict.fromkeys(getattr(cameras[i], of) for i in unclear))
+        if not unclear or len(owners) != len(folders):
+            continue
+        places: Mapping[str, str] = dict(zip(owners, folders, strict=True))
+        found = {
+            i: [n for n in fits[i] if _folder(n) == places[getattr(cameras[i], of)]]
+            for i in unclear
+        }
+        if all(len(names) == 1 for names in found.values()):
+            for i, names in found.items():
+                fits[i] = names
+            pairs = ", ".join(f"{owner or 'none'} {place}" for owner, place in places.items())
+            return [f"photos of equal labels are paired by the order of {of}s and folders: {pairs}"]
+    return []
+
+
+def _folder(name: str) -> str:
+    return str(PurePosixPath(name).parent)
