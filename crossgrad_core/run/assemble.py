@@ -17,13 +17,14 @@ from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.registry.entries import build, entries, find, from_elsewhere
+from crossgrad_core.registry.entries import build, entries, find, from_elsewhere, quick_answer
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.select import select
+from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import note_on_axes
@@ -67,7 +68,8 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
 def accepts(name: str, path: Path) -> bool:
     """Whether a reader takes the folder; one that fails does not keep the others from it."""
     try:
-        return build(Reader, name, {}).accepts(path)
+        quick = quick_answer(find("readers", name))
+        return bool(build(Reader, name, {}).accepts(path) if quick is None else quick(path))
     except Exception as error:
         _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
         return False
@@ -79,7 +81,8 @@ def check_names(config: RunConfig) -> None:
     Raises:
         UserError: A name does not exist, with the closest one that does.
     """
-    choose_device(config.device)
+    if config.device != AUTO:
+        choose_device(config.device)
     named = [("operators", link) for link in config.operators]
     named += [(slot, choice) for slot in LISTS for choice in getattr(config, slot)]
     single = (slot for slot in GROUPS if slot not in {"operators", *LISTS})
@@ -100,6 +103,8 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.
     """
+    config, of_device = with_device(config)
+    scene = replace(scene, notes=(*of_device, *scene.notes))
     plan = None
     if config.plan != "off":
         config, plan = planned(config, scene)

@@ -13,10 +13,10 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, is_fil
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import (
     check_scene_folder,
     choose_model,
-    find_models,
 )
 from crossgrad_plugins.readers._colmap_model import read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
@@ -50,10 +50,7 @@ class ColmapReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        try:
-            return bool(find_models(path))
-        except OSError:
-            return False
+        return _accepts.colmap(path)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:

@@ -22,35 +22,22 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers import _accepts
+from crossgrad_plugins.readers._accepts import NAME_COLUMN, POSE_COLUMNS
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import check_seen, find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
-from crossgrad_plugins.readers._sniff import head_of
 
-_NAME: Final = "#name"
-_POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _SENSOR: Final = 36.0  # mm
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
-)
-
-
-def _has_columns(path: Path) -> bool:
-    line = head_of(path).decode("utf-8-sig", errors="replace").partition("\n")[0]
-    return {_NAME, *_POSE, "f"} <= {cell.strip(' "\r') for cell in line.split(",")}
-
-
-_CSV: Final = Kind(
-    *("CSV", "RealityCapture", ".csv", _has_columns),
-    f"one file with the columns {_NAME}, {', '.join((*_POSE, 'f'))} ...",
 )
 
 
@@ -70,13 +57,13 @@ class RealityCaptureReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return bool(_CSV.find(Inside(path), self.file))
+        return _accepts.realitycapture(path, self.file)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        file = _CSV.one(inside, self.file)
+        file = _accepts.REALITYCAPTURE.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
         photos = PhotoNames.of(path / images)
         views = tuple(_view(inside, images, row, photos) for row in _rows(file))
@@ -104,7 +91,7 @@ def _rows(file: Path) -> list[_Row]:
     """
     rows = read_rows(file, "the CSV of RealityCapture", _TODO)
     header = [cell.strip() for cell in rows[0]] if rows else []
-    missing = [name for name in (_NAME, *_POSE, "f") if name not in header]
+    missing = [name for name in (NAME_COLUMN, *POSE_COLUMNS, "f") if name not in header]
     if missing:
         raise _wrong(file, f"a column {missing[0]}", ", ".join(header) or "an empty file")
     twice = [name for name in header if name and header.count(name) > 1]
@@ -116,7 +103,7 @@ def _rows(file: Path) -> list[_Row]:
             raise _wrong(file, f"{len(header)} cells in line {number}", f"{len(row)} cells")
         if row:
             cells = dict(zip(header, row, strict=True))
-            found.append(_Row(cells[_NAME], _numbers(cells, file, number)))
+            found.append(_Row(cells[NAME_COLUMN], _numbers(cells, file, number)))
     return found
 
 
@@ -142,9 +129,9 @@ def _wrong(file: Path, expected: str, found: str) -> UserError:
 
 
 def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
-    where = row.fields.where(_NAME)
+    where = row.fields.where(NAME_COLUMN)
     name = photos.full(inside.name(row.name, where))
-    x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
+    x, y, up, heading, pitch, roll = (row.fields.number(key) for key in POSE_COLUMNS)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))
     return raw_view(name, _lens(row.fields, inside.scene / images / name), pose)
