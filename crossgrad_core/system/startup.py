@@ -20,7 +20,7 @@ KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
 #: Seconds between lines about compiling where stderr is no terminal, and where it is one.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
-_EXPLANATION = "compiling for this machine, before the first start only (usually a minute)"
+_EXPLANATION = "compiling for this machine, before the first start only (about a minute)"
 
 
 def announce(*, quiet: bool = False) -> None:
