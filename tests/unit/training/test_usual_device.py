@@ -128,7 +128,7 @@ def test_a_device_that_is_named_is_taken_without_a_trial(on_a_gpu, name):
 @pytest.mark.usefixtures("without_a_gpu")
 def test_a_run_goes_on_where_auto_leads(tmp_path):
     (tmp_path / "config.yaml").write_text(
-        "crossgrad: '0.2'\nsteps: 3\nrasterizer: {name: gsplat}\n"
+        "scene: s\nseed: 0\nsteps: 3\nrasterizer: {name: gsplat}\n"
     )
     config = _config(tmp_path, {"device": "auto"})
     assert config.device == "cpu"
