@@ -44,8 +44,9 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
     if config.seconds is not None and config.clock == "cpu":
         return name, "--clock cpu does not count what a GPU does"
     if name != AUTO:
-        runs = "cuda" in load(Rasterizer, name).devices
-        return name, "" if runs else f"rasterizer {name} does not run on it"
+        named = load(Rasterizer, name)
+        runs = "cuda" in named.devices
+        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on it"
     on_cpu = max(speeds_on("cpu")[0].values(), default=0.0)
     speeds, notes = speeds_on("cuda")
     faster = {each: speed for each, speed in speeds.items() if speed > on_cpu}

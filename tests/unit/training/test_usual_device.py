@@ -98,6 +98,7 @@ def test_a_rasterizer_that_does_not_work_leaves_the_cpu(on_a_gpu, error, why):
     ("settings", "why"),
     [
         ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on it"),
+        ({"rasterizer": {"name": "gsplat"}}, "pip install 'crossgrad[gsplat]'"),
         ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count what a GPU does"),
         ({"backbone": {"name": "analytic"}}, "rasterizer gswarp left out: this run needs analytic"),
         ({"densifier": {"name": "absgrad"}}, "gswarp left out: this run needs abs_gradient"),
