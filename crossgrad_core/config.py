@@ -59,23 +59,23 @@ class RunConfig(BaseModel):
         description="Scene folder (COLMAP: images/ and sparse/). Default: the bundled example "
         "scene.",
     )
-    out: Annotated[Path | None, Flag("DIR", RESULTS)] = Field(
+    out: Annotated[Path | None, Flag("DIR", RESULTS, common=True)] = Field(
         None, description="Output folder, a new or an empty one. Default: below runs/."
     )
 
-    backbone: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+    backbone: Annotated[ComponentChoice, Flag("NAME", PARTS, common=True)] = Field(
         ComponentChoice(name=defaults.BACKBONE),
         description=f"What is trained. Default: {defaults.BACKBONE}.",
     )
-    sampler: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
+    sampler: Annotated[ComponentChoice, Flag("NAME", PARTS, common=True)] = Field(
         ComponentChoice(name=defaults.SAMPLER),
         description=f"Which views a step renders. Default: {defaults.SAMPLER}.",
     )
     grouping: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
-        None, description="How views are labelled near or far. Default: what the sampler needs."
+        None, description="How views are labelled near or far. Default: auto."
     )
     operator: Annotated[
-        ComponentChoice | tuple[ComponentChoice, ...], Flag("NAME[+NAME]", PARTS)
+        ComponentChoice | tuple[ComponentChoice, ...], Flag("NAME[+NAME]", PARTS, common=True)
     ] = Field(
         ComponentChoice(name=defaults.OPERATOR),
         description="How the views' gradients become one; a chain is written "
@@ -84,9 +84,7 @@ class RunConfig(BaseModel):
     densifier: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
         description=f"How primitives are added and removed; {defaults.NO_DENSIFIER} keeps them. "
-        f"Default: the backbone's; {defaults.SHORT_DENSIFIER} in place of {defaults.DENSIFIER} on "
-        "a CPU, of 100 training photos or more, in runs within seconds or of fewer than 30,000 "
-        "views whose growth follows a curve, not with filters or --preset inria.",
+        "Default: auto.",
     )
     rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
@@ -96,7 +94,7 @@ class RunConfig(BaseModel):
         ComponentChoice(name=defaults.LOSS),
         description=f"How far a render is from its photo. Default: {defaults.LOSS}.",
     )
-    exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+    exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS, common=True)] = Field(
         None,
         description="What cameras do to light between render and photo. "
         f"Default: {defaults.EXPOSURE}, a brightness for each photo if the photos differ in "
@@ -109,15 +107,10 @@ class RunConfig(BaseModel):
     )
     start: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
-        description="What is added to the points that a run starts from. "
-        f"Default: {defaults.START}; {defaults.BARE_START}, nothing, with --preset inria.",
+        description="What is added to the points that a run starts from. Default: auto.",
     )
     resolution: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
-        None,
-        description="At which scale a step renders its views. "
-        f"Default: {defaults.SHORT_RESOLUTION} on a CPU in runs within seconds or of fewer than "
-        f"30,000 steps whose growth follows a curve; {defaults.RESOLUTION} in others, with anchors "
-        "and filters, with --preset inria, and with --schedule absolute without --reference.",
+        None, description="At which scale a step renders its views. Default: auto."
     )
     exporter: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.EXPORTER),
@@ -139,9 +132,9 @@ class RunConfig(BaseModel):
     views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
         None,
         description="Views per step, K; 1..2@0.5 changes it after that share of the steps. "
-        "Default: the sampler's, or the fewest that give the operator something to do.",
+        "Default: auto.",
     )
-    steps: Annotated[int | None, Flag("N", TRAINING)] = Field(
+    steps: Annotated[int | None, Flag("N", TRAINING, common=True)] = Field(
         None, ge=1, description="Optimizer steps; schedules stretch with them. Default: 30000."
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
@@ -150,7 +143,7 @@ class RunConfig(BaseModel):
         description="Length of the run in views: as many steps as draw them. With --seconds the "
         "shorter of both.",
     )
-    seconds: Annotated[float | None, Flag("S", TRAINING)] = Field(
+    seconds: Annotated[float | None, Flag("S", TRAINING, common=True)] = Field(
         None, gt=0, description="Training seconds; the number of steps follows the clock."
     )
     clock: Annotated[Literal["wall", "cpu"], Flag("wall|cpu", TRAINING)] = Field(
@@ -167,7 +160,7 @@ class RunConfig(BaseModel):
     planned_views: int | None = Field(
         None, ge=1, description="the views that it was given at most within these seconds"
     )
-    seed: Annotated[int, Flag("N", TRAINING)] = Field(
+    seed: Annotated[int, Flag("N", TRAINING, common=True)] = Field(
         0, ge=0, description="Seed of every random number. Default: 0."
     )
     schedule: Annotated[ScheduleMode, Flag("scaled|absolute", TRAINING)] = Field(
@@ -183,8 +176,7 @@ class RunConfig(BaseModel):
     )
     events: Annotated[Unit | None, Flag("views|steps", TRAINING)] = Field(
         None,
-        description="What schedules count. Default: views; steps with --preset inria, and with "
-        "--schedule absolute without --reference.",
+        description="What schedules count. Default: auto.",
     )
     densify_from: int | None = Field(
         None, ge=0, description="density control after this, counted in --events ..."
@@ -225,8 +217,7 @@ class RunConfig(BaseModel):
     rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
         None,
         gt=0,
-        description="Multiplies all learning rates of the backbone. Default: 1 from 30,000 steps "
-        "on and with --preset inria, more in shorter runs.",
+        description="Multiplies all learning rates of the backbone. Default: auto.",
     )
     beta1: float | None = Field(
         None, ge=0, lt=1, description="decay of Adam's first moment; less in shorter runs"
@@ -242,9 +233,7 @@ class RunConfig(BaseModel):
         Field(
             None,
             description="How far positions step: by a share of the scene's extent, as published, "
-            "or along the axes of each Gaussian, by a share of their lengths. Default: size in "
-            "runs of fewer than 30,000 steps; extent in longer ones, with --preset inria, with "
-            "--schedule absolute without --reference, and of anchors.",
+            "or along the axes of each Gaussian, by a share of their lengths. Default: auto.",
         )
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
@@ -252,12 +241,17 @@ class RunConfig(BaseModel):
         description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "
         "over as many views as with one. Default: none.",
     )
-    preset: Annotated[Literal["fast", "inria"], Flag("fast|inria", CONFIGURATION)] = Field(
-        "fast",
-        description="Training rules: fast, what was measured to be best at equal time, or inria "
-        "(order of a step, 3-sigma footprint and near plane of the original code). Default: fast.",
+    preset: Annotated[Literal["fast", "inria"], Flag("fast|inria", CONFIGURATION, common=True)] = (
+        Field(
+            "fast",
+            description="Training rules: fast, what was measured to be best at equal time, or "
+            "inria (order of a step, 3-sigma footprint and near plane of the original code). "
+            "Default: fast.",
+        )
     )
-    plan: Annotated[Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION)] = Field(
+    plan: Annotated[
+        Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION, common=True)
+    ] = Field(
         "off",
         description="auto: what the scene does not need is left out, on evidence that is shown; "
         "turns: far views come first if drone and street meet, and nothing else is decided. "
@@ -272,7 +266,7 @@ class RunConfig(BaseModel):
         ge=0,
         le=1,
         description="Over the last share of the steps, rates that are constant as published fade. "
-        "Default: 0.25; 0 with --preset inria.",
+        "Default: auto.",
     )
     final_rate: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
     average: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
@@ -285,18 +279,19 @@ class RunConfig(BaseModel):
     floaters: Annotated[Literal["keep", "remove"] | None, Flag("keep|remove", TRAINING)] = Field(
         None,
         description="What is done at the end with primitives around cameras that no training photo "
-        "shows. Default: remove; keep with --preset inria, and where density control is none.",
+        "shows. Default: auto.",
     )
     dropout: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
         None,
         ge=0,
         le=0.9,
         description="Share of the Gaussians that each training view is drawn without. Default: "
-        "0.3 where a point lies in at most 5 training photos (median); else, and with --preset "
-        "inria, 0.",
+        "auto.",
     )
-    device: Annotated[str, Flag("cpu|cuda|cuda:N", MACHINE)] = Field(
-        "cpu", description="Where tensors live. Default: cpu."
+    device: Annotated[str, Flag("auto|cpu|cuda|cuda:N", MACHINE, common=True)] = Field(
+        AUTO,
+        description="Where tensors live; auto: on a GPU if a rasterizer for it works, else on the "
+        "CPU. Default: auto.",
     )
     threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
         None, ge=1, description="CPU threads. Default: all there are."
@@ -306,24 +301,22 @@ class RunConfig(BaseModel):
         "black",
         description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
     )
-    max_gaussians: Annotated[PositiveInt | Literal["auto"] | None, Flag("N|auto", TRAINING)] = (
-        Field(
-            None,
-            description="At most so many primitives; auto: as suits the length of the run. "
-            "Default: auto where growth follows the curve, else what fits into memory.",
-        )
+    max_gaussians: Annotated[
+        PositiveInt | Literal["auto"] | None, Flag("N|auto", TRAINING, common=True)
+    ] = Field(
+        None,
+        description="At most so many primitives; auto: as suits the length of the run. "
+        "Default: auto; what fits into memory where growth is free.",
     )
     growth: Annotated[Literal["free", "curve"] | None, Flag("free|curve", TRAINING)] = Field(
         None,
         description="Growth up to --max-gaussians: as it is asked for, or along a curve that gets "
-        "there with the last edit. Default: curve for densifiers of Gaussians that clone and "
-        "split, else, and where --max-gaussians is a number, free.",
+        "there with the last edit. Default: auto.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None,
         ge=1,
-        description="Steps between evaluations. Default: a tenth of the run, half-way between "
-        "resets of the opacities.",
+        description="Steps between evaluations. Default: a tenth of the run.",
     )
     eval_from: int = Field(0, ge=0, description="no evaluation before this step")
     save_every: Annotated[int | None, Flag("N", RESULTS)] = Field(

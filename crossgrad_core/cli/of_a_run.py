@@ -10,7 +10,7 @@ RunFolder = Annotated[
 ]
 Device = Annotated[
     str | None,
-    typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+    typer.Option(metavar="auto|cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
 ]
 Threads = Annotated[
     int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")

@@ -12,6 +12,7 @@ from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCEN
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.options import OPTIONS, Option
+from crossgrad_core.system.grouped import print_all_options
 from crossgrad_core.system.startup import announce
 
 
@@ -21,9 +22,19 @@ def _parameter(name: str, kind: object, info: object, default: object = None) ->
     )
 
 
-def _own(name: str, kind: object, *flags: str, heading: str = RESULTS, **shown: str) -> Parameter:
-    """An option of this start of the command, which is no setting."""
-    info = typer.Option(*flags, rich_help_panel=heading, **shown)  # type: ignore[arg-type]
+def _own(
+    name: str,
+    kind: object,
+    *flags: str,
+    heading: str = RESULTS,
+    metavar: str | None = None,
+    help: str,  # noqa: A002 - typer's name
+    common: bool = True,
+) -> Parameter:
+    """Return the parameter of an option that is not a setting."""
+    info = typer.Option(
+        *flags, rich_help_panel=heading, metavar=metavar, help=help, hidden=not common
+    )
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
@@ -60,6 +71,7 @@ _RESUMING: Final = (
         "accept_scene",
         bool,
         "--accept-scene",
+        common=False,
         help="With --resume: go on although photos, masks or points of the scene have changed.",
     ),
     _own(
@@ -89,10 +101,23 @@ _LAST: Final = (
         "check",
         bool,
         "--check",
+        common=False,
         help="Decodes all photos before training, so that no damaged one is found later.",
     ),
     _own("quiet", bool, "--quiet", "-q", help="Prints errors and the result only."),
     _own("verbose", bool, "--verbose", "-v", help="Prints every decision and event."),
+    _parameter(
+        "help_all",
+        bool,
+        typer.Option(
+            "--help-all",
+            is_eager=True,
+            expose_value=False,
+            callback=print_all_options,
+            help="Show all options and exit.",
+        ),
+        default=False,
+    ),
 )
 
 
@@ -120,6 +145,7 @@ def _setting(option: Option) -> Parameter:
             metavar=flag.metavar,
             help=option.help,
             rich_help_panel=flag.heading,
+            hidden=not flag.common,
         )
         if flag.heading
         else typer.Argument(metavar=flag.metavar, help=option.help, show_default=False)

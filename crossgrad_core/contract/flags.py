@@ -21,8 +21,10 @@ class Flag:
         metavar: What the help shows for its value.
         heading: Heading under which the help lists it, one of `HEADINGS`; empty for an argument.
         name: Its name without dashes, where it is not the setting's.
+        common: Whether `--help` shows it; `--help-all` shows every option.
     """
 
     metavar: str
     heading: str = ""
     name: str = ""
+    common: bool = False

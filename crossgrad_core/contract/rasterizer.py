@@ -62,6 +62,18 @@ class Rasterizer(Component):
         """
         return 0.0
 
+    @classmethod
+    def missing(cls, device: str) -> str:  # noqa: ARG003 - for those that need a package
+        """Return what it lacks on this machine to run on a device, and how to install it.
+
+        Empty where nothing is missing, or where it does not run on the device at all. `--device
+        auto` shows it if a GPU is there and no rasterizer uses it.
+
+        Args:
+            device: Torch device type.
+        """
+        return ""
+
     def burn_in(self, device: str) -> None:
         """Finds out before a run trains whether this machine draws rightly; by default does not.
 

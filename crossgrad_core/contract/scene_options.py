@@ -13,7 +13,7 @@ class SceneOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_size: Annotated[int | None, Flag("PIXELS", SCENE)] = Field(
+    max_size: Annotated[int | None, Flag("PIXELS", SCENE, common=True)] = Field(
         None, ge=16, description="Longest image side; larger photos are resized."
     )
     split: Annotated[

@@ -6,7 +6,7 @@ the wrong kind are errors that name the plugin and its distribution.
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
@@ -18,7 +18,7 @@ from crossgrad_core.registry.changes import Change, change_of, change_of_import
 from crossgrad_core.registry.places import defined_at, raised_at
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS, QUICK
 from crossgrad_core.registry.strays import strays
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
@@ -191,6 +191,21 @@ def notes_on(error: BaseException) -> list[str]:
     return list(reversed(getattr(error, "__notes__", ())))
 
 
+def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
+    """Return the function that answers for a component before its class is imported, or None.
+
+    A package may announce one under the name of its component: one that answers as `accepts` of
+    the reader with its default options, or as `speed` of the rasterizer.
+
+    Raises:
+        UserError: It cannot be imported.
+    """
+    for each in _offers(tuple(sys.path))[QUICK[entry.slot]]:
+        if (each.name, each.distribution) == (entry.name, entry.distribution):
+            return cast("Callable[[Any], Any]", resolve_entry(each))
+    return None
+
+
 def failed_plugin(error: Exception) -> UserError | None:
     """What to say of an exception that came out of another package's code; None of our own."""
     others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
@@ -288,12 +303,16 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
     # One unfiltered call: each one scans every installed distribution.
     points = entry_points()
     found: dict[str, tuple[Entry, ...]] = {}
-    for slot, group in {**OFFERED, PLANNERS: f"crossgrad.{PLANNERS}"}.items():
+    groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]
+    for key, slot, group in [
+        *((slot, slot, group) for slot, group in groups),
+        *((group, slot, group) for slot, group in QUICK.items()),
+    ]:
         described = (
             Entry(point.name, slot, point.value, *_identity(point.dist))
             for point in points.select(group=group)
         )
-        found[slot] = tuple(sorted(described, key=lambda entry: (entry.name, entry.distribution)))
+        found[key] = tuple(sorted(described, key=lambda entry: (entry.name, entry.distribution)))
     return found
 
 

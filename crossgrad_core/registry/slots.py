@@ -30,5 +30,11 @@ COMMANDS: Final = "commands"
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
 #: What decides settings of a run by its scene (`--plan`); no slot of a run either.
 PLANNERS: Final = "planners"
+#: Slot -> entry-point group of the functions that answer a question of `auto` before a component is
+#: imported: `accepts` of a reader, `speed` of a rasterizer.
+QUICK: Final = {
+    "readers": "crossgrad.readers.accepts",
+    "rasterizers": "crossgrad.rasterizers.speed",
+}
 #: The core's own commands, which no plugin replaces.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")

@@ -22,6 +22,7 @@ from crossgrad_core.registry.entries import (
     entries,
     find,
     from_elsewhere,
+    quick_answer,
     refuse_other_version,
 )
 from crossgrad_core.registry.manager import make_manager
@@ -30,6 +31,7 @@ from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.select import select
+from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import note_on_axes
@@ -73,17 +75,22 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
 
 def accepts(name: str, path: Path) -> bool:
     """Whether a reader takes the folder; one that fails does not keep the others from it."""
-    return _answer(name, lambda reader: reader.accepts(path))
+    return _answer(name, lambda: _accepts(name, path))
 
 
 def nearly_accepts(name: str, path: Path) -> bool:
     """Whether a file in the folder is nearly of a reader's format; see `accepts`."""
-    return _answer(name, lambda reader: reader.nearly_accepts(path))
+    return _answer(name, lambda: build(Reader, name, {}).nearly_accepts(path))
 
 
-def _answer(name: str, question: Callable[[Reader], bool]) -> bool:
+def _accepts(name: str, path: Path) -> bool:
+    quick = quick_answer(find("readers", name))
+    return bool(build(Reader, name, {}).accepts(path) if quick is None else quick(path))
+
+
+def _answer(name: str, question: Callable[[], bool]) -> bool:
     try:
-        return question(build(Reader, name, {}))
+        return question()
     except Exception as error:
         _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
         return False
@@ -96,7 +103,8 @@ def check_names(config: RunConfig) -> None:
         UserError: A name does not exist, with the closest one that does, or its package requires
             another version of crossgrad.
     """
-    choose_device(config.device)
+    if config.device != AUTO:
+        choose_device(config.device)
     named = [("operators", link) for link in config.operators]
     named += [(slot, choice) for slot in LISTS for choice in getattr(config, slot)]
     single = (slot for slot in GROUPS if slot not in {"operators", *LISTS})
@@ -117,6 +125,8 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     Raises:
         UserError: A name or option is wrong, or the components cannot work together.
     """
+    config, of_device = with_device(config)
+    scene = replace(scene, notes=(*of_device, *scene.notes))
     plan = None
     if config.plan != "off":
         config, plan = planned(config, scene)

@@ -2,7 +2,7 @@
 
 import torch
 
-from crossgrad_core.config import RunConfig
+from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.errors import UserError
 
 
@@ -14,7 +14,7 @@ def check_clock(config: RunConfig) -> None:
     """
     if config.seconds is None or config.clock == "wall":
         return
-    if torch.device(config.device).type != "cpu":
+    if config.device != AUTO and torch.device(config.device).type != "cpu":
         raise UserError(
             "CPU time does not tell what a GPU does",
             where="--clock cpu",

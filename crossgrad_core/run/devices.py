@@ -17,8 +17,8 @@ def choose_device(name: str) -> torch.device:
         raise UserError(
             f"there is no device {name!r}",
             where="--device",
-            expected="cpu, cuda or cuda:N",
-            todo="leave --device out to run on the CPU",
+            expected="auto, cpu, cuda or cuda:N",
+            todo="leave --device out to run on a GPU if one can be used, or use --device cpu",
         ) from error
     if device.type not in {"cpu", "cuda"}:
         raise UserError(

@@ -39,6 +39,7 @@ from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
 from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.run.stand_ins import REPLACEABLE, as_it_was, without_missing
+from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
 from crossgrad_core.training.budget import caught_up
@@ -67,7 +68,7 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
             error,
             RunConfig,
             subject="a run",
-            todo="docs/settings.md lists every setting, crossgrad run --help those with options",
+            todo="docs/settings.md lists every setting, crossgrad run --help-all every option",
         ) from error
 
 
@@ -255,7 +256,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
             todo=error.todo,
         ) from error
     if "device" in settings:
-        return drawn_elsewhere(config)
+        return drawn_elsewhere(with_device(config)[0])
     _check_device(config.device, folder)
     return config
 

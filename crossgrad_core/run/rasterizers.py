@@ -1,13 +1,16 @@
 """Which rasterizer draws where the user names none, or where that of a run has no device."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import entries, load
+from crossgrad_core.registry.entries import entries, find, load, quick_answer
 from crossgrad_core.wording import in_one_line, listed
 
 _LOG = logging.getLogger(__name__)
@@ -40,11 +43,22 @@ class Wanted:
         )
 
 
+def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densifier) -> Wanted:
+    """Return what a run asks of its rasterizer on a device type."""
+    return Wanted(
+        device=device,
+        response=backbone.response,
+        outputs=densifier.needs,
+        options=frozenset({"footprint"} if config.preset == "inria" else ()),
+    )
+
+
 def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
     """The name of the rasterizer, and notes on why it was chosen.
 
     Every installed one says how fast it is on the device; the fastest that can do what is wanted is
-    taken, of equally fast ones the first by name. One that cannot be imported is left out.
+    taken, of equally fast ones the first by name; if none can, the fastest, and objections say why.
+    One that cannot be imported is left out. Slower ones are not imported.
 
     Args:
         name: What the user asked for; `auto` leaves it open.
@@ -55,17 +69,36 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
     """
     if name != AUTO:
         return name, (f"rasterizer {name}: asked for",)
-    speeds, notes = _speeds(wanted)
+    speeds, notes = speeds_on(wanted.device)
     if not speeds:
         raise UserError(
             f"no installed rasterizer runs on device {wanted.device}",
             where="--rasterizer",
             todo="install one, or use --device cpu",
         )
-    chosen = min(speeds, key=lambda each: (-speeds[each], each))
-    others = [each for each in speeds if each != chosen]
-    why = f"the fastest of {len(speeds)} here" if others else "the only one here that runs"
+    chosen = fastest_able(speeds, wanted, notes) or _ranked(speeds)[0]
+    why = f"the fastest of {len(speeds)} here" if len(speeds) > 1 else "the only one here that runs"
     return chosen, (*notes, f"rasterizer {chosen}: {why} on {wanted.device}")
+
+
+def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) -> str | None:
+    """Return the fastest rasterizer that can do what is wanted; None if none can.
+
+    Args:
+        speeds: Name -> speed.
+        wanted: What the run asks of it.
+        notes: Gets a line for each faster one that is left out.
+    """
+    for name in _ranked(speeds):
+        try:
+            lacks = wanted.lacking(load(Rasterizer, name))
+        except UserError as error:
+            notes.append(f"rasterizer {name} left out: {error.what}")
+            continue
+        if not lacks:
+            return name
+        notes.append(f"rasterizer {name} left out: this run needs {listed(lacks)}")
+    return None
 
 
 def drawn_elsewhere(config: RunConfig) -> RunConfig:
@@ -79,7 +112,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
     name, device = config.rasterizer.name, config.device.partition(":")[0]
     if name == AUTO or device in load(Rasterizer, name).devices:
         return config
-    others, _ = _speeds(Wanted(device, "plain"))
+    others, _ = speeds_on(device)
     if not others:
         return config
     shared = set.intersection(*(set(load(Rasterizer, each).model_fields) for each in others))
@@ -89,23 +122,26 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
     return config.model_copy(update={"rasterizer": choice})
 
 
-def _speeds(wanted: Wanted) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Name -> speed of those that do all that is wanted, or else of all; notes on the others."""
-    able: dict[str, float] = {}
-    running: dict[str, float] = {}
+def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
+    """Return name -> speed of the rasterizers that run on a device type, and notes on broken ones.
+
+    Those that answer before they are imported are not imported.
+    """
+    speeds: dict[str, float] = {}
     notes = []
     for name in entries("rasterizers"):
         try:
-            rasterizer = load(Rasterizer, name)
-            speed = rasterizer.speed(wanted.device)
+            quick = quick_answer(find("rasterizers", name))
+            speed = float((load(Rasterizer, name).speed if quick is None else quick)(device))
         except Exception as error:
             why = getattr(error, "what", in_one_line(error))
             notes.append(f"rasterizer {name} left out: {why}")
             continue
         if speed > 0.0:
-            running[name] = speed
-            if lacks := wanted.lacking(rasterizer):
-                notes.append(f"rasterizer {name} left out: this run needs {listed(lacks)}")
-            else:
-                able[name] = speed
-    return able or running, tuple(notes)
+            speeds[name] = speed
+    return speeds, notes
+
+
+def _ranked(speeds: Mapping[str, float]) -> list[str]:
+    """Return the names, the fastest first, equally fast ones by name."""
+    return sorted(speeds, key=lambda name: (-speeds[name], name))

@@ -32,7 +32,7 @@ from crossgrad_core.defaults import (
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
-from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.rasterizers import choose_rasterizer, demands
 from crossgrad_core.run.results.metrics_csv import columns_for
 from crossgrad_core.run.usual_densifier import usual_densifier
 from crossgrad_core.run.usual_resolution import usual_resolution
@@ -70,12 +70,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
             f"densifier {usual}, as in short runs of many photos (--densifier {of_backbone}: that "
             "of the backbone)"
         )
-    wanted = Wanted(
-        device=device.type,
-        response=backbone.response,
-        outputs=densifier.needs,
-        options=frozenset({"footprint"} if config.preset == "inria" else ()),
-    )
+    wanted = demands(config, device.type, backbone, densifier)
     rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
     notes += choosing
     options = _rasterizer_options(config, scene, rasterizer_name)

@@ -11,6 +11,7 @@ from crossgrad_core.contract.schedule import REFERENCE
 from crossgrad_core.defaults import DENSIFIER, SHORT_DENSIFIER
 from crossgrad_core.registry.entries import load
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.run.usual_resolution import counts_as_short, is_plain
 from crossgrad_core.training.schedules import growth_by
 
@@ -33,7 +34,8 @@ def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, phot
     """
     usual = backbone.default_densifier
     suits = usual == DENSIFIER and is_plain(backbone) and photos >= MANY_PHOTOS
-    here = suits and config.device.partition(":")[0] == "cpu" and _is_led(config, views)
+    led = suits and _is_led(config, views)
+    here = led and with_device(config)[0].device.partition(":")[0] == "cpu"
     return SHORT_DENSIFIER if here and _is_heard(config, backbone) else usual
 
 

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from typer.core import TyperCommand
+import typer
+from typer.core import TyperCommand, TyperOption
 from typing_extensions import override
 
 if TYPE_CHECKING:
@@ -27,3 +28,18 @@ class GroupedCommand(TyperCommand):
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
+
+
+def print_all_options(context: typer.Context, wanted: bool) -> None:
+    """Print the help with the options that `--help` hides, and end the command.
+
+    Args:
+        context: The command.
+        wanted: Whether the user asked for it.
+    """
+    if wanted:
+        for parameter in context.command.params:
+            if isinstance(parameter, TyperOption):
+                parameter.hidden = False
+        typer.echo(context.get_help())
+        raise typer.Exit

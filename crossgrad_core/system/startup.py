@@ -1,4 +1,4 @@
-"""Progress before a command's first result: a line for each stage, kernels with a clock.
+"""Progress before a command's first result: a line for each stage, compiling with a clock.
 
 Listens to the log of the package; what takes long says so there (`reading scene ...`), and so does
 the cache of kernels before it compiles one. Nothing heavy is imported.
@@ -18,13 +18,10 @@ from crossgrad_core.wording import one_line
 
 #: The logger that speaks of kernels, and how its messages begin.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
-#: Seconds between lines about kernels where stderr is no terminal, and where it is one.
-PLAIN_INTERVAL, TERMINAL_INTERVAL = 10.0, 1.0
+#: Seconds between lines about compiling where stderr is no terminal, and where it is one.
+PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
-_EXPLANATION = (
-    "compiling kernels for this machine: only before the first start with these parts, usually "
-    "within a minute"
-)
+_EXPLANATION = "compiling for this machine, before the first start only (about a minute)"
 
 
 def announce(*, quiet: bool = False) -> None:
@@ -55,7 +52,7 @@ class _Startup(logging.Handler):
 
     def __init__(self, level: int) -> None:
         super().__init__(level)
-        self._kernels = _Kernels()
+        self._compiling = _Compiling()
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
@@ -64,61 +61,58 @@ class _Startup(logging.Handler):
         if record.levelno >= logging.WARNING:
             _say(f"note: {text}")
         elif record.name != KERNELS:
-            self._kernels.end()
+            self._compiling.end()
             if record.levelno >= logging.INFO:
                 _say(text)
         elif text.startswith("compiling "):
-            self._kernels.begin(text.partition(" ")[2])
+            self._compiling.begin()
         else:
-            self._kernels.done()
+            self._compiling.done()
 
     @override
     def close(self) -> None:
         """Says nothing more."""
-        self._kernels.stop()
+        self._compiling.stop()
         super().close()
 
 
-class _Kernels:
-    """Tells how long kernels have been compiled, from a thread: one of them may take ten seconds.
+class _Compiling:
+    """Shows the seconds of compiling, from a thread, because one kernel may take ten seconds.
 
-    A kernel that another one calls is compiled inside it.
+    On a terminal all is one line. A kernel that another one calls is compiled inside it.
     """
 
     def __init__(self) -> None:
-        self._names: list[str] = []
-        self._count, self._seconds, self._began = 0, 0.0, 0.0
+        self._depth, self._seconds, self._began = 0, 0.0, 0.0
         self._over = Event()
         self._thread: Thread | None = None
 
-    def begin(self, name: str) -> None:
+    def begin(self) -> None:
         """A kernel is going to be compiled."""
         if self._thread is None:
-            _say(_EXPLANATION)
+            _say(_EXPLANATION, stays=not is_live(sys.stderr))
             self._over.clear()
             self._thread = Thread(target=self._tell, name="crossgrad-startup", daemon=True)
             self._thread.start()
-        if not self._names:
+        if not self._depth:
             self._began = monotonic()
-        self._names.append(name)
-        self._count += 1
+        self._depth += 1
 
     def done(self) -> None:
         """The kernel that began last is compiled."""
-        self._names = self._names[:-1]
-        if not self._names:
+        self._depth -= 1
+        if not self._depth:
             self._seconds += monotonic() - self._began
 
     def end(self) -> None:
-        """Says what all of them took."""
+        """Say what all kernels took."""
         if not self.stop():
             return
-        kernels = "kernel" if self._count == 1 else "kernels"
-        _say(f"compiled {self._count} {kernels} in {self._seconds:.0f} s")
-        self._count, self._seconds = 0, 0.0
+        _say(f"compiled in {self._seconds:.0f} s")
+        self._seconds = 0.0
 
     def stop(self) -> bool:
-        """Ends the clock; whether there was one."""
+        """End the clock; return whether there was one."""
         if self._thread is None:
             return False
         self._over.set()
@@ -129,10 +123,9 @@ class _Kernels:
     def _tell(self) -> None:
         terminal = is_live(sys.stderr)
         while not self._over.wait(TERMINAL_INTERVAL if terminal else PLAIN_INTERVAL):
-            if names := self._names:
+            if self._depth:
                 seconds = self._seconds + monotonic() - self._began
-                text = f"  {seconds:.0f} s, kernel {self._count}: {names[0]}"
-                _say(text, stays=not terminal)
+                _say(f"{_EXPLANATION}: {seconds:.0f} s", stays=not terminal)
 
 
 def _say(text: str, *, stays: bool = True) -> None:

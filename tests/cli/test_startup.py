@@ -1,4 +1,4 @@
-"""A command says at once what it does, and tells of kernels only where it compiles some."""
+"""A command says at once what it does, and shows compiling only where it compiles."""
 
 import logging
 import subprocess
@@ -59,7 +59,7 @@ def test_stages_are_lines_and_kernels_are_told_only_when_they_are_compiled(annou
     assert lines[1:] == ["loading kernels", "training"]
 
 
-def test_compiling_is_told_with_a_clock_that_runs_inside_a_kernel(announced, capsys, monkeypatch):
+def test_compiling_is_shown_with_a_clock_that_runs_inside_a_kernel(announced, capsys, monkeypatch):
     monkeypatch.setattr(startup, "PLAIN_INTERVAL", 0.02)
     announced()
     STAGES.info("loading kernels")
@@ -74,11 +74,23 @@ def test_compiling_is_told_with_a_clock_that_runs_inside_a_kernel(announced, cap
     assert capsys.readouterr().err == ""  # nothing is compiled now
     STAGES.debug("loaded")
     assert quiet[2] == startup._EXPLANATION
-    assert len(quiet) > 4 and set(quiet[4:]) == {"  0 s, kernel 2: outer"}
-    assert capsys.readouterr().err == "compiled 2 kernels in 0 s\n"
+    assert len(quiet) > 4 and set(quiet[3:]) == {f"{startup._EXPLANATION}: 0 s"}
+    assert capsys.readouterr().err == "compiled in 0 s\n"
 
 
-def test_on_a_terminal_the_clock_stays_on_its_line(announced, capsys, monkeypatch):
+def test_a_log_gets_two_lines_of_a_minute_of_compiling_and_no_kernel(announced, capsys):
+    announced()
+    for name in ("one", "two", "three"):
+        LOG.info("compiling %s", name)
+        time.sleep(0.05)
+        LOG.info("compiled %s", name)
+    STAGES.debug("loaded")
+    assert startup.PLAIN_INTERVAL >= 60
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:] == [startup._EXPLANATION, "compiled in 0 s"]
+
+
+def test_on_a_terminal_compiling_is_one_line(announced, capsys, monkeypatch):
     monkeypatch.setattr(startup, "TERMINAL_INTERVAL", 0.02)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     announced()
@@ -86,9 +98,11 @@ def test_on_a_terminal_the_clock_stays_on_its_line(announced, capsys, monkeypatc
     time.sleep(0.1)
     STAGES.debug("loaded")
     lines = capsys.readouterr().err.split("\n")
-    assert len(lines) == 4 and lines[-1] == ""
-    assert lines[2].count("\r\x1b[K  0 s, kernel 1: one") > 1
-    assert lines[2].endswith("\r\x1b[Kcompiled 1 kernel in 0 s")
+    assert len(lines) == 3 and lines[-1] == ""
+    assert lines[1].count(f"\r\x1b[K{startup._EXPLANATION}: 0 s") > 1
+    assert lines[1].endswith("\r\x1b[Kcompiled in 0 s")
+    # A line that is longer than the terminal could not be overwritten.
+    assert len(f"{startup._EXPLANATION}: 999 s") <= 80
 
 
 def test_quiet_shows_warnings_only(announced, capsys):

@@ -69,7 +69,7 @@ def config_of(row: Row) -> RunConfig:
     }
     views = _several_views(choices["sampler"], choices["operator"])
     few = {"steps": 100, "views": views, "metrics": [{"name": "psnr"}], "start": {"name": "sfm"}}
-    return RunConfig.model_validate({**few, **choices, **_TIMES})
+    return RunConfig.model_validate({"device": "cpu", **few, **choices, **_TIMES})
 
 
 @cache

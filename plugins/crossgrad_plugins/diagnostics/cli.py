@@ -108,7 +108,11 @@ def diagnose(  # noqa: PLR0913, PLR0917 - one parameter per option of the comman
         ),
     ] = None,
     device: Annotated[
-        str | None, typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live.")
+        str | None,
+        typer.Option(
+            metavar="auto|cpu|cuda|cuda:N",
+            help="Where tensors live. Default: auto, or the device of --run.",
+        ),
     ] = None,
     threads: Annotated[
         int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")

@@ -68,7 +68,11 @@ def plan(  # noqa: PLR0913, PLR0917 - one parameter per option of the command li
     ] = None,
     device: Annotated[
         str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Where tensors live.", rich_help_panel=_RUN),
+        typer.Option(
+            metavar="auto|cpu|cuda|cuda:N",
+            help="Where tensors live. Default: auto.",
+            rich_help_panel=_RUN,
+        ),
     ] = None,
     threads: Annotated[
         int | None,

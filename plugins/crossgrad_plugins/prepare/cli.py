@@ -76,7 +76,7 @@ def prepare(  # noqa: PLR0913, PLR0917 - one parameter per option of the command
         typer.Option(
             metavar="DIR",
             help="Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, "
-            "folders masks beside photos, and files NAME_mask.png.",
+            "masks/ beside photos, NAME_mask.png.",
             rich_help_panel=_HOW,
         ),
     ] = None,

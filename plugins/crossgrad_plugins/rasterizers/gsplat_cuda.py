@@ -20,18 +20,14 @@ from crossgrad_core.plugin import (
     Selection,
     hookimpl,
 )
+from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.gpu.blended import counter
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
-from crossgrad_plugins.rasterizers.gpu.missing import (
-    bring_ninja,
-    compiler_missing,
-    package_missing,
-)
+from crossgrad_plugins.rasterizers.gpu.missing import bring_ninja
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-_PACKAGE = "gsplat"
 _GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
@@ -54,13 +50,18 @@ class GsplatRasterizer(Rasterizer):
     @classmethod
     @override
     def speed(cls, device: str) -> float:
-        return 100.0 if device in cls.devices and not _missing() else 0.0
+        return _speeds.gsplat(device)
+
+    @classmethod
+    @override
+    def missing(cls, device: str) -> str:
+        return _speeds.gsplat_missing() if device in cls.devices else ""
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
         """Objects where the package, or what it compiles its kernels with, is not there."""
-        missing = _missing() if selection.device in self.devices else None
-        return [missing] if missing else []
+        missing = self.missing(selection.device)
+        return [f"{missing}, or leave --rasterizer out"] if missing else []
 
     @override
     def burn_in(self, device: str) -> None:
@@ -137,10 +138,6 @@ class GsplatRasterizer(Rasterizer):
             )
             for view, screen in enumerate(screens)
         ]
-
-
-def _missing() -> str | None:
-    return package_missing(_PACKAGE) or compiler_missing(_PACKAGE)
 
 
 def _batch(tensors: Sequence[Tensor]) -> Tensor:

@@ -19,14 +19,12 @@ from crossgrad_core.plugin import (
     Selection,
     hookimpl,
 )
+from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
-from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-#: And what it is built on.
-_PACKAGES = ("gswarp", "warp")
 #: Depth up to which gswarp draws nothing, in the units that it is given.
 _NEAR = 0.2
 
@@ -54,7 +52,12 @@ class GswarpRasterizer(Rasterizer):
     @classmethod
     @override
     def speed(cls, device: str) -> float:
-        return 80.0 if device in cls.devices and not package_missing(*_PACKAGES) else 0.0
+        return _speeds.gswarp(device)
+
+    @classmethod
+    @override
+    def missing(cls, device: str) -> str:
+        return _speeds.gswarp_missing() if device in cls.devices else ""
 
     @hookimpl
     def crossgrad_objections(self, selection: Selection) -> list[str]:
@@ -62,8 +65,8 @@ class GswarpRasterizer(Rasterizer):
         if selection.device not in self.devices:
             return []
         reasons = []
-        if missing := package_missing(*_PACKAGES):
-            reasons.append(missing)
+        if missing := self.missing(selection.device):
+            reasons.append(f"{missing}, or leave --rasterizer out")
         if selection.backbone.own_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]
             reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")

@@ -19,6 +19,7 @@ from crossgrad_core.plugin import (
     Screen,
     UserError,
 )
+from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
@@ -46,7 +47,7 @@ class NumbaRasterizer(Rasterizer):
     @classmethod
     @override
     def speed(cls, device: str) -> float:
-        return 10.0 if device in cls.devices else 0.0
+        return _speeds.numba(device)
 
     @override
     def render(

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
 from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Response, Screen
+from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.reference.compositing import (
     Drawing,
@@ -49,7 +50,7 @@ class TorchRasterizer(Rasterizer):
     @classmethod
     @override
     def speed(cls, device: str) -> float:
-        return 1.0 if device in cls.devices else 0.0
+        return _speeds.torch(device)
 
     @override
     def render(

@@ -4,11 +4,14 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crossgrad_core.plugin import UserError, is_file
 from crossgrad_core.scene.pillow import opened
-from crossgrad_plugins.georeference.ellipsoid import Place
 from crossgrad_plugins.georeference.gps_tags import Numbers, gps_of, is_place
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.georeference.ellipsoid import Place
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,7 @@ class Measured:
     """
 
     source: str
-    places: Mapping[str, Place] = field(default_factory=dict)
+    places: "Mapping[str, Place]" = field(default_factory=dict)
     flat: int = 0
     strangers: tuple[str, ...] = ()
 
@@ -40,16 +43,20 @@ def of_headers(files: Mapping[str, Path], source: str) -> Measured:
 
 def measured(found: Iterable[tuple[str, Numbers | None]], source: str) -> Measured:
     """What is a place on Earth among numbers of photos."""
-    places: dict[str, Place] = {}
+    known: dict[str, Numbers] = {}
     flat = 0
     for name, numbers in found:
         if numbers is None or not is_place(*numbers[:2]):
             continue
         if math.isfinite(numbers[2]):
-            places[name] = Place(*numbers)
+            known[name] = numbers
         else:
             flat += 1
-    return Measured(source, places, flat)
+    if not known:
+        return Measured(source, flat=flat)
+    from crossgrad_plugins.georeference.ellipsoid import Place
+
+    return Measured(source, {name: Place(*numbers) for name, numbers in known.items()}, flat)
 
 
 def _header(path: Path) -> Numbers | None:

@@ -1,9 +1,9 @@
 """The place of a scene on Earth, from whatever tells it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,14 @@ from crossgrad_core.plugin import (
 from crossgrad_core.scene.photos import FilePhoto
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count
-from crossgrad_plugins.georeference.ellipsoid import Place, geocentric, place_at
-from crossgrad_plugins.georeference.fit import Fit, fit_similarity
-from crossgrad_plugins.georeference.frames import similarity_of
-from crossgrad_plugins.georeference.on_earth import RESIDUALS, OnEarth
-from crossgrad_plugins.georeference.projection import Projection
-from crossgrad_plugins.readers._geo_list import of_list
 from crossgrad_plugins.readers._gps import Measured, of_headers
 from crossgrad_plugins.readers._json import Fields, read_object
-from crossgrad_plugins.readers._priors import of_priors
+
+# Most scenes have no place: what computes with places is imported where one is found.
+if TYPE_CHECKING:
+    from crossgrad_plugins.georeference.ellipsoid import Place
+    from crossgrad_plugins.georeference.fit import Fit
+    from crossgrad_plugins.georeference.on_earth import OnEarth
 
 #: In the scene's folder: places of photos as OpenDroneMap takes them, and COLMAP's databases.
 _LIST: Final = "geo.txt"
@@ -66,7 +65,7 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
                 notes.append(f"{measured.source}: no photo of the scene is there, or has a place")
             continue
         found = _fitted(scene, shown, measured)
-        if isinstance(found, OnEarth):
+        if not isinstance(found, str):
             return at(replace(scene, notes=(*scene.notes, *notes)), found)
         notes.append(found)
     if not notes:
@@ -82,17 +81,24 @@ def _sources(
     if named is not None:
         yield _named(named, names)
         return
-    lists: list[tuple[Path, Callable[[Path], Measured]]] = [
-        (raw.root / _LIST, lambda path: of_list(path, names)),
-        *((raw.root / name, lambda path: of_priors(path, names)) for name in _DATABASES),
-    ]
-    for path, read in lists:
+    for path in (raw.root / name for name in (_LIST, *_DATABASES)):
         if is_file(path):
             try:
-                yield read(path)
+                yield _listed(path, names)
             except UserError as error:  # A run does not need it.
                 notes.append(f"{path.name} tells no places: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
+
+
+def _listed(path: Path, names: list[str]) -> Measured:
+    """The places in a list, or in a database of COLMAP."""
+    if path.suffix == ".db":
+        from crossgrad_plugins.readers._priors import of_priors
+
+        return of_priors(path, names)
+    from crossgrad_plugins.readers._geo_list import of_list
+
+    return of_list(path, names)
 
 
 def _file_of(view: View, raw: RawScene) -> Path:
@@ -113,11 +119,17 @@ def _named(path: Path, names: list[str]) -> Measured:
             expected="a folder with the photos as they were taken, or a list as geo.txt",
             todo="check the path",
         )
+    from crossgrad_plugins.readers._geo_list import of_list
+
     return of_list(path, names)
 
 
-def _fitted(scene: Scene, views: list[View], measured: Measured) -> OnEarth | str:
+def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | str":
     """The place by photos whose own places were measured, or why it cannot be told."""
+    from crossgrad_plugins.georeference.ellipsoid import geocentric, place_at
+    from crossgrad_plugins.georeference.fit import fit_similarity
+    from crossgrad_plugins.georeference.on_earth import OnEarth
+
     places = [measured.places[view.name] for view in views]
     numbers = np.array([[each.latitude, each.longitude, each.altitude] for each in places])
     earth = geocentric(numbers)
@@ -132,7 +144,7 @@ def _fitted(scene: Scene, views: list[View], measured: Measured) -> OnEarth | st
     return OnEarth(origin, fit.frame, f"{of}{left}", _residuals(fit))
 
 
-def _residuals(fit: Fit) -> dict[str, float]:
+def _residuals(fit: "Fit") -> dict[str, float]:
     """Metres, of the photos that were kept."""
     errors = fit.errors[fit.kept]
     return {
@@ -157,6 +169,10 @@ def by_code(scene: Scene, code: str) -> Scene:
     Raises:
         UserError: There is no such system, the scene lies outside of it, or it stretches unevenly.
     """
+    from crossgrad_plugins.georeference.ellipsoid import place_at
+    from crossgrad_plugins.georeference.on_earth import OnEarth
+    from crossgrad_plugins.georeference.projection import Projection
+
     where = f"reader.crs={code}"
     projection = Projection.of(code, where)
     middle = scene.similarity.offset
@@ -181,6 +197,9 @@ def by_file(scene: Scene, file: Path) -> Scene:
     Raises:
         UserError: The file cannot be read, or its transform is no similarity.
     """
+    from crossgrad_plugins.georeference.frames import similarity_of
+    from crossgrad_plugins.georeference.on_earth import RESIDUALS, OnEarth
+
     fields = read_object(file)
     frame = similarity_of(fields.numbers("transform", 4, 4))
     if frame is None:
@@ -192,12 +211,14 @@ def by_file(scene: Scene, file: Path) -> Scene:
     return at(scene, OnEarth(origin_of(fields.inner("origin")), frame, file.name, residuals))
 
 
-def origin_of(fields: Fields) -> Place:
+def origin_of(fields: Fields) -> "Place":
     """The place of an object with latitude, longitude and altitude.
 
     Raises:
         UserError: A number is missing, or is none on Earth.
     """
+    from crossgrad_plugins.georeference.ellipsoid import Place
+
     for key, most in (("latitude", 90.0), ("longitude", 180.0)):
         if abs(fields.number(key)) > most:
             fields.wrong(key, f"degrees from -{most:g} to {most:g}")

@@ -11,15 +11,14 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import read_object
 from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._raw import raw_scene
-from crossgrad_plugins.readers._sniff import begins_with
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
 
-_TRAIN: Final = "transforms_train.json"
 #: The first one that is there is held out; validation views are left out where there are others.
 _HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")
 _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
@@ -45,15 +44,15 @@ class BlenderReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return begins_with(path / self.folder / _TRAIN, b"{")
+        return _accepts.blender(path, self.folder)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
         # A scene's own folder has no name within it.
-        file = inside.name(_TRAIN, "reader.folder", self.folder)
-        base = file[: -len(_TRAIN)]
+        file = inside.name(_accepts.BLENDER_FILE, "reader.folder", self.folder)
+        base = file[: -len(_accepts.BLENDER_FILE)]
         train = _read(inside, file, base)
         held_out = next(
             (f"{base}{name}" for name in _HELD_OUT if (path / base / name).exists()), ""

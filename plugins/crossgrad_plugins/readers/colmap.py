@@ -16,10 +16,10 @@ from crossgrad_core.scene.point_cloud import NO_POINTS, PointCloud
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import (
     check_scene_folder,
     choose_model,
-    find_models,
 )
 from crossgrad_plugins.readers._colmap_model import model_files, read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
@@ -55,10 +55,7 @@ class ColmapReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        try:
-            return bool(find_models(path))
-        except OSError:
-            return False
+        return _accepts.colmap(path)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:

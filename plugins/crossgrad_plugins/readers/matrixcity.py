@@ -4,8 +4,6 @@ Source of the format: https://github.com/city-super/MatrixCity, README (NeRF's a
 metres; the rotation in `rot_mat` is to be multiplied by 100).
 """
 
-import re
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -18,19 +16,15 @@ from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.frames import rotation_of
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene
-from crossgrad_plugins.readers._sniff import holds
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_lens, transform_of
 
-_FILE: Final = "transforms.json"
-#: Folders in which blocks are looked for, and how deep: such as small_city/aerial/train/block_1.
-_FOLDER: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
-_DEEPEST: Final = 4
 _TO_UNIT: Final = 100.0
 _PHOTOS: Final = "rgb"
 
@@ -48,18 +42,19 @@ class MatrixCityReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return any(holds(path / name, b'"rot_mat"') for name in _files(Inside(path)))
+        return _accepts.matrixcity(path)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        files = _files(inside)
+        files = _accepts.pose_files(path)
         if not files:
             raise UserError(
                 "the scene has no block of MatrixCity",
                 where=path,
-                expected=f"{_FILE} with the poses and {_PHOTOS}/ with the photos of a block",
+                expected=f"{_accepts.TRANSFORMS_FILE} with the poses and {_PHOTOS}/ with the "
+                "photos of a block",
                 todo="name the folder of a block, or one that holds blocks",
             )
         frames = {name: _read(inside, name) for name in files}
@@ -73,25 +68,6 @@ class MatrixCityReader(Reader):
         raw = raw_scene(inside, images, views, points, f"MatrixCity: {blocks}, {points.note}")
         split = (frozenset(names) - test, test) if test else None
         return build_scene(replace(raw, split=split), options)
-
-
-def _files(inside: Inside) -> Sequence[str]:
-    """Names of the pose files of all blocks; that of the scene's own folder alone, if any."""
-    found = [path.relative_to(inside.scene).as_posix() for path in _walk(inside.scene, 0)]
-    return [_FILE] if _FILE in found else sorted(found)
-
-
-def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """The pose files in a folder and in those below that may be of this data set."""
-    try:
-        inner = [path for path in folder.iterdir() if _FOLDER.fullmatch(path.name)]
-    except OSError:
-        return
-    if (folder / _FILE).is_file():
-        yield folder / _FILE
-    for path in inner:
-        if depth < _DEEPEST and path.is_dir() and not path.is_symlink():
-            yield from _walk(path, depth + 1)
 
 
 def _is_test(name: str) -> bool:

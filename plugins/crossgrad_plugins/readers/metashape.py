@@ -27,11 +27,11 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.ellipsoid import place_at
 from crossgrad_plugins.georeference.frames import SAME, Frame3D, rotation_of
 from crossgrad_plugins.georeference.on_earth import OnEarth
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._equal_labels import Labelled, paired
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
 from crossgrad_plugins.readers._metashape_numbers import numbers
 from crossgrad_plugins.readers._metashape_rig import Rig
@@ -39,7 +39,6 @@ from crossgrad_plugins.readers._place import at, by_gps
 from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opencv
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
-from crossgrad_plugins.readers._sniff import head_of
 from crossgrad_plugins.readers._xml import read_xml
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
@@ -52,17 +51,6 @@ _GLOBAL: Final = (
 )
 #: Coordinate systems whose chunk transform leads to geocentric coordinates.
 _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
-
-
-def _is_metashape(path: Path) -> bool:
-    head = head_of(path)
-    return b"<document" in head and b"<chunk" in head
-
-
-_XML: Final = Kind(
-    *("XML", "Metashape", ".xml", _is_metashape),
-    "one file of File > Export > Export Cameras, with a chunk in a document",
-)
 
 
 class MetashapeReader(Reader):
@@ -87,13 +75,13 @@ class MetashapeReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return bool(_XML.find(Inside(path), self.file))
+        return _accepts.metashape(path, self.file)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        file = _XML.one(inside, self.file)
+        file = _accepts.METASHAPE.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
         chunk = _chunk(file)
         cameras, notes = _cameras(chunk, file)

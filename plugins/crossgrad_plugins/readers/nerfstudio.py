@@ -14,13 +14,13 @@ from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.split import has_lists
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.georeference.frames import Frame3D, rotation_of
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers._place import by_gps
 from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._raw import raw_scene
-from crossgrad_plugins.readers._sniff import begins_with, holds
 from crossgrad_plugins.readers._transforms import (
     photo_name,
     raw_views,
@@ -28,7 +28,6 @@ from crossgrad_plugins.readers._transforms import (
     transform_of,
 )
 
-_FILE = "transforms.json"
 #: The views that are trained on, and the held-out ones: those of the first list that has any.
 _TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"
 
@@ -42,7 +41,7 @@ class NerfstudioReader(Reader):
     train_list.txt or test_list.txt is.
     """
 
-    file: str = Field(_FILE, description="file of the frames within the scene")
+    file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
     points: str | None = Field(
         None,
         description="PLY of points within the scene; by itself what the file names, or one "
@@ -51,8 +50,7 @@ class NerfstudioReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        file = path / self.file
-        return begins_with(file, b"{") and not holds(file, b'"rot_mat"')
+        return _accepts.nerfstudio(path, self.file)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:

@@ -25,6 +25,7 @@ from crossgrad_core.scene.raw_checks import FARTHEST
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.frames import SAME
 from crossgrad_plugins.georeference.on_earth import OnEarth
+from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_json
@@ -32,10 +33,7 @@ from crossgrad_plugins.readers._lenses import Frame, refuse_lens
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import at, by_gps, origin_of
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
-from crossgrad_plugins.readers._sniff import begins_with
 
-#: OpenSfM's place, and that of a project of OpenDroneMap.
-_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
 _BYTE: Final = 255
 #: Below this many radians a rotation is its own sine.
 _SMALL: Final = 1e-12
@@ -57,7 +55,7 @@ class OpenSfmReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return any(begins_with(path / name, b"[") for name in self._names)
+        return _accepts.opensfm(path, self._names)
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
@@ -81,7 +79,7 @@ class OpenSfmReader(Reader):
 
     @property
     def _names(self) -> tuple[str, ...]:
-        return _FILES if self.file is None else (self.file,)
+        return _accepts.OPENSFM_FILES if self.file is None else (self.file,)
 
     def _find(self, inside: Inside) -> Path:
         names = [inside.name(name, "reader.file") for name in self._names]

@@ -23,11 +23,12 @@ from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
+from crossgrad_plugins.readers import _accepts
+from crossgrad_plugins.readers._accepts import COLUMNS, NAME_COLUMN, POSE_COLUMNS
 from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._columns import Columns, column_names
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._kind import Kind
 from crossgrad_plugins.readers._lenses import Frame, refuse_term
 from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers._place import by_gps
@@ -35,30 +36,10 @@ from crossgrad_plugins.readers._points import find_points
 from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_scene, raw_view
 
-_NAME: Final = "name"
-_POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-_NEEDED: Final = frozenset({_NAME, *_POSE, "f"})
-#: A file with this many of the columns is meant to be one of RealityCapture.
-_NEARLY: Final = 5
 _SENSOR: Final = 36.0  # mm
 _TODO: Final = (
     "export it again: Registration, 'Internal/External camera parameters', as comma-separated text"
-)
-
-
-def _has_columns(path: Path) -> bool:
-    return {*Columns.of(path, _NEEDED).names} >= _NEEDED
-
-
-def _has_most_columns(path: Path) -> bool:
-    return len(_NEEDED & {*Columns.of(path, _NEEDED).names}) >= _NEARLY
-
-
-_CSV: Final = Kind(
-    *("CSV", "RealityCapture", ".csv", _has_columns),
-    f"one file with the columns #{_NAME}, {', '.join((*_POSE, 'f'))} ...",
-    _has_most_columns,
 )
 
 
@@ -78,17 +59,17 @@ class RealityCaptureReader(Reader):
 
     @override
     def accepts(self, path: Path) -> bool:
-        return bool(_CSV.find(Inside(path), self.file))
+        return _accepts.realitycapture(path, self.file)
 
     @override
     def nearly_accepts(self, path: Path) -> bool:
-        return bool(_CSV.find_near(Inside(path)))
+        return bool(_accepts.REALITYCAPTURE.find_near(Inside(path)))
 
     @override
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        file = _CSV.one(inside, self.file)
+        file = _accepts.REALITYCAPTURE.one(inside, self.file)
         images = inside.name(self.images, "reader.images")
         rows = _rows(file)
         photos = PhotoNames.of(path / images, (row.name for row in rows))
@@ -116,10 +97,12 @@ def _rows(file: Path) -> list[_Row]:
     Raises:
         UserError: The file cannot be read, lacks a column, or a row has another number of cells.
     """
-    columns = Columns.of(file, _NEEDED)
+    columns = Columns.of(file, COLUMNS)
     rows = read_rows(file, "the CSV of RealityCapture", _TODO, delimiter=columns.delimiter)
     header = columns.names
-    missing = [name for name in (f"#{_NAME}", *_POSE, "f") if name.strip("#") not in header]
+    missing = [
+        name for name in (f"#{NAME_COLUMN}", *POSE_COLUMNS, "f") if name.strip("#") not in header
+    ]
     if missing:
         raise _wrong(file, f"a column {missing[0]}", ", ".join(header) or "an empty file")
     twice = [name for name in header if name and header.count(name) > 1]
@@ -136,7 +119,7 @@ def _rows(file: Path) -> list[_Row]:
         if len(cells) < len(header) or any(cells[len(header) :]):
             raise _wrong(file, f"{len(header)} cells in line {number}", f"{len(row)} cells")
         named = dict(zip(header, cells, strict=False))
-        found.append(_Row(named[_NAME], _numbers(named, file, number)))
+        found.append(_Row(named[NAME_COLUMN], _numbers(named, file, number)))
     return found
 
 
@@ -165,8 +148,8 @@ def _wrong(file: Path, expected: str, found: str) -> UserError:
 
 
 def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView:
-    name = photos.full(row.name, inside, row.fields.where(_NAME))
-    x, y, up, heading, pitch, roll = (row.fields.number(key) for key in _POSE)
+    name = photos.full(row.name, inside, row.fields.where(NAME_COLUMN))
+    x, y, up, heading, pitch, roll = (row.fields.number(key) for key in POSE_COLUMNS)
     rotation = rotation_of_angles(heading, pitch, roll)
     pose = from_opengl(rotation, np.array([x, y, up]))
     return raw_view(name, _lens(row.fields, inside.scene / images / name), pose)

@@ -130,7 +130,7 @@ def test_what_is_too_faint_to_draw_counts_as_seen(name):
 
 def options_of(**settings):
     scene = replace(sample_scene(), similarity=replace(sample_scene().similarity, scale=0.01))
-    config = RunConfig.model_validate({"steps": 5, **settings})
+    config = RunConfig.model_validate({"steps": 5, "device": "cpu", **settings})
     selection, _ = selecting.select(config, scene, "none")
     return selection.rasterizer
 

@@ -4,8 +4,9 @@ import pytest
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_plugins.readers._accepts import is_held_out
 from crossgrad_plugins.readers.colmap import ColmapReader
-from crossgrad_plugins.readers.uc_gs import UcGsReader, is_test
+from crossgrad_plugins.readers.uc_gs import UcGsReader
 
 
 def read(path, **options):
@@ -48,7 +49,7 @@ def test_lists_of_the_user_come_first(tmp_path):
     ],
 )
 def test_what_is_held_out(name, held_out):
-    assert is_test(name) is held_out
+    assert is_held_out(name) is held_out
 
 
 def test_other_scenes_are_left_to_colmap(tmp_path):

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import torch
 from pydantic import field_validator
@@ -12,9 +12,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import Compared, Field, Figure, Metric, Selection, hookimpl, masked
-from crossgrad_plugins.metrics.perceptual.distance import distance
 from crossgrad_plugins.metrics.perceptual.trunks import Trunk
-from crossgrad_plugins.metrics.perceptual.weights import Weights, read_weights
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.metrics.perceptual.weights import Weights
 
 #: How images enter the network, for summary.json.
 IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
@@ -87,6 +88,8 @@ class Perceptual(Metric):
         small = min(compared.render.shape[:2]) < self.net.smallest
         if self.trunk is None or small or (mask is not None and not bool(mask.any())):
             return None
+        from crossgrad_plugins.metrics.perceptual.distance import distance
+
         render, photo = (
             self.entering(masked(image.to(torch.float32) / 255, mask))
             for image in (compared.render, compared.photo)
@@ -97,10 +100,12 @@ class Perceptual(Metric):
     def entering(self, image: Tensor) -> Tensor:
         """An image [H, W, 3] in [0, 1] as it enters the network."""
 
-    def _weights(self, trunk: Path) -> Weights:
+    def _weights(self, trunk: Path) -> "Weights":
         return _kept(self.net, trunk, self.heads, f"metrics.{self.entry}")
 
 
 @lru_cache(maxsize=4)
-def _kept(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> Weights:
+def _kept(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> "Weights":
+    from crossgrad_plugins.metrics.perceptual.weights import read_weights
+
     return read_weights(net, trunk, heads, setting)

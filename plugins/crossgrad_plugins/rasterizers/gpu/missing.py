@@ -19,7 +19,7 @@ def package_missing(package: str, *others: str) -> str | None:
         return None
     return (
         f"rasterizer {package} needs the package {lacks}, which is not installed: "
-        f"pip install 'crossgrad[{package}]', or leave --rasterizer out"
+        f"pip install 'crossgrad[{package}]'"
     )
 
 

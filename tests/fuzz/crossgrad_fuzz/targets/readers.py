@@ -214,8 +214,6 @@ def _target(
         _inside: ("Inside.files",),
         # Files that options name, or of which there are none or several.
         _kind: ("Kind.one",),
-        matrixcity: ("_walk",),
-        uc_gs: ("_names",),  # folders of more photos than are looked at
         # Sizes that no input has, and what other formats have.
         _json: ("read_object", "Fields.texts"),
         _xml: ("_parsed", "_Builder.start"),

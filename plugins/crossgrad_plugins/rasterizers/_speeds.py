@@ -1,0 +1,44 @@
+"""How fast each rasterizer is on a device, answered without importing the rasterizers.
+
+The entry points of the group `crossgrad.rasterizers.speed` name these functions; the scale is that
+of `Rasterizer.speed`.
+"""
+
+from typing import Final
+
+#: gswarp, and the package that it is built on.
+GSWARP_PACKAGES: Final = ("gswarp", "warp")
+
+
+def gsplat(device: str) -> float:
+    """Return the speed of gsplat, 0 where its package or a compiler is missing."""
+    return 100.0 if device == "cuda" and not gsplat_missing() else 0.0
+
+
+def gswarp(device: str) -> float:
+    """Return the speed of gswarp, 0 where a package is missing."""
+    return 80.0 if device == "cuda" and not gswarp_missing() else 0.0
+
+
+def numba(device: str) -> float:
+    """Return the speed of the compiled kernels."""
+    return 10.0 if device == "cpu" else 0.0
+
+
+def torch(device: str) -> float:
+    """Return the speed of the reference."""
+    return 1.0 if device in {"cpu", "cuda"} else 0.0
+
+
+def gsplat_missing() -> str:
+    """Return what gsplat lacks on this machine and how to install it; empty if nothing."""
+    from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
+
+    return package_missing("gsplat") or compiler_missing("gsplat") or ""
+
+
+def gswarp_missing() -> str:
+    """Return what gswarp lacks on this machine and how to install it; empty if nothing."""
+    from crossgrad_plugins.rasterizers.gpu.missing import package_missing
+
+    return package_missing(*GSWARP_PACKAGES) or ""

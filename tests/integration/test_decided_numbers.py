@@ -1,0 +1,21 @@
+"""Every number that a run decides by itself is the one that is written down."""
+
+import json
+
+import pytest
+from support.decided import PATH, as_json, combinations, decided
+
+CHUNK = 25
+KNOWN = json.loads(PATH.read_text(encoding="utf-8"))
+CHOSEN = list(combinations())
+
+
+def test_the_file_has_all_combinations():
+    assert [name for name, _ in CHOSEN] == [*KNOWN]
+
+
+@pytest.mark.parametrize("first", range(0, len(CHOSEN), CHUNK))
+def test_decided_numbers_are_the_known_ones(first):
+    chunk = CHOSEN[first : first + CHUNK]
+    found = {name: json.loads(as_json(decided(settings))) for name, settings in chunk}
+    assert found == {name: KNOWN[name] for name, _ in chunk}

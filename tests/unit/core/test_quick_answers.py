@@ -1,0 +1,82 @@
+"""`auto` asks readers and rasterizers without importing them, if their package announces how."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+from support.distributions import write_distribution
+
+from crossgrad_core.registry.entries import entries, find, load, quick_answer
+from crossgrad_core.run.assemble import accepts
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+
+ACCEPTS = "def made_up(path):\n    return (path / 'made-up.txt').is_file()\n"
+FAILS = "def made_up(path):\n    raise RuntimeError('no answer')\n"
+BROKEN = "raise RuntimeError('imported')\n"
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """A package whose reader cannot be imported, and which announces a quick answer."""
+
+    def put(source):
+        plugins = {
+            "readers": {"made-up": "made_up_reader:Reader"},
+            "readers.accepts": {"made-up": "made_up_quick:made_up"},
+        }
+        modules = {"made_up_reader": BROKEN, "made_up_quick": source}
+        write_distribution(tmp_path / "site", "made-up", plugins, modules)
+        monkeypatch.syspath_prepend(tmp_path / "site")
+
+    yield put
+    sys.modules.pop("made_up_quick", None)
+
+
+@pytest.mark.parametrize(("slot", "method"), [("readers", "accepts"), ("rasterizers", "speed")])
+def test_each_of_ours_announces_one(slot, method):
+    for name, entry in entries(slot).items():
+        assert quick_answer(entry) is not None, name
+        assert callable(getattr(load(slot, name), method))
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda", "mps"])
+def test_rasterizers_answer_as_their_classes(device):
+    for name, entry in entries("rasterizers").items():
+        assert quick_answer(entry)(device) == load("rasterizers", name).speed(device)
+
+
+def test_a_reader_is_not_imported_to_be_asked(install, tmp_path):
+    install(ACCEPTS)
+    assert not accepts("made-up", tmp_path)
+    (tmp_path / "made-up.txt").touch()
+    assert accepts("made-up", tmp_path)
+
+
+def test_an_answer_that_fails_leaves_the_reader_out(install, tmp_path, caplog):
+    install(FAILS)
+    assert not accepts("made-up", tmp_path)
+    assert "reader made-up left out: RuntimeError: no answer" in caplog.text
+
+
+def test_only_the_package_of_a_component_answers_for_it(install):
+    install(ACCEPTS)
+    entry = find("readers", "made-up")
+    assert quick_answer(entry) is not None
+    assert quick_answer(replace(entry, distribution="another")) is None
+
+
+def test_a_rasterizer_that_answers_and_cannot_be_imported_is_left_out(tmp_path, monkeypatch):
+    plugins = {
+        "rasterizers": {"made-up": "made_up_rasterizer:Rasterizer"},
+        "rasterizers.speed": {"made-up": "made_up_speed:speed"},
+    }
+    modules = {
+        "made_up_rasterizer": BROKEN,
+        "made_up_speed": "def speed(device):\n    return 500.0\n",
+    }
+    write_distribution(tmp_path, "made-up", plugins, modules)
+    monkeypatch.syspath_prepend(tmp_path)
+    name, notes = choose_rasterizer("auto", Wanted("cpu", "plain"))
+    assert name == "numba"
+    assert notes[0] == "rasterizer made-up left out: rasterizer made-up cannot be imported"
+    sys.modules.pop("made_up_speed", None)
