@@ -60,7 +60,8 @@ _RESUMING: Final = (
         "accept_scene",
         bool,
         "--accept-scene",
-        help="With --resume: go on although photos, masks or points of the scene have changed.",
+        help="Go on although points, poses and photos of the scene contradict each other; with "
+        "--resume, although photos, masks or points have changed.",
     ),
 )
 _LAST: Final = (

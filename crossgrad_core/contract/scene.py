@@ -1,6 +1,6 @@
 """The data types of a scene."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, Self
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.georeference import UNPLACED, Georeference
 from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.state import Json
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +136,7 @@ class Scene:
             distance to neighbours tells. None: at all points.
         point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
         georeference: Where on Earth it is.
+        check: Figures of the check of the scene against itself; None before the check.
     """
 
     name: str
@@ -148,6 +150,7 @@ class Scene:
     point_sizes: NDArray[np.float64] | None = None
     point_opacities: NDArray[np.float64] | None = None
     georeference: Georeference = UNPLACED
+    check: Mapping[str, Json] | None = None
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
         """The scene with these of its points alone, [Q] rising; views know their new rows."""

@@ -1,0 +1,261 @@
+"""Whether the photos of a scene agree with its points, which do not, and why."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.scene.self_check.diagnosis import Bench, scores
+from crossgrad_core.scene.self_check.evidence import (
+    FEWEST,
+    Agreement,
+    Booleans,
+    Evidence,
+    observed,
+    tested,
+)
+from crossgrad_core.scene.self_check.rig import Integers
+from crossgrad_core.scene.self_check.trials import Trial, turns
+
+#: The scene disagrees as a whole if its better photos correlate with the points by less ...
+_LEAST: Final = 0.35
+#: ... or if more of its photos disagree.
+_MOST_BAD: Final = 0.6
+#: A photo disagrees below this share of the correlation of the better photos, if its points also
+#: have this many times the usual deviation from the colours that the photo predicts.
+_BAD: Final = 0.45
+_NOISY: Final = 1.5
+#: Share of observed points in frame below which the pose of a photo is wrong.
+_IN_FRAME: Final = 0.5
+#: A photo below this share of the correlation of the better photos is tried out, and another photo
+#: fits its pose if it correlates by so much more.
+_SUSPECT: Final = 0.65
+_FITS_BETTER: Final = 0.25
+#: Photos that a suspect is compared with, and suspects.
+_MOST_COMPARED: Final = 64
+_MOST_SUSPECTS: Final = 32
+#: Share of the correlation of the better photos that a photo reaches which fits.
+_FITS: Final = 0.7
+#: Points of a photo without tracks.
+_FEWEST_TESTED: Final = 3 * FEWEST
+#: The better photos: the upper quartile.
+_BETTER: Final = 0.75
+#: What a small change of all cameras gains at least if it is the cause.
+_GAIN_OF_ALL: Final = 0.08
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why some photos disagree.
+
+    Attributes:
+        views: The photos.
+        what: The cause.
+        todo: What the user can do.
+    """
+
+    views: tuple[int, ...]
+    what: str
+    todo: str
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The outcome for a scene.
+
+    Attributes:
+        compared: Photos that were compared with points.
+        correlation: Median correlation of colours; NaN if nothing could be compared.
+        in_frame: Median share of the observed points in frame; NaN without tracks.
+        all_wrong: Why the whole scene disagrees; None if it does not.
+        some_wrong: Why some photos disagree.
+        notes: What else was found.
+    """
+
+    compared: int
+    correlation: float
+    in_frame: float
+    all_wrong: Cause | None = None
+    some_wrong: tuple[Cause, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+_EXCHANGED: Final = (
+    "other photos fit their poses better",
+    "give each photo the name that its pose has in the model",
+)
+_STRANGE: Final = (
+    "their poses are wrong, or they show something else than the points",
+    "remove them from the model, or estimate their poses again",
+)
+_UNKNOWN: Final = Verdict(0, np.nan, np.nan)
+
+
+def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
+    """The outcome for some views of a scene.
+
+    Raises:
+        UserError: A photo cannot be decoded.
+    """
+    if len(scene.points) < FEWEST:
+        return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
+    has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
+    rows = np.asarray(views, dtype=np.int64)
+    groups = [
+        _Group.of(make(scene, rows[which]), rows[which])
+        for make, which in ((observed, has_tracks), (tested, ~has_tracks))
+        if which.any()
+    ]
+    verdict = groups[0].verdict()
+    if len(groups) > 1 and verdict.all_wrong is None:
+        held = groups[1].suspects()
+        verdict = replace(verdict, some_wrong=(*verdict.some_wrong, *held))
+    return verdict
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Photos with tracks, or photos without.
+
+    Attributes:
+        evidence: What they are compared with.
+        views: [V] rows of the views.
+        agreement: How well they agree as they are.
+        recolored: Whether the points' own colours say nothing, so that photos replace them.
+    """
+
+    evidence: Evidence
+    views: Integers
+    agreement: Agreement
+    recolored: bool = False
+
+    @classmethod
+    def of(cls, evidence: Evidence, views: Integers) -> "_Group":
+        group = cls(evidence, views, evidence.agreement(evidence.rig))
+        if not evidence.tracked or group.better >= _LEAST:
+            return group
+        by_photos = evidence.of_photos()
+        other = cls(by_photos, views, by_photos.agreement(by_photos.rig), True)
+        told = np.isfinite(group.agreement.correlation).any()
+        return other if not told or other.better >= _LEAST else group
+
+    @property
+    def better(self) -> float:
+        """The correlation of the better photos; 0 if no photo has one."""
+        known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
+        return float(np.quantile(known, _BETTER)) if len(known) else 0.0
+
+    @property
+    def told(self) -> Booleans:
+        """[V] photos about which something can be said."""
+        return np.isfinite(self.agreement.correlation) | self._out
+
+    @property
+    def _out(self) -> Booleans:
+        """[V] photos that have most of their observed points out of frame."""
+        if not self.evidence.tracked:
+            return np.zeros(len(self.views), dtype=np.bool_)
+        return np.asarray(self.agreement.share < _IN_FRAME)
+
+    def bad(self) -> Booleans:
+        """[V] photos that disagree."""
+        correlation, noise = self.agreement.correlation, self.agreement.noise
+        low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
+        good = np.isfinite(correlation) & ~low
+        usual = float(np.median(noise[good])) if good.any() else 0.0
+        unlike = low & (np.nan_to_num(noise) > _NOISY * usual)
+        return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
+
+    def verdict(self) -> Verdict:
+        """The outcome for these photos."""
+        correlation = self.agreement.correlation
+        known = np.isfinite(correlation)
+        verdict = Verdict(
+            int(self.told.sum()),
+            float(np.median(correlation[known])) if known.any() else np.nan,
+            float(np.nanmedian(self.agreement.share)) if self.evidence.tracked else np.nan,
+            notes=("the colours of the points say nothing; photos are compared with each other",)
+            if self.recolored
+            else (),
+        )
+        if not self.told.any():
+            return replace(verdict, notes=("colours of points and photos cannot be compared",))
+        bad = self.bad()
+        if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD:
+            return self._as_a_whole(verdict)
+        good = np.flatnonzero(self.told & ~bad)
+        bench = Bench(self.evidence, good)
+        if bench.is_off():
+            found = bench.diagnosis()
+            if found.trial is not None and found.after >= found.before + _GAIN_OF_ALL:
+                return replace(verdict, all_wrong=self._cause(found.trial))
+        return replace(verdict, some_wrong=self.suspects())
+
+    def _cause(self, trial: Trial) -> Cause:
+        return Cause(tuple(self.views.tolist()), trial.cause, trial.todo)
+
+    def _as_a_whole(self, verdict: Verdict) -> Verdict:
+        """The outcome if most photos disagree."""
+        cameras = np.arange(len(self.views))
+        found = Bench(self.evidence, cameras).diagnosis()
+        if found.repairs and found.trial is not None:
+            return replace(verdict, all_wrong=self._cause(found.trial))
+        unknown = Cause(
+            tuple(self.views.tolist()),
+            "poses, points and photos do not belong together, and no change that was tried "
+            "repairs it",
+            "check that model and photos are of the same reconstruction",
+        )
+        if self.evidence.tracked and (self._out.mean() > _MOST_BAD or not self.recolored):
+            return replace(verdict, all_wrong=unknown)
+        note = "colours of points and photos are unlike, so that nothing can be said"
+        return replace(verdict, notes=(*verdict.notes, note))
+
+    def suspects(self) -> tuple[Cause, ...]:
+        """Why single photos disagree."""
+        bad, correlation = self.bad(), self.agreement.correlation
+        if self.evidence.tracked:
+            tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
+        else:
+            tried = bad & (self.agreement.inside >= _FEWEST_TESTED)
+        rows = np.flatnonzero(tried)[:_MOST_SUSPECTS]
+        if not len(rows):
+            return ()
+        causes = []
+        exchanged = self._fitting_others(rows)
+        if len(exchanged):
+            causes.append(Cause(self._named(exchanged), *_EXCHANGED))
+        left = np.setdiff1d(rows, exchanged)
+        if len(left) and (common := self._in_common(left)) is not None:
+            causes.append(common)
+        elif self.evidence.tracked and len(left := left[bad[left]]):
+            causes.append(Cause(self._named(left), *_STRANGE))
+        return tuple(causes)
+
+    def _named(self, rows: Integers) -> tuple[int, ...]:
+        return tuple(self.views[rows].tolist())
+
+    def _in_common(self, rows: Integers) -> Cause | None:
+        """What repairs some photos together; a single one may only be mirrored or rotated."""
+        bench = Bench(self.evidence, rows)
+        found = bench.diagnosis() if len(rows) > 1 else bench.best(turns())
+        if found.trial is None or not found.repairs:
+            return None
+        return Cause(self._named(rows), found.trial.cause, found.trial.todo)
+
+    def _fitting_others(self, rows: Integers) -> Integers:
+        """Those of some cameras that fit another photo."""
+        others = self.views[:: -(-len(self.views) // _MOST_COMPARED)]
+        others = np.union1d(others, self.views[rows])
+        fitting = []
+        for row in rows:
+            evidence = self.evidence.chosen(np.full(len(others), row))
+            agreement = evidence.agreement(replace(evidence.rig, photos=others))
+            fit = scores(agreement, tracked=self.evidence.tracked)
+            fit[others == self.views[row]] = 0.0
+            own = max(float(np.nan_to_num(self.agreement.correlation[row])), 0.0)
+            if fit.max() > max(own + _FITS_BETTER, _FITS * self.better):
+                fitting.append(row)
+        return np.array(fitting, dtype=np.int64)
