@@ -74,12 +74,7 @@ class Bench:
 
     def score(self, rig: Rig) -> float:
         """How well the photos agree in a rig, mean over the cameras."""
-        photos = rig.photos
-        known = (photos >= 0) & (photos < self._evidence.photos)
-        if not known.all():
-            return 0.0
-        agreement = self._evidence.agreement(rig)
-        return float(scores(agreement, tracked=self._evidence.tracked).mean())
+        return float(scores(self._evidence.agreement(rig), tracked=self._evidence.tracked).mean())
 
     def tried(self, trial: Trial) -> float:
         """How well the photos agree after a change."""

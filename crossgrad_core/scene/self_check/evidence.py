@@ -13,13 +13,14 @@ from crossgrad_core.scene.self_check.rig import Floats, Integers, Rig
 
 #: Observations below which a correlation says nothing.
 FEWEST: Final = 8
+#: The same for colours of points that other photos show.
+FEWEST_OF_PHOTOS: Final = 24
 #: Observed points of a photo that are looked at.
 MOST_OBSERVED: Final = 96
 #: Points of a camera that trials look at.
 MOST_TRIED: Final = 2_000
-#: Points that are tested for a photo without tracks, at least and in all photos together.
+#: Points that are tested for each photo without tracks, at least.
 _TESTED: Final = 1_500
-_TESTED_IN_ALL: Final = 60_000
 #: A point is hidden where another one in its cell is nearer by this factor.
 _HIDES: Final = 1.15
 #: Points of a cell of the depth test, and the most cells in either direction.
@@ -36,25 +37,19 @@ class Agreement:
     """How well each photo agrees with the points.
 
     Attributes:
-        counts: [V] points that were looked at.
-        inside: [V] points of these that are in front of the camera, in frame and not hidden.
+        share: [V] share of the points that were looked at which are in front of the camera, in frame
+            and not hidden; NaN without any.
+        inside: [V] points whose colours were compared.
         correlation: [V] of the colours of points and photo; NaN where it cannot be told.
         spread: [V] standard deviation of the points' colours, levels of 255.
         stops: [V] how much brighter the photo is than its points, in stops; NaN as above.
     """
 
-    counts: Integers
+    share: Floats
     inside: Integers
     correlation: Floats
     spread: Floats
     stops: Floats
-
-    @property
-    def share(self) -> Floats:
-        """[V] share of the points that are in frame; NaN without any."""
-        return np.divide(
-            self.inside, self.counts, out=np.full(len(self.counts), np.nan), where=self.counts > 0
-        )
 
     @property
     def noise(self) -> Floats:
@@ -68,7 +63,6 @@ class Evidence:
 
     Attributes:
         pixels: Decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool where pixels count.
-        photos: How many photos there are.
         rig: The cameras that are looked at.
         rows: [V, N] rows of points for each camera, -1 where there are fewer.
         colors: [P, 3] colours of points; None takes those of the other photos of each point.
@@ -76,7 +70,6 @@ class Evidence:
     """
 
     pixels: Callable[[int], Pixels]
-    photos: int
     rig: Rig
     rows: Integers
     colors: NDArray[np.uint8] | None
@@ -95,6 +88,13 @@ class Evidence:
         """The same with the colours of points as the other photos show them."""
         return replace(self, colors=None)
 
+    @property
+    def colored(self) -> bool:
+        """Whether the colours of the points differ, so that they can be compared."""
+        if self.colors is None:
+            return True
+        return bool(self.colors[np.unique(self.rows[self.rows >= 0])].std(axis=0).max() >= FLAT)
+
     def agreement(self, rig: Rig) -> Agreement:
         """How well photos agree with the points in a rig, as it is or as a trial changes it."""
         shares, depth, inside = rig.project(self.rows)
@@ -102,18 +102,21 @@ class Evidence:
         inside &= known
         if not self.tracked:
             inside &= _unhidden(shares, depth, inside)
+        counts, framed = known.sum(axis=1), inside.sum(axis=1)
+        share = np.divide(framed, counts, out=np.full(len(counts), np.nan), where=counts > 0)
         shown, counting = self._shown(rig.photos, shares, inside)
         inside[inside] = counting
         cameras, columns = np.nonzero(inside)
         rows, shown = self.rows[cameras, columns], shown[counting]
-        counts = known.sum(axis=1)
         if self.colors is not None:
-            return _compared(counts, cameras, shown, self.colors[rows].astype(np.float64))
+            return _compared(share, cameras, shown, self.colors[rows].astype(np.float64))
         times = np.bincount(rows)[rows]
         several = times > 1
         expected = np.stack([np.bincount(rows, each)[rows] for each in shown.T], axis=-1) - shown
         expected /= np.maximum(times - 1, 1)[:, None]
-        return _compared(counts, cameras[several], shown[several], expected[several])
+        found = _compared(share, cameras[several], shown[several], expected[several])
+        few = found.inside < FEWEST_OF_PHOTOS
+        return replace(found, correlation=np.where(few, np.nan, found.correlation))
 
     def _shown(
         self, photos: Integers, shares: Floats, inside: Booleans
@@ -156,9 +159,15 @@ def observed(scene: Scene, views: Integers) -> Evidence:
     return _evidence(scene, views, rows, tracked=True)
 
 
-def tested(scene: Scene, views: Integers) -> Evidence:
-    """Some points for each of some views without tracks: those in frame that none hides count."""
-    number, total = max(_TESTED_IN_ALL // len(views), _TESTED), len(scene.points)
+def tested(scene: Scene, views: Integers, most: int) -> Evidence:
+    """Some points for each of some views without tracks: those in frame that none hides count.
+
+    Args:
+        scene: The scene.
+        views: Rows of the views.
+        most: Points of all views together.
+    """
+    number, total = max(most // len(views), _TESTED), len(scene.points)
     some = np.random.default_rng(0).choice(total, min(number, total), replace=False)
     rows = np.broadcast_to(some, (len(views), len(some)))
     return _evidence(scene, views, rows, tracked=False)
@@ -171,7 +180,7 @@ def _evidence(scene: Scene, views: Integers, rows: Integers, *, tracked: bool) -
         return photo.image().numpy(), None if mask is None else mask.numpy()
 
     rig = Rig.of(scene).chosen(views)
-    return Evidence(pixels, len(scene.views), rig, rows, scene.point_colors, tracked)
+    return Evidence(pixels, rig, rows, scene.point_colors, tracked)
 
 
 def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
@@ -188,9 +197,9 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
     return np.asarray(depth <= _HIDES * nearest[cell])
 
 
-def _compared(counts: Integers, cameras: Integers, shown: Floats, expected: Floats) -> Agreement:
+def _compared(share: Floats, cameras: Integers, shown: Floats, expected: Floats) -> Agreement:
     """The agreement of [O] observations of cameras, by their colours [O, 3]."""
-    total = len(counts)
+    total = len(share)
     number = np.bincount(cameras, minlength=total)
     divisor = np.maximum(number, 1)
 
@@ -209,4 +218,4 @@ def _compared(counts: Integers, cameras: Integers, shown: Floats, expected: Floa
     correlation = np.full(total, np.nan)
     correlation[told] = product[told] / np.sqrt(squares[0][told] * squares[1][told])
     stops = np.where(told, 2.2 * np.log2((light + 1.0) / (light_expected + 1.0)), np.nan)
-    return Agreement(counts, number, correlation, np.asarray(spread[1]), stops)
+    return Agreement(share, number, correlation, np.asarray(spread[1]), stops)

@@ -28,6 +28,7 @@ class Rig:
         sizes: [V, 2] width and height in pixels.
         points: [P, 3] input units.
         photos: [V] the view whose photo each camera is compared with.
+        count: Photos of the scene.
         turn: [2, 2] turns or mirrors the photos around their middle.
     """
 
@@ -38,6 +39,7 @@ class Rig:
     sizes: Floats
     points: Floats
     photos: Integers
+    count: int
     turn: Floats
 
     @classmethod
@@ -54,6 +56,7 @@ class Rig:
             sizes=np.array([[each.width, each.height] for each in cameras], dtype=np.float64),
             points=scene.similarity.to_input(scene.points),
             photos=np.arange(len(cameras)),
+            count=len(cameras),
             turn=UPRIGHT,
         )
 

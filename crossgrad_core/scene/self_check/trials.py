@@ -220,8 +220,12 @@ def _shifted() -> Iterator[Trial]:
             f"{'before' if shift > 0 else 'after'} it",
             "name the photos as the model does: one may be missing, or counting starts at 1 "
             "instead of 0",
-            lambda rig, shift=shift: replace(rig, photos=rig.photos + shift),
+            _next(shift),
         )
+
+
+def _next(shift: int) -> Change:
+    return lambda rig: replace(rig, photos=(rig.photos + shift) % rig.count)
 
 
 def _focal(factor: float) -> Trial:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.scene.self_check.diagnosis import Bench, scores
+from crossgrad_core.scene.self_check.diagnosis import REPAIRED, Bench, scores, some
 from crossgrad_core.scene.self_check.evidence import (
     FEWEST,
     Agreement,
@@ -16,7 +16,7 @@ from crossgrad_core.scene.self_check.evidence import (
     observed,
     tested,
 )
-from crossgrad_core.scene.self_check.rig import Integers
+from crossgrad_core.scene.self_check.rig import Floats, Integers
 from crossgrad_core.scene.self_check.trials import Trial, turns
 
 #: The scene disagrees as a whole if its better photos correlate with the points by less ...
@@ -40,6 +40,9 @@ _MOST_SUSPECTS: Final = 32
 _FITS: Final = 0.7
 #: Points of a photo without tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
+#: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
+_MOST_TESTED: Final = 300_000
+_FEW_TESTED: Final = 40_000
 #: The better photos: the upper quartile.
 _BETTER: Final = 0.75
 #: What a small change of all cameras gains at least if it is the cause.
@@ -90,6 +93,10 @@ _STRANGE: Final = (
     "their poses are wrong, or they show something else than the points",
     "remove them from the model, or estimate their poses again",
 )
+_UNRELATED: Final = (
+    "poses, points and photos do not belong together, and no change that was tried repairs it",
+    "check that the model and the photos are of one reconstruction",
+)
 _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
 
@@ -103,14 +110,12 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
         return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    groups = [
-        _Group.of(make(scene, rows[which]), rows[which])
-        for make, which in ((observed, has_tracks), (tested, ~has_tracks))
-        if which.any()
-    ]
-    verdict = groups[0].verdict()
-    if len(groups) > 1 and verdict.all_wrong is None:
-        held = groups[1].suspects()
+    tracked, others = rows[has_tracks], rows[~has_tracks]
+    if not len(tracked):
+        return _Group.of(tested(scene, others, _MOST_TESTED), others).verdict()
+    verdict = _Group.of(observed(scene, tracked), tracked).verdict()
+    if len(others) and verdict.all_wrong is None:
+        held = _Group.of(tested(scene, others, _FEW_TESTED), others).suspects()
         verdict = replace(verdict, some_wrong=(*verdict.some_wrong, *held))
     return verdict
 
@@ -138,8 +143,7 @@ class _Group:
             return group
         by_photos = evidence.of_photos()
         other = cls(by_photos, views, by_photos.agreement(by_photos.rig), True)
-        told = np.isfinite(group.agreement.correlation).any()
-        return other if not told or other.better >= _LEAST else group
+        return other if other.better >= _LEAST or not evidence.colored else group
 
     @property
     def better(self) -> float:
@@ -183,15 +187,19 @@ class _Group:
         if not self.told.any():
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
         bad = self.bad()
-        if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD:
+        if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < _LEAST:
             return self._as_a_whole(verdict)
-        good = np.flatnonzero(self.told & ~bad)
-        bench = Bench(self.evidence, good)
+        bench = Bench(self.evidence, np.flatnonzero(self.told & ~bad))
         if bench.is_off():
             found = bench.diagnosis()
             if found.trial is not None and found.after >= found.before + _GAIN_OF_ALL:
                 return replace(verdict, all_wrong=self._cause(found.trial))
         return replace(verdict, some_wrong=self.suspects())
+
+    @property
+    def _mean(self) -> float:
+        """How well the photos agree, mean over those of which something can be said."""
+        return float(scores(self.agreement, tracked=self.evidence.tracked)[self.told].mean())
 
     def _cause(self, trial: Trial) -> Cause:
         return Cause(tuple(self.views.tolist()), trial.cause, trial.todo)
@@ -202,24 +210,22 @@ class _Group:
         found = Bench(self.evidence, cameras).diagnosis()
         if found.repairs and found.trial is not None:
             return replace(verdict, all_wrong=self._cause(found.trial))
-        unknown = Cause(
-            tuple(self.views.tolist()),
-            "poses, points and photos do not belong together, and no change that was tried "
-            "repairs it",
-            "check that model and photos are of the same reconstruction",
-        )
+        chosen = some(cameras)
+        if 2 * len(self._fitting_others(chosen)) >= len(chosen):
+            return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
+        if self.better >= _LEAST:
+            return replace(verdict, some_wrong=self.suspects())
         if self.evidence.tracked and (self._out.mean() > _MOST_BAD or not self.recolored):
-            return replace(verdict, all_wrong=unknown)
+            return replace(verdict, all_wrong=Cause(self._named(cameras), *_UNRELATED))
         note = "colours of points and photos are unlike, so that nothing can be said"
         return replace(verdict, notes=(*verdict.notes, note))
 
     def suspects(self) -> tuple[Cause, ...]:
         """Why single photos disagree."""
         bad, correlation = self.bad(), self.agreement.correlation
-        if self.evidence.tracked:
-            tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
-        else:
-            tried = bad & (self.agreement.inside >= _FEWEST_TESTED)
+        tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
+        if not self.evidence.tracked:
+            tried &= self.agreement.inside >= _FEWEST_TESTED
         rows = np.flatnonzero(tried)[:_MOST_SUSPECTS]
         if not len(rows):
             return ()
@@ -228,22 +234,44 @@ class _Group:
         if len(exchanged):
             causes.append(Cause(self._named(exchanged), *_EXCHANGED))
         left = np.setdiff1d(rows, exchanged)
-        if len(left) and (common := self._in_common(left)) is not None:
+        common, repaired = self._in_common(left)
+        if common is not None:
             causes.append(common)
-        elif self.evidence.tracked and len(left := left[bad[left]]):
+        left = np.setdiff1d(left, repaired)
+        if self.evidence.tracked and len(left := left[bad[left]]):
             causes.append(Cause(self._named(left), *_STRANGE))
         return tuple(causes)
 
     def _named(self, rows: Integers) -> tuple[int, ...]:
         return tuple(self.views[rows].tolist())
 
-    def _in_common(self, rows: Integers) -> Cause | None:
-        """What repairs some photos together; a single one may only be mirrored or rotated."""
+    def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
+        """What repairs some photos, and these; a single one may only be mirrored or rotated."""
+        none = np.zeros(0, dtype=np.int64)
+        if not len(rows):
+            return None, none
         bench = Bench(self.evidence, rows)
         found = bench.diagnosis() if len(rows) > 1 else bench.best(turns())
-        if found.trial is None or not found.repairs:
-            return None
-        return Cause(self._named(rows), found.trial.cause, found.trial.todo)
+        if found.trial is None or found.after < found.before + _GAIN_OF_ALL:
+            return None, none
+        evidence = self.evidence.chosen(rows)
+        after = scores(
+            evidence.agreement(found.trial.change(evidence.rig)), tracked=evidence.tracked
+        )
+        repaired = rows[self._fits(after, rows)]
+        if not len(repaired):
+            return None, none
+        return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+
+    def _fits(self, after: Floats, rows: Integers) -> Booleans:
+        """Whether photos fit that did not, by their scores after a change."""
+        before = scores(self.agreement, tracked=self.evidence.tracked)[rows]
+        return np.asarray((after > before + _FITS_BETTER) & (after > self._fitting))
+
+    @property
+    def _fitting(self) -> float:
+        """The score of a photo that fits."""
+        return max(_FITS * self.better, REPAIRED)
 
     def _fitting_others(self, rows: Integers) -> Integers:
         """Those of some cameras that fit another photo."""
@@ -255,7 +283,6 @@ class _Group:
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
             fit[others == self.views[row]] = 0.0
-            own = max(float(np.nan_to_num(self.agreement.correlation[row])), 0.0)
-            if fit.max() > max(own + _FITS_BETTER, _FITS * self.better):
+            if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)
         return np.array(fitting, dtype=np.int64)
