@@ -13,6 +13,7 @@ from torch import Tensor
 from crossgrad_core.contract.georeference import UNPLACED, Georeference
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.state import Json
+from crossgrad_core.contract.strays import stray_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +194,19 @@ class Scene:
         return centers_of(self.train_views)
 
     @cached_property
+    def usual_centers(self) -> NDArray[np.float64]:
+        """[M, 3] training camera centres without stray ones, local frame."""
+        return self.centers[~stray_rows(self.centers, self.points)]
+
+    @cached_property
+    def middle(self) -> NDArray[np.float64]:
+        """[3] mean of the training camera centres without stray ones, local frame."""
+        return np.asarray(self.usual_centers.mean(axis=0))
+
+    @cached_property
     def distances(self) -> NDArray[np.float64]:
         """[N] distance of each training camera from their mean, local units."""
-        return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
+        return np.asarray(np.linalg.norm(self.centers - self.middle, axis=1))
 
 
 def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
