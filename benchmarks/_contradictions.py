@@ -153,7 +153,7 @@ def some_views(model: Model, rng: np.random.Generator, most: float = 0.25) -> ND
     return np.sort(rng.choice(count, rng.integers(1, max(2, int(most * count) + 1)), replace=False))
 
 
-def opengl_axes(model: Model, rng: np.random.Generator) -> Wrong:
+def opengl_axes(model: Model, _: np.random.Generator) -> Wrong:
     """Camera axes y up, z backward."""
     turned = replace(
         model, rotations=_FLIP @ model.rotations, translations=model.translations @ _FLIP
@@ -161,7 +161,7 @@ def opengl_axes(model: Model, rng: np.random.Generator) -> Wrong:
     return Wrong(turned, "all", frozenset(), ("OpenGL",))
 
 
-def camera_to_world(model: Model, rng: np.random.Generator) -> Wrong:
+def camera_to_world(model: Model, _: np.random.Generator) -> Wrong:
     """Poses inverted."""
     inverse = model.rotations.transpose(0, 2, 1)
     turned = replace(model, rotations=inverse, translations=model.centers)
@@ -174,7 +174,7 @@ def exchanged(model: Model, rng: np.random.Generator) -> Wrong:
     photos = list(model.photos)
     for a, b in views.reshape(-1, 2):
         photos[a], photos[b] = photos[b], photos[a]
-    strength = "one pair" if len(views) == 2 else "several pairs"  # noqa: PLR2004
+    strength = "one pair" if len(views) == 2 else "several pairs"
     return Wrong(replace(model, photos=photos), strength, frozenset(views.tolist()), ())
 
 
@@ -259,7 +259,7 @@ def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
     return Wrong(replace(model, photos=photos), "half", frozenset(views.tolist()), ())
 
 
-def points_y_z(model: Model, rng: np.random.Generator) -> Wrong:
+def points_y_z(model: Model, _: np.random.Generator) -> Wrong:
     """Points in a world with other axes than the poses."""
     matrix = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return Wrong(

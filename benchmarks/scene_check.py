@@ -165,11 +165,11 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
         yield f"| {kind} | {strength} | {told} | {len(members)} | {found} | {shown} |"
     found = sum(each.found for each in hard)
     right = [each for each in outcomes if each.kind == "right"]
+    warned = sum(not each.found for each in right)
     yield ""
     yield (
-        f"Kinds and strengths whose mean fall is {FALL:g} dB or more: {found} of {len(hard)} scenes "
-        f"found. Right scenes: {sum(not each.found for each in right)} of {len(right)} got a "
-        "warning."
+        f"Kinds and strengths that cost {FALL:g} dB or more in the mean: {found} of {len(hard)} "
+        f"scenes found. Right scenes: {warned} of {len(right)} got a warning."
     )
 
 

@@ -15,9 +15,7 @@ _FAR: Final = 10.0
 _OF_POINTS: Final = 0.9
 
 
-def stray_rows(
-    centers: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[N] which cameras are stray: ten times farther away than all others and than most points.
 
     A camera that photographs the scene from afar is none, because the points show the scene's size.

@@ -31,7 +31,7 @@ class Frame:
     Attributes:
         similarity: Input frame -> local frame.
         note: One sentence for the run's log.
-        stray: [N] the training cameras that were left out because they are far away from all others.
+        stray: [N] training cameras that did not count, because they are far from all others.
     """
 
     similarity: Similarity
@@ -60,8 +60,8 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
     """The local frame of a scene (3DGS: centre and extent of the training cameras).
 
-    Stray cameras do not count. Where the training cameras stand in one place, the unit is their median distance to the points,
-    and without points one unit of the input.
+    Stray cameras do not count. Where the training cameras stand in one place, the unit is their
+    median distance to the points, and without points one unit of the input.
 
     Args:
         centers: [N, 3] centres of the training cameras, input frame; N >= 1.

@@ -45,10 +45,10 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
     for warning in warnings:
         _LOG.warning("%s", warning)
     notes = (*warnings, *findings_of(scene, sketches, names))
-    figures = {
+    figures: dict[str, Json] = {
         "seconds": round(perf_counter() - begun, 3),
         **_figures(verdict),
-        "warnings": list(warnings),
+        "warnings": [*warnings],
         "disagreeing": [
             scene.views[view].name for cause in verdict.some_wrong for view in cause.views
         ],
@@ -74,7 +74,7 @@ def _figures(verdict: Verdict) -> dict[str, Json]:
         "correlation": round(verdict.correlation, 4) if isfinite(verdict.correlation) else None,
         "in_frame": round(verdict.in_frame, 4) if isfinite(verdict.in_frame) else None,
         "cause": None if verdict.all_wrong is None else verdict.all_wrong.what,
-        "notes": list(verdict.notes),
+        "notes": [*verdict.notes],
     }
 
 

@@ -25,7 +25,8 @@ _FEWEST_UNTRACKED: Final = 3 * FEWEST
 _CLEARLY: Final = 0.03
 #: A probe must be so much better than the scene as it is.
 _PROBED: Final = 0.01
-_ROUNDS: Final = 8
+#: How often the step of a search is halved.
+_ROUNDS: Final = 4
 #: How well photos agree, at least, after a change that repairs a scene, and what it gains.
 REPAIRED: Final = 0.45
 GAINED: Final = 0.25
@@ -101,19 +102,16 @@ class Bench:
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """The best number of a search: the best of those given, then between its neighbours."""
-        values = search.values
-        step = values[1] / values[0] if search.ratio else values[1] - values[0]
-        best, best_score = 0.0, -1.0
-        candidates: Iterable[float] = values
+        """The best numbers of a search: the best of those given, then between their neighbours."""
+        tried = [self.tried(search.trial(value)) for value in search.values]
+        best, score, step = search.values[int(np.argmax(tried))], max(tried), search.step
         for _ in range(_ROUNDS):
-            for value in candidates:
-                score = self.tried(search.trial(value))
-                if score > best_score:
-                    best, best_score = float(value), score
-            step = np.sqrt(step) if search.ratio else step / 2.0
-            candidates = (best / step, best * step) if search.ratio else (best - step, best + step)
-        return best_score, search.trial(best)
+            step /= 2.0
+            around = best + step * np.vstack([np.eye(len(best)), -np.eye(len(best))])
+            tried = [self.tried(search.trial(value)) for value in around]
+            if max(tried) > score:
+                best, score = around[int(np.argmax(tried))], max(tried)
+        return score, search.trial(best)
 
 
 def _better(found: Diagnosis, score: float, trial: Trial) -> Diagnosis:

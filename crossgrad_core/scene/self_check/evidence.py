@@ -1,4 +1,4 @@
-"""How well photos agree with points: the share of points in frame, and the correlation of colours."""
+"""How well photos agree with points: share of the points in frame, correlation of colours."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -37,8 +37,8 @@ class Agreement:
     """How well each photo agrees with the points.
 
     Attributes:
-        share: [V] share of the points that were looked at which are in front of the camera, in frame
-            and not hidden; NaN without any.
+        share: [V] share of the points that are in front of the camera, in frame and not hidden;
+            NaN without any points.
         inside: [V] points whose colours were compared.
         correlation: [V] of the colours of points and photo; NaN where it cannot be told.
         spread: [V] standard deviation of the points' colours, levels of 255.
@@ -118,9 +118,7 @@ class Evidence:
         few = found.inside < FEWEST_OF_PHOTOS
         return replace(found, correlation=np.where(few, np.nan, found.correlation))
 
-    def _shown(
-        self, photos: Integers, shares: Floats, inside: Booleans
-    ) -> tuple[Floats, Booleans]:
+    def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> tuple[Floats, Booleans]:
         """[O, 3] colours of the photos where they show the points inside; whether they count."""
         numbers = inside.sum(axis=1)
         places = shares[inside]

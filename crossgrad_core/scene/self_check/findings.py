@@ -83,7 +83,8 @@ def _equal_poses(scene: Scene) -> Iterator[str]:
     )
     names = _repeated(rounded, [view.name for view in scene.views])
     if names:
-        yield f"check: {count(len(names), 'photo')} with the pose of another one: {name_some(names)}"
+        photos = count(len(names), "photo")
+        yield f"check: {photos} with the pose of another one: {name_some(names)}"
 
 
 def _far_points(scene: Scene) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The cameras and points of a scene as arrays in input coordinates, so that a trial can change them."""
+"""The cameras and points of a scene as arrays in input coordinates: trials change them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from crossgrad_core.contract.scene import Scene
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-#: The eight ways to lay a photo over a frame: what turns or mirrors coordinates around its middle.
+#: Photos as they are, neither turned nor mirrored.
 UPRIGHT: Final = np.eye(2)
 
 

@@ -1,4 +1,4 @@
-"""Changes that are tried on a scene that disagrees with itself: the one that repairs it is the cause."""
+"""Changes that are tried on a scene that disagrees with itself: what repairs it is the cause."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -29,24 +29,27 @@ class Trial:
 
 @dataclass(frozen=True)
 class Search:
-    """A change with a number that is looked for.
+    """A change with one number or two that are looked for.
 
     Attributes:
-        values: The numbers that are tried first.
-        ratio: Whether the number is a factor; else it is a difference.
-        trial: The trial of a number.
+        values: [N, D] the numbers that are tried first.
+        step: Their distance from each other.
+        trial: The trial of D numbers.
     """
 
     values: Floats
-    ratio: bool
-    trial: Callable[[float], Trial]
+    step: float
+    trial: Callable[[Floats], Trial]
 
 
-_MODEL: Final = "correct the model, or export it again"
 _POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down, z forward)"
 _PHOTOS: Final = "put the photos back as they were when the poses were estimated"
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 _AXES: Final = "xyz"
+#: Steps of a factor's logarithm; steps and reach of the principal point, shares of the photo.
+_FACTOR: Final = 0.04
+_OFF: Final = 0.05
+_MOST_OFF: Final = 0.5
 #: Turns and mirrorings of a photo around its middle.
 _TURNS: Final = (
     ("the photos are mirrored left to right", [[-1.0, 0.0], [0.0, 1.0]]),
@@ -107,20 +110,22 @@ def other_axes() -> Iterator[Trial]:
 
 
 def searches() -> Iterator[Search]:
-    """All changes with a number."""
-    yield Search(np.geomspace(0.2, 5.0, 80), True, _focal)
-    yield Search(np.geomspace(0.01, 100.0, 230), True, _scaled)
-    yield Search(np.geomspace(0.1, 10.0, 115), True, _resized)
-    yield Search(np.linspace(-0.5, 0.5, 41), False, lambda value: _offset(value, 0))
-    yield Search(np.linspace(-0.5, 0.5, 41), False, lambda value: _offset(value, 1))
+    """All changes with numbers: factors by their logarithm, then shares of width and height."""
+    for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
+        steps = np.arange(-np.log(most), np.log(most), _FACTOR)
+        yield Search(steps[:, None], _FACTOR, lambda value, make=make: make(np.exp(value[0])))
+    shares = np.arange(-_MOST_OFF, _MOST_OFF + _OFF, _OFF)
+    places = np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
+    yield Search(places, _OFF, lambda value: _offset(value[0], value[1]))
 
 
 def probes() -> Iterator[Trial]:
     """Small changes of what is known as numbers: a right scene agrees best as it is."""
     for make in (_focal, _scaled):
         yield from (make(value) for value in (0.93, 1.07))
-    for axis in (0, 1):
-        yield from (_offset(value, axis) for value in (-0.04, 0.04))
+    for value in (-0.04, 0.04):
+        yield _offset(value, 0.0)
+        yield _offset(0.0, value)
 
 
 def _turned(matrix: Floats) -> Change:
@@ -254,11 +259,10 @@ def _resized(factor: float) -> Trial:
     )
 
 
-def _offset(share: float, axis: int) -> Trial:
-    side = ("width", "height")[axis]
-    unit = np.eye(2)[axis]
+def _offset(across: float, down: float) -> Trial:
     return Trial(
-        f"the principal point is wrong: {share:+.1%} of the photos' {side} away fits",
+        f"the principal point is wrong: {across:+.1%} of the photos' width and {down:+.1%} of "
+        "their height away fits",
         "correct the principal point of the cameras; if the photos were cropped, move it with them",
-        lambda rig: replace(rig, principal=rig.principal + share * rig.sizes * unit),
+        lambda rig: replace(rig, principal=rig.principal + rig.sizes * [across, down]),
     )

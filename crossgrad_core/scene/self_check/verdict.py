@@ -38,6 +38,8 @@ _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
 #: Share of the correlation of the better photos that a photo reaches which fits.
 _FITS: Final = 0.7
+#: So few photos are only tried mirrored and rotated: by chance one of all changes fits them.
+_FEW: Final = 2
 #: Points of a photo without tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
 #: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
@@ -251,7 +253,7 @@ class _Group:
         if not len(rows):
             return None, none
         bench = Bench(self.evidence, rows)
-        found = bench.diagnosis() if len(rows) > 1 else bench.best(turns())
+        found = bench.diagnosis() if len(rows) > _FEW else bench.best(turns())
         if found.trial is None or found.after < found.before + _GAIN_OF_ALL:
             return None, none
         evidence = self.evidence.chosen(rows)

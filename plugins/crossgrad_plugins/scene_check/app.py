@@ -1,6 +1,6 @@
 """What the command `crossgrad check` prints."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +29,7 @@ def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
     return [*notes[:_MOST], *more, _verdict(found, len(scene.views), reader)]
 
 
-def _verdict(found: dict[str, object], photos: int, reader: str) -> str:
+def _verdict(found: Mapping[str, object], photos: int, reader: str) -> str:
     measured = {
         "correlation of colours": found.get("correlation"),
         "share of observed points in frame": found.get("in_frame"),
