@@ -17,7 +17,7 @@ from crossgrad_core.scene.self_check.evidence import (
     tested,
 )
 from crossgrad_core.scene.self_check.rig import Floats, Integers
-from crossgrad_core.scene.self_check.trials import Trial, turns
+from crossgrad_core.scene.self_check.trials import Trial, likely, turns
 
 #: The scene disagrees as a whole if its better photos correlate with the points by less ...
 _LEAST: Final = 0.35
@@ -47,6 +47,8 @@ _MOST_TESTED: Final = 300_000
 _FEW_TESTED: Final = 40_000
 #: The better photos: the upper quartile.
 _BETTER: Final = 0.75
+#: Photos that agree by less are also tried with the likely changes of all cameras.
+_SURE: Final = 0.75
 #: What a small change of all cameras gains at least if it is the cause.
 _GAIN_OF_ALL: Final = 0.08
 
@@ -141,11 +143,12 @@ class _Group:
     @classmethod
     def of(cls, evidence: Evidence, views: Integers) -> "_Group":
         group = cls(evidence, views, evidence.agreement(evidence.rig))
-        if not evidence.tracked or group.better >= _LEAST:
-            return group
-        by_photos = evidence.of_photos()
-        other = cls(by_photos, views, by_photos.agreement(by_photos.rig), True)
-        return other if other.better >= _LEAST or not evidence.colored else group
+        return group.by_photos() if evidence.tracked and not evidence.colored else group
+
+    def by_photos(self) -> "_Group":
+        """The same photos, with the colours of points as the other photos show them."""
+        evidence = self.evidence.of_photos()
+        return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
     @property
     def better(self) -> float:
@@ -187,16 +190,29 @@ class _Group:
             else (),
         )
         if not self.told.any():
+            if self.evidence.colored:
+                return self._as_a_whole(verdict)
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
         bad = self.bad()
         if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < _LEAST:
             return self._as_a_whole(verdict)
-        bench = Bench(self.evidence, np.flatnonzero(self.told & ~bad))
-        if bench.is_off():
+        found = self._of_all(np.flatnonzero(self.told & ~bad))
+        if found is not None:
+            return replace(verdict, all_wrong=found)
+        return replace(verdict, some_wrong=self.suspects())
+
+    def _of_all(self, rows: Integers) -> Cause | None:
+        """What makes photos agree better that agree somewhat."""
+        bench = Bench(self.evidence, rows)
+        if bench.before < _SURE:
+            found = bench.best(likely())
+            if found.repairs and found.trial is not None:
+                return self._cause(found.trial)
+        if not self.recolored and bench.is_off():
             found = bench.diagnosis()
             if found.trial is not None and found.after >= found.before + _GAIN_OF_ALL:
-                return replace(verdict, all_wrong=self._cause(found.trial))
-        return replace(verdict, some_wrong=self.suspects())
+                return self._cause(found.trial)
+        return None
 
     @property
     def _mean(self) -> float:
@@ -209,7 +225,8 @@ class _Group:
     def _as_a_whole(self, verdict: Verdict) -> Verdict:
         """The outcome if most photos disagree."""
         cameras = np.arange(len(self.views))
-        found = Bench(self.evidence, cameras).diagnosis()
+        bench = Bench(self.evidence, cameras)
+        found = bench.best(likely()) if self.recolored else bench.diagnosis()
         if found.repairs and found.trial is not None:
             return replace(verdict, all_wrong=self._cause(found.trial))
         chosen = some(cameras)
@@ -217,8 +234,13 @@ class _Group:
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
         if self.better >= _LEAST:
             return replace(verdict, some_wrong=self.suspects())
-        if self.evidence.tracked and (self._out.mean() > _MOST_BAD or not self.recolored):
+        if self._out.mean() > _MOST_BAD:
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_UNRELATED))
+        if self.evidence.tracked and not self.recolored:
+            other = self.by_photos()
+            if other.better < _LEAST and np.isfinite(other.agreement.correlation).any():
+                return replace(verdict, all_wrong=Cause(self._named(cameras), *_UNRELATED))
+            return other.verdict()
         note = "colours of points and photos are unlike, so that nothing can be said"
         return replace(verdict, notes=(*verdict.notes, note))
 

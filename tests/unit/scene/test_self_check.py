@@ -83,7 +83,7 @@ def test_the_search_has_these_kinds(contradictions):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 2, 4])
 def test_each_kind_is_reported_with_its_cause_or_its_photos(contradictions, model, kind, seed):
     wrong = contradictions.KINDS[kind](model, np.random.default_rng(seed))
     verdict = found(wrong.model)
