@@ -113,7 +113,7 @@ def searches() -> Iterator[Search]:
     """All changes with numbers: factors by their logarithm, then shares of width and height."""
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
-        yield Search(steps[:, None], _FACTOR, lambda value, make=make: make(np.exp(value[0])))
+        yield Search(steps[:, None], _FACTOR, _by_logarithm(make))
     shares = np.arange(-_MOST_OFF, _MOST_OFF + _OFF, _OFF)
     places = np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
     yield Search(places, _OFF, lambda value: _offset(value[0], value[1]))
@@ -126,6 +126,10 @@ def probes() -> Iterator[Trial]:
     for value in (-0.04, 0.04):
         yield _offset(value, 0.0)
         yield _offset(0.0, value)
+
+
+def _by_logarithm(make: Callable[[float], Trial]) -> Callable[[Floats], Trial]:
+    return lambda value: make(float(np.exp(value[0])))
 
 
 def _turned(matrix: Floats) -> Change:

@@ -40,7 +40,7 @@ _MOST_SUSPECTS: Final = 32
 _FITS: Final = 0.7
 #: So few photos are only tried mirrored and rotated: by chance one of all changes fits them.
 _FEW: Final = 2
-#: Points of a photo without tracks.
+#: Points in frame of a photo that is compared with others, or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
 #: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
 _MOST_TESTED: Final = 300_000
@@ -232,15 +232,20 @@ class _Group:
         chosen = some(cameras)
         if 2 * len(self._fitting_others(chosen)) >= len(chosen):
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
+        return self._unexplained(verdict)
+
+    def _unexplained(self, verdict: Verdict) -> Verdict:
+        """The outcome if most photos disagree and nothing that was tried repairs it."""
         if self.better >= _LEAST:
             return replace(verdict, some_wrong=self.suspects())
+        unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
         if self._out.mean() > _MOST_BAD:
-            return replace(verdict, all_wrong=Cause(self._named(cameras), *_UNRELATED))
+            return replace(verdict, all_wrong=unrelated)
         if self.evidence.tracked and not self.recolored:
             other = self.by_photos()
-            if other.better < _LEAST and np.isfinite(other.agreement.correlation).any():
-                return replace(verdict, all_wrong=Cause(self._named(cameras), *_UNRELATED))
-            return other.verdict()
+            if other.better >= _LEAST or not np.isfinite(other.agreement.correlation).any():
+                return other.verdict()
+            return replace(verdict, all_wrong=unrelated)
         note = "colours of points and photos are unlike, so that nothing can be said"
         return replace(verdict, notes=(*verdict.notes, note))
 
@@ -306,7 +311,8 @@ class _Group:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            fit[others == self.views[row]] = 0.0
+            # By chance one of many photos fits a few points.
+            fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)
         return np.array(fitting, dtype=np.int64)

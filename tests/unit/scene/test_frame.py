@@ -88,7 +88,7 @@ def test_pose_keeps_its_rotation_and_moves_its_centre():
 
 @pytest.mark.parametrize("strays", [1, 2])
 def test_cameras_far_from_all_others_do_not_set_the_unit(strays):
-    far = CENTERS[:strays] + [1e6, 0, 0]
+    far = CENTERS[:strays] + np.array([1e6, 0, 0])
     frame = make_frame(np.vstack([CENTERS, far]), POINTS)
     alone = make_frame(CENTERS, POINTS)
     np.testing.assert_array_equal(np.flatnonzero(frame.stray), 20 + np.arange(strays))
