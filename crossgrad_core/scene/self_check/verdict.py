@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.scene.self_check.diagnosis import REPAIRED, Bench, scores, some
+from crossgrad_core.scene.self_check.diagnosis import REPAIRED, Bench, Diagnosis, scores, some
 from crossgrad_core.scene.self_check.evidence import (
     FEWEST,
     Agreement,
@@ -275,22 +275,29 @@ class _Group:
         return tuple(self.views[rows].tolist())
 
     def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
-        """What repairs some photos, and these; a single one may only be mirrored or rotated."""
+        """What repairs most of some photos, or mirrors and rotates some; and which it repairs."""
         none = np.zeros(0, dtype=np.int64)
         if not len(rows):
             return None, none
         bench = Bench(self.evidence, rows)
-        found = bench.diagnosis() if len(rows) > _FEW else bench.best(turns())
-        if found.trial is None or found.after < found.before + _GAIN_OF_ALL:
-            return None, none
-        evidence = self.evidence.chosen(rows)
-        after = scores(
-            evidence.agreement(found.trial.change(evidence.rig)), tracked=evidence.tracked
-        )
-        repaired = rows[self._fits(after, rows)]
-        if not len(repaired):
+        if len(rows) > _FEW:
+            found = bench.diagnosis()
+            repaired = self._repaired(found, rows)
+            if found.trial is not None and 2 * len(repaired) > len(rows):
+                return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+        found = bench.best(turns())
+        repaired = self._repaired(found, rows)
+        if found.trial is None or not len(repaired):
             return None, none
         return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+
+    def _repaired(self, found: Diagnosis, rows: Integers) -> Integers:
+        """Those of some photos that a change repairs."""
+        if found.trial is None:
+            return rows[:0]
+        evidence = self.evidence.chosen(rows)
+        changed = evidence.agreement(found.trial.change(evidence.rig))
+        return rows[self._fits(scores(changed, tracked=evidence.tracked), rows)]
 
     def _fits(self, after: Floats, rows: Integers) -> Booleans:
         """Whether photos fit that did not, by their scores after a change."""
