@@ -190,9 +190,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="longest side of the photos")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument(
-        "--out", type=Path, help="JSON lines of all scenes, added to; the table is of all in it"
-    )
+    parser.add_argument("--out", type=Path, help="JSON lines: added to, and all are in the table")
     args = parser.parse_args()
     outcomes: list[Outcome] = []
     seeds = range(args.first, args.first + max(args.wrong, args.right))

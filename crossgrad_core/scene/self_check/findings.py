@@ -1,4 +1,4 @@
-"""What else is worth knowing about the cameras, points and photos of a scene."""
+"""Notes on equal poses, far points, and photos that are equal, blurred, dark or bright."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the command `crossgrad check` prints."""
+"""The output of the command `crossgrad check`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
