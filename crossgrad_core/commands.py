@@ -304,12 +304,13 @@ def fingerprint(scene: "Scene", config: "RunConfig") -> str:
 
 
 def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
-    """The scene of a configuration, and the name of the reader that read it.
+    """The scene of a configuration, checked, and the name of the reader that read it.
 
     Sets the number of CPU threads first.
 
     Raises:
-        UserError: No reader accepts the folder, or the one that does cannot read it.
+        UserError: No reader accepts the folder, the one that does cannot read it, or the scene
+            contradicts itself.
     """
     from crossgrad_core.numerics.threads import configure_threads
     from crossgrad_core.run import assemble as assembling
@@ -317,7 +318,7 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
     configure_threads(config.threads)
     if config.scene is None:
         raise UserError("no scene is named", where="scene", todo="name its folder")
-    return assembling.read_scene(config, config.scene)
+    return assembling.read_and_check(config, config.scene)
 
 
 def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":

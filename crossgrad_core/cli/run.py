@@ -72,12 +72,14 @@ _RESUMING: Final = (
         bool,
         "--accept-scene",
         common=False,
-        help="With --resume: go on although photos, masks or points of the scene have changed.",
+        help="Go on although points, poses and photos of the scene contradict each other; with "
+        "--resume, although photos, masks or points have changed.",
     ),
     _own(
         "accept_plugins",
         bool,
         "--accept-plugins",
+        common=False,
         help="With --resume: go on with other versions of the packages that train the run.",
     ),
 )

@@ -22,8 +22,7 @@ def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]
 
     Without what is rounding: a camera that stands there has 0, and equal distances are equal.
     """
-    middle = scene.centers.mean(axis=0)
-    return without_rounding(scene, np.linalg.norm(centers_of(views) - middle, axis=1))
+    return without_rounding(scene, np.linalg.norm(centers_of(views) - scene.middle, axis=1))
 
 
 def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.float64]:

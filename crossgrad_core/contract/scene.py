@@ -1,6 +1,6 @@
 """The data types of a scene."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from crossgrad_core.contract.georeference import UNPLACED, Georeference
 from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.state import Json
+from crossgrad_core.contract.strays import stray_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +139,7 @@ class Scene:
         point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
         georeference: Where on Earth it is.
         files: Files that it was read from, except photos and masks.
+        check: Figures of the check of the scene against itself; None before the check.
     """
 
     name: str
@@ -151,6 +154,7 @@ class Scene:
     point_opacities: NDArray[np.float64] | None = None
     georeference: Georeference = UNPLACED
     files: tuple[Path, ...] = ()
+    check: Mapping[str, Json] | None = None
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
         """The scene with these of its points alone, [Q] rising; views know their new rows."""
@@ -193,9 +197,19 @@ class Scene:
         return centers_of(self.train_views)
 
     @cached_property
+    def usual_centers(self) -> NDArray[np.float64]:
+        """[M, 3] training camera centres without stray ones, local frame."""
+        return self.centers[~stray_rows(self.centers, self.points)]
+
+    @cached_property
+    def middle(self) -> NDArray[np.float64]:
+        """[3] mean of the training camera centres without stray ones, local frame."""
+        return np.asarray(self.usual_centers.mean(axis=0))
+
+    @cached_property
     def distances(self) -> NDArray[np.float64]:
         """[N] distance of each training camera from their mean, local units."""
-        return np.asarray(np.linalg.norm(self.centers - self.centers.mean(axis=0), axis=1))
+        return np.asarray(np.linalg.norm(self.centers - self.middle, axis=1))
 
 
 def centers_of(views: Sequence[View]) -> NDArray[np.float64]:

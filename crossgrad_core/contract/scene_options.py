@@ -50,6 +50,9 @@ class SceneOptions(BaseModel):
     disk_mib: int = Field(
         20480, ge=0, description="disk space for large photos in the size as trained, MiB; 0: none"
     )
+    accept_scene: bool = Field(
+        False, description="go on although the scene contradicts itself, as --accept-scene does"
+    )
     masks: Path | None = Field(None, description="mask folder; default <scene>/masks if present")
 
     @property

@@ -47,6 +47,7 @@ from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
 from crossgrad_core.run.session import CLOUD, Session, totals
+from crossgrad_core.run.settings import layered
 from crossgrad_core.run.settings_for_nothing import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
@@ -118,7 +119,8 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         resume: Folder of a stopped run to continue.
         dry_run: Of a new run, check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        accept_scene: Continue although photos, masks or points of the scene have changed.
+        accept_scene: Of a new run, train although the scene contradicts itself; of one that goes
+            on, continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
         check: Decode all photos before training.
 
@@ -133,12 +135,14 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     if resume is not None:
         accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
         return resumed(resume, settings, way, **accepted).exit_code
-    if accept_scene or accept_plugins:
+    if accept_plugins:
         raise UserError(
             "only a run that is continued has something to compare with",
-            where="--accept-scene" if accept_scene else "--accept-plugins",
+            where="--accept-plugins",
             todo="leave it out, or name the run with --resume",
         )
+    if accept_scene:
+        settings = layered([settings, {"reading.accept_scene": True}])
     if dry_run:
         _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0

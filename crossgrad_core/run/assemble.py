@@ -32,6 +32,7 @@ from crossgrad_core.run.idle import idle_note
 from crossgrad_core.run.planning import notes_of, planned
 from crossgrad_core.run.select import select
 from crossgrad_core.run.usual_device import with_device
+from crossgrad_core.scene.self_check.check import checked
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import note_on_axes
@@ -71,6 +72,23 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
         near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
         name = (*able, *near, READER)[0]
     return build(Reader, name, config.reader.options).read(path, config.reading), name
+
+
+def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tuple[Scene, str]:
+    """As `read_scene`, and points, poses and photos are checked against each other.
+
+    Args:
+        config: The configuration.
+        path: The scene's folder.
+        accept: Go on although the scene contradicts itself, as the configuration may also say.
+
+    Raises:
+        UserError: As `read_scene`, the scene contradicts itself, or a photo cannot be decoded.
+    """
+    scene, name = read_scene(config, path)
+    reading = config.reading
+    accept = accept or reading.accept_scene
+    return checked(scene, path, cache_mib=reading.cache_mib, accept=accept), name
 
 
 def accepts(name: str, path: Path) -> bool:

@@ -15,7 +15,7 @@ from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.validation import as_user_error
-from crossgrad_core.run.assemble import assemble, check_names, read_scene
+from crossgrad_core.run.assemble import assemble, check_names, read_and_check, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import load_latest
 from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.persist import check_settings, from_checkpoint
@@ -73,7 +73,11 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
 
 
 def set_up(
-    config: RunConfig, verbosity: int, check: Callable[[Fingerprint], tuple[str, ...]] | None = None
+    config: RunConfig,
+    verbosity: int,
+    check: Callable[[Fingerprint], tuple[str, ...]] | None = None,
+    *,
+    looks: bool = False,
 ) -> tuple[Setup, float]:
     """The assembled run and the seconds that reading the scene took.
 
@@ -81,6 +85,7 @@ def set_up(
         config: The configuration, with a scene.
         verbosity: -1 quiet, 0 normal, 1 verbose.
         check: Refuses a scene that is not the run's; answers with notes on one that it takes.
+        looks: Nothing will be trained: the scene is not checked against itself.
 
     Raises:
         UserError: The scene cannot be read, or the components cannot work together.
@@ -88,8 +93,14 @@ def set_up(
     check_names(config)
     configure_threads(config.threads)
     start = perf_counter()
-    scene, reader = read_scene(config, cast("Path", config.scene))
-    notes = () if check is None else check(fingerprint_of(scene, cast("Path", config.scene)))
+    path = cast("Path", config.scene)
+    # A run that goes on began with this scene, so that it was accepted.
+    scene, reader = (
+        read_scene(config, path)
+        if looks
+        else read_and_check(config, path, accept=check is not None)
+    )
+    notes = () if check is None else check(fingerprint_of(scene, path))
     scene = replace(scene, notes=(*notes, *scene.notes))
     seconds = perf_counter() - start
     level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
@@ -208,7 +219,8 @@ def _from(
     checkpoint = load_latest(folder)
     # Read after the checkpoint: a run that follows the clock only adds to its configuration.
     config = _config(folder, settings)
-    setup, seconds = set_up(without_missing(config) if looks else config, verbosity, check)
+    config_now = without_missing(config) if looks else config
+    setup, seconds = set_up(config_now, verbosity, check, looks=looks)
     check_settings(as_it_was(setup.config, config), checkpoint)
     state = from_checkpoint(setup, checkpoint)
     state.clock.load += seconds

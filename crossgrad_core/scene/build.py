@@ -26,6 +26,7 @@ from crossgrad_core.scene.raw_checks import (
 from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
 from crossgrad_core.scene.split import Label, split_views
 from crossgrad_core.scene.thinning import FEWEST, PER_PHOTO, thinned
+from crossgrad_core.scene.wording import count, name_some
 from crossgrad_core.wording import one_line
 
 
@@ -87,6 +88,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
             *photos.notes,
             *split.notes,
             frame.note,
+            *_note_stray([used[i].name for i in train], frame),
             _note_regimes(regimes, train, "image folder" if by_folder else "footprint"),
             *_note_unmeasured(regimes, train, options),
         ),
@@ -120,6 +122,16 @@ def _positions(views: Sequence[RawView], names: Sequence[str]) -> tuple[int, ...
 def _localize(view: RawView, photos: ChosenPhotos, frame: Frame) -> Camera:
     pose = torch.from_numpy(frame.pose(view.world_to_camera))
     return Camera(**vars(photos.pinholes[view.name]), world_to_camera=pose)
+
+
+def _note_stray(names: Sequence[str], frame: Frame) -> list[str]:
+    stray = [name for name, is_stray in zip(names, frame.stray, strict=True) if is_stray]
+    if not stray:
+        return []
+    return [
+        f"cameras: {count(len(stray), 'training camera')} far away from all others: "
+        f"{name_some(stray)}; the local frame is made without them, and their poses may be wrong"
+    ]
 
 
 def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str:

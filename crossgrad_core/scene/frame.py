@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.strays import stray_rows
 
 # 1.1 x the largest distance of a training camera from their mean (3DGS, scene extent).
 _MARGIN = 1.1
@@ -30,10 +31,12 @@ class Frame:
     Attributes:
         similarity: Input frame -> local frame.
         note: One sentence for the run's log.
+        stray: [N] training cameras that did not count, because they are far from all others.
     """
 
     similarity: Similarity
     note: str
+    stray: NDArray[np.bool_]
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 3] points of the input frame in the local frame, on its grid."""
@@ -57,13 +60,15 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
     """The local frame of a scene (3DGS: centre and extent of the training cameras).
 
-    Where the training cameras stand in one place, the unit is their median distance to the points,
-    and without points one unit of the input.
+    Stray cameras do not count. Where the training cameras stand in one place, the unit is their
+    median distance to the points, and without points one unit of the input.
 
     Args:
         centers: [N, 3] centres of the training cameras, input frame; N >= 1.
         points: [P, 3] SfM points, input frame; may be empty.
     """
+    stray = stray_rows(centers, points)
+    centers = centers[~stray]
     # Sums of coordinates far from 0 lose digits; sums of differences do not.
     origin = centers[0] + (centers - centers[0]).mean(0)
     extent = float(_MARGIN * np.linalg.norm(centers - origin, axis=1).max())
@@ -73,17 +78,20 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
             Similarity(origin, 1 / extent),
             f"local frame: 1 unit = {extent:.6g} input units, the extent of the training cameras "
             "(1.1 x largest distance from their mean)",
+            stray,
         )
     if depth > _SMALLEST:
         return Frame(
             Similarity(origin, 1 / depth),
             f"local frame: 1 unit = {depth:.6g} input units, the median distance to the SfM "
             "points, because the training cameras stand in one place",
+            stray,
         )
     return Frame(
         Similarity(origin, 1.0),
         "local frame: 1 unit = 1 input unit, because the training cameras stand in one place and "
         "there are no SfM points",
+        stray,
     )
 
 

@@ -146,8 +146,3 @@ def test_a_run_of_an_older_version_goes_on_and_knows_its_scene_from_then_on(root
     spoilt(root / "scene", "trained")
     with pytest.raises(UserError, match="training photos missing"):
         figures.evaluate(root / "run")
-
-
-def test_a_new_run_has_nothing_to_accept(root):
-    with pytest.raises(UserError, match="--accept-scene"):
-        app.run({"scene": str(root / "scene"), "steps": 2}, accept_scene=True)

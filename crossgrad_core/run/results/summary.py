@@ -42,6 +42,7 @@ class Summary:
         environment: Machine and versions.
         ply: What is in the PLY; None where none was written.
         notes: What was chosen or left out, and why.
+        check: Figures of the check of the scene against itself; None without one.
         plan: What a planner decided and on what evidence; None where nothing was.
         error: Why the run failed; None otherwise.
     """
@@ -56,6 +57,7 @@ class Summary:
     environment: "Mapping[str, Json]"
     ply: "Mapping[str, Json] | None" = None
     notes: Sequence[str] = ()
+    check: "Mapping[str, Json] | None" = None
     plan: "Mapping[str, Json] | None" = None
     error: str | None = None
 
@@ -121,6 +123,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
+        "scene_check": None if summary.check is None else dict(summary.check),
         "plan": None if summary.plan is None else dict(summary.plan),
         "definitions": _definitions(figures),
         "falling": [each.name for each in figures if each.falls],

@@ -20,10 +20,9 @@ def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> N
 
     Equal heights are equal, as `radial_distances` has distances.
     """
-    middle = scene.centers.mean(axis=0)
     # Not a matrix product: its rounding depends on the number of rows, and a median cut falls
     # exactly on one of them.
-    return without_rounding(scene, ((centers_of(views) - middle) * up).sum(axis=1))
+    return without_rounding(scene, ((centers_of(views) - scene.middle) * up).sum(axis=1))
 
 
 def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:
@@ -72,11 +71,10 @@ def _flattest(scene: Scene) -> NDArray[np.float64]:
 
     Its sign puts the cameras above the SfM points or, where there are none, lets them look down.
     """
-    centers = scene.centers
-    spread = centers - centers.mean(axis=0)
+    spread = scene.usual_centers - scene.middle
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]
     if len(scene.points):
-        downward = np.median(scene.points, axis=0) - centers.mean(axis=0)
+        downward = np.median(scene.points, axis=0) - scene.middle
     else:
         rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         downward = np.stack(rows).astype(np.float64).mean(axis=0)

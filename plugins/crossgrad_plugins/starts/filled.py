@@ -111,7 +111,7 @@ class Filled(Start):
         if not views:
             return filling
         some = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
-        sky = Sky(upward(scene)[0], scene.centers, some, _NOT_STRAY)
+        sky = Sky(upward(scene)[0], scene.usual_centers, some, _NOT_STRAY)
         deep = {
             view: Depth.of(view.camera, scene.points[view.seen], FEWEST, sky)
             for view in (scene.train_views if margin else views)

@@ -84,3 +84,34 @@ def test_pose_keeps_its_rotation_and_moves_its_centre():
     np.testing.assert_allclose(
         camera_centers(local[None]), frame.similarity.to_local(center), atol=2.0**-30
     )
+
+
+@pytest.mark.parametrize("strays", [1, 2])
+def test_cameras_far_from_all_others_do_not_set_the_unit(strays):
+    far = CENTERS[:strays] + np.array([1e6, 0, 0])
+    frame = make_frame(np.vstack([CENTERS, far]), POINTS)
+    alone = make_frame(CENTERS, POINTS)
+    np.testing.assert_array_equal(np.flatnonzero(frame.stray), 20 + np.arange(strays))
+    assert frame.similarity.scale == alone.similarity.scale
+    np.testing.assert_array_equal(frame.similarity.offset, alone.similarity.offset)
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "distance"), [(16, 1, 8), (97, 3, 8), (10, 10, 1000), (3, 1, 1e6), (18, 4, 90)]
+)
+def test_far_groups_and_few_cameras_are_not_stray(near, far, distance):
+    rng = np.random.default_rng(0)
+    centers = np.vstack([rng.normal(size=(near, 3)), rng.normal(size=(far, 3)) + distance])
+    assert not make_frame(centers, rng.normal(size=(500, 3))).stray.any()
+
+
+def test_a_camera_that_sees_a_large_scene_from_afar_is_not_stray():
+    street = RNG.normal(size=(30, 3)) * 0.5
+    drone = np.array([[0.0, 0, 100]])
+    town = RNG.uniform(-80, 80, (2000, 3))
+    assert not make_frame(np.vstack([street, drone]), town).stray.any()
+
+
+def test_single_far_points_do_not_hide_a_stray_camera():
+    points = np.vstack([POINTS, [[1e9, 0, 0]]])
+    assert make_frame(np.vstack([CENTERS, [[1e6, 0, 0]]]), points).stray.sum() == 1

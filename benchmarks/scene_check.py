@@ -1,0 +1,218 @@
+"""A seeded search over scenes that contradict themselves, and over right ones.
+
+    python benchmarks/scene_check.py TOWN TOWN TOWN SCENE SCENE [--wrong 240] [--right 400]
+        [--trained 60] [--out FILE]
+
+The towns are those of benchmarks/towns.py, 24 photos of either kind. Each wrong scene has a random
+kind and strength, number of photos and points, crop, and tracks or none. Some of them are trained
+for 150 steps on photos of 100 pixels, as is the right scene that each was made from: `fall` is
+the difference of the held-out PSNR, mean by kind and strength. `found` counts the scenes that were
+reported with the right cause, or with the right photos. Right scenes have random photos and points,
+gains, noise, JPEG and frames; none of them should get a warning.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+from _contradictions import KINDS, Model, Wrong, harmless, varied
+from _machine import code, facts
+
+from crossgrad_core.commands import (
+    assemble_new,
+    begin,
+    configured,
+    take_steps,
+)
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.evaluation.evaluation import evaluate
+from crossgrad_core.run.assemble import read_scene
+from crossgrad_core.run.export import renderer
+from crossgrad_core.scene.self_check.verdict import Verdict, verdict_of
+
+#: A fall of the held-out PSNR that has to be reported, dB.
+FALL = 3.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A scene of the search.
+
+    Attributes:
+        seed: Its seed.
+        base: The scene it was made from.
+        kind: How it was made wrong; "right" if it was not.
+        strength: How strongly.
+        photos: Its photos.
+        tracks: Whether its points have tracks.
+        reported: What was reported.
+        found: Whether the right cause or photos were reported; of a right scene, nothing.
+        fall: What the held-out PSNR falls by, dB; None if it was not trained.
+        seconds: CPU seconds of the check.
+    """
+
+    seed: int
+    base: str
+    kind: str
+    strength: str
+    photos: int
+    tracks: bool
+    reported: str
+    found: bool
+    fall: float | None
+    seconds: float
+
+
+@cache
+def base(path: Path, size: int) -> Model:
+    """A right scene in small photos."""
+    config = configured({"scene": path, "threads": 1, "reading": {"max_size": size}})
+    return Model.of(read_scene(config, path)[0])
+
+
+def trained_psnr(scene: Scene, path: Path, steps: int) -> float:
+    """The held-out PSNR after a short training."""
+    config = configured(
+        {
+            "scene": path,
+            "threads": 1,
+            "steps": steps,
+            "seed": 0,
+            "metrics": [{"name": "psnr"}],
+            "plan": "off",
+        }
+    )
+    setup = assemble_new(config, scene, "colmap")
+    state = begin(setup)
+    take_steps(setup, state)
+    result = evaluate(scene.test_views, renderer(setup, state), setup.metrics)
+    return float(result.overall.as_data()["psnr"] or 0.0)
+
+
+def text_of(verdict: Verdict) -> str:
+    """What was reported, in a line."""
+    if verdict.all_wrong is not None:
+        return verdict.all_wrong.what
+    return "; ".join(f"{list(cause.views)}: {cause.what}" for cause in verdict.some_wrong)
+
+
+def is_found(wrong: Wrong, verdict: Verdict) -> bool:
+    """Whether the right cause, or about the right photos, were reported."""
+    causes = [each.what for each in (verdict.all_wrong, *verdict.some_wrong) if each is not None]
+    named = {view for cause in verdict.some_wrong for view in cause.views}
+    if not wrong.views:
+        return any(word in cause for word in wrong.causes for cause in causes)
+    if verdict.all_wrong is not None:
+        return False
+    return named <= wrong.views and 2 * len(named) >= len(wrong.views)
+
+
+def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
+    """A scene that contradicts itself; trained if there are steps."""
+    rng = np.random.default_rng(seed)
+    right = varied(base(path, size), rng)
+    kind = list(KINDS)[seed % len(KINDS)]
+    wrong = KINDS[kind](right, rng)
+    scene = wrong.model.scene()
+    begun = process_time()
+    verdict = verdict_of(scene, range(len(scene.views)))
+    seconds = process_time() - begun
+    fall = None
+    if steps is not None:
+        fall = trained_psnr(right.scene(), path, steps) - trained_psnr(scene, path, steps)
+    return Outcome(
+        seed,
+        path.name,
+        kind,
+        wrong.strength,
+        len(scene.views),
+        any(len(rows) for rows in right.seen),
+        text_of(verdict),
+        is_found(wrong, verdict),
+        fall,
+        seconds,
+    )
+
+
+def right_scene(path: Path, seed: int, size: int) -> Outcome:
+    """A right scene."""
+    rng = np.random.default_rng(seed)
+    model = harmless(varied(base(path, size), rng), rng)
+    scene = model.scene()
+    begun = process_time()
+    verdict = verdict_of(scene, range(len(scene.views)))
+    seconds, text = process_time() - begun, text_of(verdict)
+    tracks = any(len(rows) for rows in model.seen)
+    count = len(scene.views)
+    return Outcome(seed, path.name, "right", "", count, tracks, text, not text, None, seconds)
+
+
+def table(outcomes: list[Outcome]) -> Iterator[str]:
+    """The table of sensitivity by kind and strength, and what holds of all scenes."""
+    cells: dict[tuple[str, str, bool], list[Outcome]] = defaultdict(list)
+    for each in outcomes:
+        if each.kind != "right":
+            cells[each.kind, each.strength, each.tracks].append(each)
+    yield "| kind | strength | tracks | scenes | found | fall, dB (trained) |"
+    yield "|---|---|---|---|---|---|"
+    hard: list[Outcome] = []
+    for (kind, strength, tracks), members in sorted(cells.items()):
+        falls = [each.fall for each in members if each.fall is not None]
+        mean = float(np.mean(falls)) if falls else float("nan")
+        shown = f"{mean:.1f} ({len(falls)})" if falls else "-"
+        hard += members if falls and mean >= FALL else []
+        found = sum(each.found for each in members)
+        told = "yes" if tracks else "no"
+        yield f"| {kind} | {strength} | {told} | {len(members)} | {found} | {shown} |"
+    found = sum(each.found for each in hard)
+    right = [each for each in outcomes if each.kind == "right"]
+    warned = sum(not each.found for each in right)
+    yield ""
+    yield (
+        f"Kinds and strengths that cost {FALL:g} dB or more in the mean: {found} of {len(hard)} "
+        f"scenes found. Right scenes: {warned} of {len(right)} got a warning."
+    )
+
+
+def main() -> None:
+    """Searches, and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--wrong", type=int, default=240)
+    parser.add_argument("--right", type=int, default=400)
+    parser.add_argument("--trained", type=int, default=60, help="wrong scenes that are trained")
+    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--size", type=int, default=100, help="longest side of the photos")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--out", type=Path, help="JSON lines: added to, and all are in the table")
+    args = parser.parse_args()
+    outcomes: list[Outcome] = []
+    seeds = range(args.first, args.first + max(args.wrong, args.right))
+    for number, seed in enumerate(seeds):
+        path = args.scenes[seed // len(KINDS) % len(args.scenes)]
+        made = []
+        if number < args.right:
+            made.append(right_scene(path, 1_000_000 + seed, args.size))
+        if number < args.wrong:
+            steps = args.steps if number < args.trained else None
+            made.append(wrong_scene(path, seed, args.size, steps))
+        outcomes += made
+        if args.out is not None:
+            with args.out.open("a") as file:
+                file.writelines(json.dumps(asdict(each)) + "\n" for each in made)
+    if args.out is not None:
+        lines = args.out.read_text().splitlines()
+        outcomes = [Outcome(**json.loads(line)) for line in lines]
+    machine = facts()
+    print(f"commit {code()}, {machine['cpu']}, {machine['date']}\n")
+    print("\n".join(table(outcomes)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""The cameras and points of a scene as arrays in input coordinates: trials change them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.contract.scene import Scene
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+#: Photos as they are, neither turned nor mirrored.
+UPRIGHT: Final = np.eye(2)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras, and the points of their scene.
+
+    Attributes:
+        rotations: [V, 3, 3] world to camera.
+        translations: [V, 3] world to camera, input units.
+        focal: [V, 2] pixels.
+        principal: [V, 2] pixels.
+        sizes: [V, 2] width and height in pixels.
+        points: [P, 3] input units.
+        photos: [V] the view whose photo each camera is compared with.
+        count: Photos of the scene.
+        turn: [2, 2] turns or mirrors the photos around their middle.
+    """
+
+    rotations: Floats
+    translations: Floats
+    focal: Floats
+    principal: Floats
+    sizes: Floats
+    points: Floats
+    photos: Integers
+    count: int
+    turn: Floats
+
+    @classmethod
+    def of(cls, scene: Scene) -> "Rig":
+        """The rig of a scene."""
+        cameras = [view.camera for view in scene.views]
+        centers = scene.similarity.to_input(np.stack([each.center.numpy() for each in cameras]))
+        rotations = np.stack([each.world_to_camera[:3, :3].numpy() for each in cameras])
+        return cls(
+            rotations=rotations,
+            translations=-np.einsum("vij,vj->vi", rotations, centers),
+            focal=np.array([[each.fx, each.fy] for each in cameras]),
+            principal=np.array([[each.cx, each.cy] for each in cameras]),
+            sizes=np.array([[each.width, each.height] for each in cameras], dtype=np.float64),
+            points=scene.similarity.to_input(scene.points),
+            photos=np.arange(len(cameras)),
+            count=len(cameras),
+            turn=UPRIGHT,
+        )
+
+    def chosen(self, views: Sequence[int] | Integers) -> "Rig":
+        """The rig with some of its cameras, which keep their photos."""
+        rows = np.asarray(views, dtype=np.int64)
+        return replace(
+            self,
+            rotations=self.rotations[rows],
+            translations=self.translations[rows],
+            focal=self.focal[rows],
+            principal=self.principal[rows],
+            sizes=self.sizes[rows],
+            photos=self.photos[rows],
+        )
+
+    @property
+    def centers(self) -> Floats:
+        """[V, 3] camera centres, input units."""
+        return np.asarray(-np.einsum("vji,vj->vi", self.rotations, self.translations))
+
+    def project(self, rows: Integers) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Where the cameras see points.
+
+        Args:
+            rows: [V, N] rows of points for each camera.
+
+        Returns:
+            [V, N, 2] places in the photo as shares of its width and height, [V, N] depths, and
+            [V, N] whether the point is in front of the camera and in its frame.
+        """
+        local = self.points[rows] @ self.rotations.transpose(0, 2, 1) + self.translations[:, None]
+        depth = local[..., 2]
+        front = depth > 0.0
+        inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=front)
+        pixels = self.focal[:, None] * local[..., :2] * inverse[..., None] + self.principal[:, None]
+        shares = pixels / self.sizes[:, None]
+        inside = front & ((shares >= 0.0) & (shares < 1.0)).all(axis=-1)
+        if self.turn is not UPRIGHT:
+            shares = (shares - 0.5) @ self.turn.T + 0.5
+        return shares, depth, inside

@@ -1,0 +1,325 @@
+"""Whether the photos of a scene agree with its points, which do not, and why."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.scene.self_check.diagnosis import REPAIRED, Bench, Diagnosis, scores, some
+from crossgrad_core.scene.self_check.evidence import (
+    FEWEST,
+    Agreement,
+    Booleans,
+    Evidence,
+    observed,
+    tested,
+)
+from crossgrad_core.scene.self_check.rig import Floats, Integers
+from crossgrad_core.scene.self_check.trials import Trial, likely, turns
+
+#: The scene disagrees as a whole if its better photos correlate with the points by less ...
+_LEAST: Final = 0.35
+#: ... or if more of its photos disagree.
+_MOST_BAD: Final = 0.6
+#: A photo disagrees below this share of the correlation of the better photos, if its points also
+#: have this many times the usual deviation from the colours that the photo predicts.
+_BAD: Final = 0.45
+_NOISY: Final = 1.5
+#: Share of observed points in frame below which the pose of a photo is wrong.
+_IN_FRAME: Final = 0.5
+#: A photo below this share of the correlation of the better photos is tried out, and another photo
+#: fits its pose if it correlates by so much more.
+_SUSPECT: Final = 0.65
+_FITS_BETTER: Final = 0.25
+#: Photos that a suspect is compared with, and suspects.
+_MOST_COMPARED: Final = 64
+_MOST_SUSPECTS: Final = 32
+#: Share of the correlation of the better photos that a photo reaches which fits.
+_FITS: Final = 0.7
+#: So few photos are only tried mirrored and rotated: by chance one of all changes fits them.
+_FEW: Final = 2
+#: Points in frame of a photo that is compared with others, or has no tracks.
+_FEWEST_TESTED: Final = 3 * FEWEST
+#: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
+_MOST_TESTED: Final = 300_000
+_FEW_TESTED: Final = 40_000
+#: The better photos: the upper quartile.
+_BETTER: Final = 0.75
+#: Photos that agree by less are also tried with the likely changes of all cameras.
+_SURE: Final = 0.75
+#: What a small change of all cameras gains at least if it is the cause.
+_GAIN_OF_ALL: Final = 0.08
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why some photos disagree.
+
+    Attributes:
+        views: The photos.
+        what: The cause.
+        todo: What the user can do.
+    """
+
+    views: tuple[int, ...]
+    what: str
+    todo: str
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The outcome for a scene.
+
+    Attributes:
+        compared: Photos that were compared with points.
+        correlation: Median correlation of colours; NaN if nothing could be compared.
+        in_frame: Median share of the observed points in frame; NaN without tracks.
+        all_wrong: Why the whole scene disagrees; None if it does not.
+        some_wrong: Why some photos disagree.
+        notes: What else was found.
+    """
+
+    compared: int
+    correlation: float
+    in_frame: float
+    all_wrong: Cause | None = None
+    some_wrong: tuple[Cause, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+_EXCHANGED: Final = (
+    "other photos fit their poses better",
+    "give each photo the name that its pose has in the model",
+)
+_STRANGE: Final = (
+    "their poses are wrong, or they show something else than the points",
+    "remove them from the model, or estimate their poses again",
+)
+_UNRELATED: Final = (
+    "poses, points and photos do not belong together, and no change that was tried repairs it",
+    "check that the model and the photos are of one reconstruction",
+)
+_UNKNOWN: Final = Verdict(0, np.nan, np.nan)
+
+
+def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
+    """The outcome for some views of a scene.
+
+    Raises:
+        UserError: A photo cannot be decoded.
+    """
+    if len(scene.points) < FEWEST:
+        return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
+    has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
+    rows = np.asarray(views, dtype=np.int64)
+    tracked, others = rows[has_tracks], rows[~has_tracks]
+    if not len(tracked):
+        return _Group.of(tested(scene, others, _MOST_TESTED), others).verdict()
+    verdict = _Group.of(observed(scene, tracked), tracked).verdict()
+    if len(others) and verdict.all_wrong is None:
+        held = _Group.of(tested(scene, others, _FEW_TESTED), others).suspects()
+        verdict = replace(verdict, some_wrong=(*verdict.some_wrong, *held))
+    return verdict
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Photos with tracks, or photos without.
+
+    Attributes:
+        evidence: What they are compared with.
+        views: [V] rows of the views.
+        agreement: How well they agree as they are.
+        recolored: Whether the points' own colours say nothing, so that photos replace them.
+    """
+
+    evidence: Evidence
+    views: Integers
+    agreement: Agreement
+    recolored: bool = False
+
+    @classmethod
+    def of(cls, evidence: Evidence, views: Integers) -> "_Group":
+        group = cls(evidence, views, evidence.agreement(evidence.rig))
+        return group.by_photos() if evidence.tracked and not evidence.colored else group
+
+    def by_photos(self) -> "_Group":
+        """The same photos, with the colours of points as the other photos show them."""
+        evidence = self.evidence.of_photos()
+        return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
+
+    @property
+    def better(self) -> float:
+        """The correlation of the better photos; 0 if no photo has one."""
+        known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
+        return float(np.quantile(known, _BETTER)) if len(known) else 0.0
+
+    @property
+    def told(self) -> Booleans:
+        """[V] photos about which something can be said."""
+        return np.isfinite(self.agreement.correlation) | self._out
+
+    @property
+    def _out(self) -> Booleans:
+        """[V] photos that have most of their observed points out of frame."""
+        if not self.evidence.tracked:
+            return np.zeros(len(self.views), dtype=np.bool_)
+        return np.asarray(self.agreement.share < _IN_FRAME)
+
+    def bad(self) -> Booleans:
+        """[V] photos that disagree."""
+        correlation, noise = self.agreement.correlation, self.agreement.noise
+        low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
+        good = np.isfinite(correlation) & ~low
+        usual = float(np.median(noise[good])) if good.any() else 0.0
+        unlike = low & (np.nan_to_num(noise) > _NOISY * usual)
+        return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
+
+    def verdict(self) -> Verdict:
+        """The outcome for these photos."""
+        correlation = self.agreement.correlation
+        known = np.isfinite(correlation)
+        verdict = Verdict(
+            int(self.told.sum()),
+            float(np.median(correlation[known])) if known.any() else np.nan,
+            float(np.nanmedian(self.agreement.share)) if self.evidence.tracked else np.nan,
+            notes=("the colours of the points say nothing; photos are compared with each other",)
+            if self.recolored
+            else (),
+        )
+        if not self.told.any():
+            if self.evidence.colored:
+                return self._as_a_whole(verdict)
+            return replace(verdict, notes=("colours of points and photos cannot be compared",))
+        bad = self.bad()
+        if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < _LEAST:
+            return self._as_a_whole(verdict)
+        found = self._of_all(np.flatnonzero(self.told & ~bad))
+        if found is not None:
+            return replace(verdict, all_wrong=found)
+        return replace(verdict, some_wrong=self.suspects())
+
+    def _of_all(self, rows: Integers) -> Cause | None:
+        """What makes photos agree better that agree somewhat."""
+        bench = Bench(self.evidence, rows)
+        if bench.before < _SURE:
+            found = bench.best(likely())
+            if found.repairs and found.trial is not None:
+                return self._cause(found.trial)
+        if not self.recolored and bench.is_off():
+            found = bench.diagnosis()
+            if found.trial is not None and found.after >= found.before + _GAIN_OF_ALL:
+                return self._cause(found.trial)
+        return None
+
+    @property
+    def _mean(self) -> float:
+        """How well the photos agree, mean over those of which something can be said."""
+        return float(scores(self.agreement, tracked=self.evidence.tracked)[self.told].mean())
+
+    def _cause(self, trial: Trial) -> Cause:
+        return Cause(tuple(self.views.tolist()), trial.cause, trial.todo)
+
+    def _as_a_whole(self, verdict: Verdict) -> Verdict:
+        """The outcome if most photos disagree."""
+        cameras = np.arange(len(self.views))
+        bench = Bench(self.evidence, cameras)
+        found = bench.best(likely()) if self.recolored else bench.diagnosis()
+        if found.repairs and found.trial is not None:
+            return replace(verdict, all_wrong=self._cause(found.trial))
+        chosen = some(cameras)
+        if 2 * len(self._fitting_others(chosen)) >= len(chosen):
+            return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
+        return self._unexplained(verdict)
+
+    def _unexplained(self, verdict: Verdict) -> Verdict:
+        """The outcome if most photos disagree and nothing that was tried repairs it."""
+        if self.better >= _LEAST:
+            return replace(verdict, some_wrong=self.suspects())
+        unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
+        if self._out.mean() > _MOST_BAD:
+            return replace(verdict, all_wrong=unrelated)
+        if self.evidence.tracked and not self.recolored:
+            other = self.by_photos()
+            if other.better >= _LEAST or not np.isfinite(other.agreement.correlation).any():
+                return other.verdict()
+            return replace(verdict, all_wrong=unrelated)
+        note = "colours of points and photos are unlike, so that nothing can be said"
+        return replace(verdict, notes=(*verdict.notes, note))
+
+    def suspects(self) -> tuple[Cause, ...]:
+        """Why single photos disagree."""
+        bad, correlation = self.bad(), self.agreement.correlation
+        tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
+        if not self.evidence.tracked:
+            tried &= self.agreement.inside >= _FEWEST_TESTED
+        rows = np.flatnonzero(tried)[:_MOST_SUSPECTS]
+        if not len(rows):
+            return ()
+        causes = []
+        exchanged = self._fitting_others(rows)
+        if len(exchanged):
+            causes.append(Cause(self._named(exchanged), *_EXCHANGED))
+        left = np.setdiff1d(rows, exchanged)
+        common, repaired = self._in_common(left)
+        if common is not None:
+            causes.append(common)
+        left = np.setdiff1d(left, repaired)
+        if self.evidence.tracked and len(left := left[bad[left]]):
+            causes.append(Cause(self._named(left), *_STRANGE))
+        return tuple(causes)
+
+    def _named(self, rows: Integers) -> tuple[int, ...]:
+        return tuple(self.views[rows].tolist())
+
+    def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
+        """What repairs most of some photos, or mirrors and rotates some; and which it repairs."""
+        none = np.zeros(0, dtype=np.int64)
+        if not len(rows):
+            return None, none
+        bench = Bench(self.evidence, rows)
+        if len(rows) > _FEW:
+            found = bench.diagnosis()
+            repaired = self._repaired(found, rows)
+            if found.trial is not None and 2 * len(repaired) > len(rows):
+                return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+        found = bench.best(turns())
+        repaired = self._repaired(found, rows)
+        if found.trial is None or not len(repaired):
+            return None, none
+        return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
+
+    def _repaired(self, found: Diagnosis, rows: Integers) -> Integers:
+        """Those of some photos that a change repairs."""
+        if found.trial is None:
+            return rows[:0]
+        evidence = self.evidence.chosen(rows)
+        changed = evidence.agreement(found.trial.change(evidence.rig))
+        return rows[self._fits(scores(changed, tracked=evidence.tracked), rows)]
+
+    def _fits(self, after: Floats, rows: Integers) -> Booleans:
+        """Whether photos fit that did not, by their scores after a change."""
+        before = scores(self.agreement, tracked=self.evidence.tracked)[rows]
+        return np.asarray((after > before + _FITS_BETTER) & (after > self._fitting))
+
+    @property
+    def _fitting(self) -> float:
+        """The score of a photo that fits."""
+        return max(_FITS * self.better, REPAIRED)
+
+    def _fitting_others(self, rows: Integers) -> Integers:
+        """Those of some cameras that fit another photo."""
+        others = self.views[:: -(-len(self.views) // _MOST_COMPARED)]
+        others = np.union1d(others, self.views[rows])
+        fitting = []
+        for row in rows:
+            evidence = self.evidence.chosen(np.full(len(others), row))
+            agreement = evidence.agreement(replace(evidence.rig, photos=others))
+            fit = scores(agreement, tracked=self.evidence.tracked)
+            # By chance one of many photos fits a few points.
+            fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
+            if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
+                fitting.append(row)
+        return np.array(fitting, dtype=np.int64)

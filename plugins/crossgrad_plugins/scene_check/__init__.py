@@ -1,0 +1,1 @@
+"""`crossgrad check`: points, poses and photos of a scene, held against each other."""

@@ -1,0 +1,42 @@
+"""The output of the command `crossgrad check`."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.commands import configured, merged, read_scene
+
+#: Notes that are printed.
+_MOST: Final = 12
+
+
+def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
+    """The notes on a scene, the warnings first, and the verdict.
+
+    Args:
+        path: The scene's folder.
+        assignments: `KEY=VALUE` texts as after `--set`.
+
+    Raises:
+        UserError: The scene cannot be read, or it contradicts itself.
+    """
+    scene, reader = read_scene(configured(merged(None, {"scene": str(path)}, assignments)))
+    found = scene.check or {}
+    warnings = found.get("warnings")
+    first = [str(each) for each in warnings] if isinstance(warnings, list) else []
+    notes = [*first, *(note for note in scene.notes if note not in first)]
+    more = [f"and {len(notes) - _MOST} more notes"] if len(notes) > _MOST else []
+    return [*notes[:_MOST], *more, _verdict(found, len(scene.views), reader)]
+
+
+def _verdict(found: Mapping[str, object], photos: int, reader: str) -> str:
+    measured = {
+        "correlation of colours": found.get("correlation"),
+        "share of observed points in frame": found.get("in_frame"),
+    }
+    shown = [f"{name} {value:.2f}" for name, value in measured.items() if isinstance(value, float)]
+    figures = f" (median {', '.join(shown)})" if shown else ""
+    return (
+        f"verdict: {found.get('verdict')}; {found.get('compared')} of {photos} photos compared "
+        f"with the points, reader {reader}{figures}"
+    )

@@ -1,0 +1,218 @@
+"""Scenes in memory that are right, or that contradict themselves in one of many ways."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.scenes import write_tiny_scene
+from support.scripts import BENCHMARKS
+
+from crossgrad_core.commands import configured
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.assemble import read_and_check, read_scene
+from crossgrad_core.scene.self_check.check import checked
+from crossgrad_core.scene.self_check.verdict import verdict_of
+
+KINDS = (
+    "OpenGL axes",
+    "camera-to-world poses",
+    "exchanged photos",
+    "mirrored photos",
+    "rotated photos",
+    "wrong focal length",
+    "turned cameras",
+    "wrong principal point",
+    "scaled points",
+    "photos shifted by one",
+    "half of the photos elsewhere",
+    "points with y and z exchanged",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A right scene on disk."""
+    folder = tmp_path_factory.mktemp("scenes") / "right"
+    return write_tiny_scene(folder, views=16, width=96, height=64, points=600, centered=True)
+
+
+@pytest.fixture(scope="module")
+def contradictions():
+    """The module with the kinds of contradictions."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        import _contradictions
+
+        yield _contradictions
+
+
+@pytest.fixture(scope="module")
+def model(folder, contradictions):
+    """The right scene in memory, moved away from the origin that its points surround."""
+    config = configured({"scene": str(folder), "threads": 1})
+    right = contradictions.Model.of(read_scene(config, folder)[0])
+    offset = np.array([0.3, -0.8, 0.5])
+    moved = replace(right, points=right.points + offset)
+    return moved.posed(right.rotations, right.centers + offset)
+
+
+def without_tracks(model):
+    return replace(model, seen=[np.zeros(0, dtype=np.int64) for _ in model.seen])
+
+
+def found(model):
+    scene = model.scene()
+    return verdict_of(scene, range(len(scene.views)))
+
+
+def causes(verdict):
+    return [each.what for each in (verdict.all_wrong, *verdict.some_wrong) if each is not None]
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+def test_a_right_scene_agrees(model, tracks):
+    verdict = found(model if tracks else without_tracks(model))
+    assert not causes(verdict)
+    assert verdict.correlation > 0.8
+    assert verdict.compared == 16
+
+
+def test_the_search_has_these_kinds(contradictions):
+    assert tuple(contradictions.KINDS) == KINDS
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_each_kind_is_reported_with_its_cause_or_its_photos(contradictions, model, kind, seed):
+    wrong = contradictions.KINDS[kind](model, np.random.default_rng(seed))
+    verdict = found(wrong.model)
+    if wrong.views:
+        assert verdict.all_wrong is None
+        named = {view for cause in verdict.some_wrong for view in cause.views}
+        assert named <= wrong.views
+        assert 2 * len(named) >= len(wrong.views)
+    else:
+        assert any(word in cause for word in wrong.causes for cause in causes(verdict))
+
+
+@pytest.mark.parametrize("kind", ["OpenGL axes", "camera-to-world poses", "scaled points"])
+def test_the_cause_is_found_without_tracks(contradictions, model, kind):
+    wrong = contradictions.KINDS[kind](without_tracks(model), np.random.default_rng(0))
+    assert any(word in cause for word in wrong.causes for cause in causes(found(wrong.model)))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_light_noise_jpeg_and_another_frame_are_no_contradiction(contradictions, model, seed):
+    rng = np.random.default_rng(seed)
+    assert not causes(found(contradictions.harmless(contradictions.varied(model, rng), rng)))
+
+
+def test_points_of_one_colour_are_compared_by_the_other_photos_of_their_tracks(model):
+    grey = replace(model, colors=np.full_like(model.colors, 128))
+    verdict = found(grey)
+    assert verdict.compared == 16
+    assert not causes(verdict)
+    assert "photos are compared with each other" in verdict.notes[0]
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+def test_nothing_is_said_about_points_of_random_colours(model, tracks):
+    colors = np.random.default_rng(1).integers(0, 256, model.colors.shape).astype(np.uint8)
+    random = replace(model, colors=colors)
+    assert not causes(found(random if tracks else without_tracks(random)))
+
+
+def test_nothing_is_said_without_points(model):
+    none = replace(model, points=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.uint8))
+    verdict = found(without_tracks(none))
+    assert verdict.compared == 0
+    assert not causes(verdict)
+
+
+def test_masked_pixels_are_no_contradiction(model):
+    class Half:
+        def __init__(self, pixels):
+            self.pixels = pixels
+
+        def image(self):
+            return self.pixels.image()
+
+        def mask(self):
+            image = self.pixels.image()
+            keep = image[..., 0].bool() | True
+            keep[:, : image.shape[1] // 2] = False
+            return keep
+
+    scene = model.scene()
+    views = tuple(replace(view, photo=Half(view.photo)) for view in scene.views)
+    verdict = verdict_of(replace(scene, views=views), range(len(views)))
+    assert not causes(verdict)
+    assert verdict.in_frame > 0.95
+
+
+def exchange(folder, first, second):
+    a, b = folder / "images" / first, folder / "images" / second
+    other = b.read_bytes()
+    b.write_bytes(a.read_bytes())
+    a.write_bytes(other)
+
+
+def test_photos_that_disagree_are_named_in_a_note_and_in_the_figures(tmp_path, caplog):
+    folder = write_tiny_scene(tmp_path / "s", views=12, width=96, height=64, points=600)
+    exchange(folder, "0003.png", "0007.png")
+    config = configured({"scene": str(folder), "threads": 1})
+    scene, _ = read_and_check(config, folder)
+    (note,) = (note for note in scene.notes if note.startswith("check:"))
+    assert "0003.png, 0007.png" in note
+    assert note in caplog.text
+    assert scene.check["verdict"] == "some photos disagree"
+    assert scene.check["disagreeing"] == ["0003.png", "0007.png"]
+
+
+def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(contradictions, model):
+    wrong = contradictions.KINDS["OpenGL axes"](model, np.random.default_rng(0)).model.scene()
+    with pytest.raises(UserError, match="the scene contradicts itself") as error:
+        checked(wrong, Path("scene"), cache_mib=1280)
+    assert "OpenGL axes" in error.value.found
+    assert "--accept-scene" in error.value.todo
+    accepted = checked(wrong, Path("scene"), cache_mib=1280, accept=True)
+    assert any("OpenGL axes" in note for note in accepted.notes)
+    assert accepted.check["verdict"] == "the scene disagrees"
+
+
+def test_of_a_scene_larger_than_the_memory_evenly_spread_photos_are_looked_at(model):
+    scene = model.scene()
+    large = [
+        replace(view, camera=replace(view.camera, width=4000, height=3000)) for view in scene.views
+    ]
+    few = checked(replace(scene, views=tuple(large)), Path("scene"), cache_mib=400, accept=True)
+    assert 0 < few.check["compared"] < len(scene.views)
+
+
+def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
+    rotations, centers = model.rotations.copy(), model.centers
+    rotations[2], centers[2] = rotations[1], centers[1]
+    photos = list(model.photos)
+    photos[2] = photos[1]
+    seen = list(model.seen)
+    seen[2] = seen[1]
+    points = np.vstack([model.points, [[1e7, 0, 0]]])
+    colors = np.vstack([model.colors, [[9, 9, 9]]]).astype(np.uint8)
+    odd = replace(model, photos=photos, seen=seen, points=points, colors=colors)
+    scene = checked(odd.posed(rotations, centers).scene(), Path("scene"), cache_mib=1280)
+    notes = " | ".join(note for note in scene.notes if note.startswith("check:"))
+    assert "1 photo with the pose of another one: 0002.png" in notes
+    assert "almost equal: 0001.png and 0002.png" in notes
+    assert "1 point practically at infinity" in notes
+
+
+def test_dark_and_blurred_photos_are_noted(model):
+    photos = list(model.photos)
+    photos[3] = (photos[3] // 60).astype(np.uint8)
+    height, width = photos[5].shape[:2]
+    across = np.linspace(0, 255, width)[None, :, None]
+    photos[5] = np.broadcast_to(across, (height, width, 3)).astype(np.uint8)
+    scene = checked(replace(model, photos=photos).scene(), Path("scene"), cache_mib=1280)
+    notes = " | ".join(note for note in scene.notes if note.startswith("check:"))
+    assert "1 photo (0003.png) much darker or brighter" in notes
