@@ -19,6 +19,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.growth import require_bounded, size_of
 from crossgrad_core.testing.posed import SamplerRun
 
 #: Steps after which a run is interrupted, and steps that follow.
@@ -128,6 +129,12 @@ def old_states_stay_untouched(make: Make[Sampler]) -> None:
         require(same_state(old, kept), "sample changes the state that it was given")
 
 
+def states_stay_bounded(make: Make[Sampler]) -> None:
+    """The state does not grow with the number of steps."""
+    run = sampler_run(make())
+    require_bounded((size_of(run.state) for _ in iter(run.draw, None)), "sample")
+
+
 SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
     *COMPONENT_CHECKS,
     usual_views_are_admitted,
@@ -136,4 +143,5 @@ SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
     same_seed_same_draws,
     resumes_exactly,
     old_states_stay_untouched,
+    states_stay_bounded,
 )
