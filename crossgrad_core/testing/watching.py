@@ -14,10 +14,10 @@ def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None
     """Writes the wall time of the fastest call of each hook into `seconds`, as calls are made."""
     begun: list[float] = []
 
-    def before(name: str, implementations: object, arguments: object) -> None:
+    def before(*_: object) -> None:
         begun.append(perf_counter())
 
-    def after(outcome: object, name: str, implementations: object, arguments: object) -> None:
+    def after(_: object, name: str, *__: object) -> None:
         taken = perf_counter() - begun.pop()
         seconds[name] = min(taken, seconds.get(name, taken))
 

@@ -31,7 +31,7 @@ def check_package(package: str) -> tuple[str, bool]:
     Raises:
         UserError: No such package is installed, or it offers no plugin.
     """
-    found = _entries_of(package)
+    found = entries_of(package)
     origins = sorted({f"{entry.distribution} {entry.version}" for entry in found})
     lines, failed = [", ".join(origins)], 0
     width = max(len(_label(entry)) for entry in found)
@@ -46,7 +46,7 @@ def check_package(package: str) -> tuple[str, bool]:
     return "\n".join(lines), failed == 0
 
 
-def _entries_of(package: str) -> list[Entry]:
+def entries_of(package: str) -> list[Entry]:
     """The plugins of a package by slot and name.
 
     Raises:
