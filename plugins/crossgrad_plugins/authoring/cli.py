@@ -115,9 +115,9 @@ def matrix(
 ) -> None:
     """Train a package's components with all others for a few steps.
 
-    Each combination of installed components trains a tiny scene twice; losses and parameters must be
-    finite, and both runs the same. A combination that is refused before training, with a reason,
-    is no failure. Exit status: 0 where all others train, 1 where one fails.
+    Each combination of installed components trains a tiny scene twice; losses and parameters must
+    be finite, and both runs the same. A combination that is refused before training, with a
+    reason, is no failure. Exit status: 0 where all others train, 1 where one fails.
     """
     announce()
     from crossgrad_plugins.authoring.matrix.report import train_matrix, train_one

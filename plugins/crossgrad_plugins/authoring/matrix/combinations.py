@@ -137,8 +137,9 @@ def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOT
     lines = []
     for reason, concerned in by_reason.items():
         places = _slots_that_decide(concerned, rows)
-        for names in {tuple(row[i] for i in places) for row in concerned}:
-            lines.append(f"{named(names, [slots[i] for i in places])}: {reason}")
+        deciding = [slots[i] for i in places]
+        names = {tuple(row[i] for i in places) for row in concerned}
+        lines += [f"{named(each, deciding)}: {reason}" for each in names]
     return sorted(lines)
 
 

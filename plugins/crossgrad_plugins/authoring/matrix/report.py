@@ -134,14 +134,15 @@ def report(tally: Tally, package: str) -> str:
     heading = f"{members.package}: {listed(f'{slot} {name}' for slot, name in sorted(own))}"
     numbers = count(len(tally.trained) - len(tally.failed), "combination")
     lines = [_filled(heading, ""), f"{numbers} trained for {STEPS} steps, twice with the same bits"]
-    for reason in members.left_out:
-        lines.append(_filled(f"left out: {reason}", "  "))
+    lines += [_filled(f"left out: {reason}", "  ") for reason in members.left_out]
     refused = sum(map(len, tally.refused.values()))
     lines.append(f"{count(refused, 'combination')} refused before training, with the reason")
     for slots, rows in tally.refused.items():
         lines += [_filled(line, "  ") for line in _refusals(rows, slots, tally)]
-    for name in tally.never_trained:
-        lines.append(f"FAIL  {name} was trained in no combination: each one was refused")
+    lines += [
+        f"FAIL  {name} was trained in no combination: each one was refused"
+        for name in tally.never_trained
+    ]
     lines.append(f"{count(len(tally.failed), 'combination')} failed")
     for combination, reason in tally.failed.items():
         lines += [f"  {combination}", _filled(reason, "    ")]
