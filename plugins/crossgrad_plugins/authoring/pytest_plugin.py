@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from typing_extensions import override
 
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunConfig
@@ -47,6 +48,7 @@ class Matrix(pytest.Collector):
         super().__init__(**kwargs)
         self.package = package
 
+    @override
     def collect(self) -> list[pytest.Item]:
         """A test for each combination, also for those that are refused.
 
@@ -92,6 +94,7 @@ class Combination(pytest.Item):
         super().__init__(**kwargs)
         self.make, self.reasons = make, reasons
 
+    @override
     def runtest(self) -> None:
         """Trains it."""
         from crossgrad_core.testing.short_runs import try_out
@@ -101,6 +104,7 @@ class Combination(pytest.Item):
             pytest.skip("refused before training: " + "; ".join(self.reasons))
         try_out(self.make(), STEPS)
 
+    @override
     def reportinfo(self) -> tuple[str, None, str]:
         """Where it is: in no file."""
         return NAME, None, self.name
