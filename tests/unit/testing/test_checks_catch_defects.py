@@ -1001,7 +1001,7 @@ def test_every_check_has_a_defect_that_it_catches():
     }
     # Other files of this folder hold further defects, in the same form: (module.check, Defect, ...
     sources = [path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py")]
-    caught = {name for each in sources for name in re.findall(r"^ +\(\w+\.(\w+), \w", each, re.M)}
+    caught = {name for each in sources for name in re.findall(r"^ +\(\w+\.(\w+), \w", each, re.MULTILINE)}
     assert {check.__name__ for check in checks} - caught == set()
 
 
