@@ -8,7 +8,9 @@ from torch import Tensor
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.contract.observer import Observer
 from crossgrad_core.numerics.threads import on_one_thread
+from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble, reasons_against
 from crossgrad_core.run.select import select
 from crossgrad_core.testing.contract import require
@@ -52,7 +54,9 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     """
     selection, _ = select(config, sample_scene(), "none")
     # What the manager would gather; registering with it would take most of the time.
-    asked = (getattr(c, "crossgrad_objections", None) for c in selection.components.values())
+    observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
+    plugins = (*selection.components.values(), *observers)
+    asked = (getattr(each, "crossgrad_objections", None) for each in plugins)
     answers = [ask(selection) for ask in asked if ask is not None]
     return reasons_against(config, selection, [each for each in answers if each])
 
