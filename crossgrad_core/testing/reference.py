@@ -69,7 +69,7 @@ def moved(
 
 @dataclass(frozen=True)
 class _Case:
-    """What is drawn.
+    """Gaussians, a camera and options to draw with.
 
     Attributes:
         name: What is special about it.
@@ -145,7 +145,7 @@ def _depths(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What a rasterizer made of a case, float64 on the CPU.
+    """The outputs and gradients of one render, float64 on the CPU.
 
     Attributes:
         pixels: Image, alpha and, where it provides it, depth.

@@ -26,7 +26,7 @@ _LARGEST_LOSS = 10.0
 
 @dataclass(frozen=True)
 class ShortRun:
-    """What a few steps left.
+    """The parameters and records of a few steps.
 
     Attributes:
         before: Parameters before the first step.

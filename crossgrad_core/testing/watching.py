@@ -1,4 +1,4 @@
-"""What hooks cost: the time of their calls, and the memory that is kept after them."""
+"""The cost of hooks: the time of their calls, and the memory that is kept after them."""
 
 import gc
 import tracemalloc

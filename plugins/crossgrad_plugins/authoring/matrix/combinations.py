@@ -46,7 +46,7 @@ Refused: TypeAlias = Mapping[Row, Collection[str]]
 
 @dataclass(frozen=True)
 class Factors:
-    """What is combined.
+    """Combinations of the components of some slots.
 
     Attributes:
         slots: The slots, in the order of the names in a row.

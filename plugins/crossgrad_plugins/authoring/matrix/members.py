@@ -1,4 +1,4 @@
-"""Which components take part in the matrix of a package, and in which combinations."""
+"""The components that take part in the matrix of a package, and their combinations."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ Admits = Callable[[Row, tuple[str, ...]], bool]
 
 @dataclass(frozen=True)
 class Members:
-    """What takes part.
+    """The components that are combined.
 
     Attributes:
         package: What the package is called and its version.

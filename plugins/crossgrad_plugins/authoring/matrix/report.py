@@ -25,7 +25,7 @@ _PAUSE = 5.0
 
 @dataclass
 class Tally:
-    """What came of the combinations.
+    """The combinations that trained, were refused or failed.
 
     Attributes:
         members: What takes part.
