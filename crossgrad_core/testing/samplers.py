@@ -1,5 +1,6 @@
 """Contract checks of samplers."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +14,7 @@ from crossgrad_core.testing.contract import (
     Check,
     Make,
     admitted,
+    cannot_tell,
     global_randomness_untouched,
     require,
     revived,
@@ -83,6 +85,22 @@ def _require_good(draw: Draw, counts: frozenset[int], available: int) -> None:
     )
 
 
+def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
+    """Where the training views have groups, every draw has labels: operators may need them."""
+    sampler = make()
+    if sampler.default_grouping is not None or sampler.own_labels:
+        raise cannot_tell("it has groups of its own choice")
+    regimes = tuple(view.regime for view in sample_scene().train_views)
+    run = replace(sampler_run(sampler), groups=regimes)
+    for draw in run.draws(_AFTER):
+        require(
+            draw.labels is not None,
+            "context.groups is given, and sample answers a Draw without labels, so that no "
+            "operator can tell the groups apart; expected a label for each view, such as "
+            "context.groups[view]",
+        )
+
+
 def every_view_comes(make: Make[Sampler]) -> None:
     """Each training view is drawn sooner or later."""
     sampler = make()
@@ -139,6 +157,7 @@ SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
     *COMPONENT_CHECKS,
     usual_views_are_admitted,
     draws_are_training_views,
+    draws_hand_on_the_groups,
     every_view_comes,
     same_seed_same_draws,
     resumes_exactly,

@@ -27,6 +27,7 @@ from crossgrad_core.testing import (
     operators,
     rasterizers,
     readers,
+    reference,
     samplers,
 )
 from crossgrad_core.testing.contract import ContractError
@@ -165,7 +166,9 @@ class InTurn(api.Sampler):
         start = state.values.get("start", 0)
         number = len(context.scene.train)
         views = tuple((start + k) % number for k in range(context.views_per_step))
-        return api.Draw(views), api.PluginState({"start": start + context.views_per_step})
+        groups = context.groups
+        labels = None if groups is None else tuple(groups[view] for view in views)
+        return api.Draw(views, labels), api.PluginState({"start": start + context.views_per_step})
 
 
 class UsualViewsRefused(InTurn):
@@ -874,7 +877,7 @@ DEFECTS = [
     (rasterizers.statistics_are_filled, NoStatistics),
     (rasterizers.same_input_same_bits, Flickers),
     (rasterizers.rows_on_demand_are_asked_for, AsksForNoRows),
-    (rasterizers.the_reference_draws_the_same, LessOpaque),
+    (reference.the_reference_draws_the_same, LessOpaque),
     (rasterizers.dilations_of_gaussians_are_heeded, OneDilation),
     (backbones.blocks_cover_the_parameters, LooseTensor),
     (backbones.created_from_the_scene, GlobalStart),

@@ -3,7 +3,7 @@
 from itertools import combinations, product
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crossgrad_plugins.authoring.matrix.pairwise import meetings, pairs_of, pairwise
@@ -13,6 +13,7 @@ def pairs(rows):
     return {(i, j, row[i], row[j]) for row in rows for i, j in combinations(range(len(rows[0])), 2)}
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # A busy machine is slow enough.
 @given(st.sets(st.tuples(*[st.sampled_from("abcd")] * 4), min_size=1))
 def test_every_pair_that_can_occur_occurs(admitted):
     chosen = pairwise(sorted(admitted))

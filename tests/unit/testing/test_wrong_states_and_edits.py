@@ -1,4 +1,4 @@
-"""States that grow for ever, edits that remove nearly all, and views that count by their place."""
+"""States that grow for ever, edits that remove nearly all, and views without label or by place."""
 
 from unittest import SkipTest
 
@@ -23,6 +23,11 @@ class Hoards(api.Sampler):
     def sample(self, context, state):
         drawn = context.rng.integers(len(context.scene.train), size=context.views_per_step)
         return api.Draw(tuple(map(int, drawn))), longer(context, state)
+
+
+class Unlabelled(api.Sampler):
+    def sample(self, context, state):
+        return api.Draw((0,) * context.views_per_step), state
 
 
 class HoardsScales(FullSize):
@@ -83,6 +88,7 @@ class RepeatsOne(NoDensification):
 @pytest.mark.parametrize(
     ("check", "make", "words"),
     [
+        (samplers.draws_hand_on_the_groups, Unlabelled, "a Draw without labels"),
         (samplers.states_stay_bounded, Hoards, "that sample returns grows for ever"),
         (resolutions.states_stay_bounded, HoardsScales, "that scales returns grows for ever"),
         (densifiers.states_stay_bounded, HoardsEdits, "that densify returns grows for ever"),
