@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
+from crossgrad_core.registry.entries import load as load_component
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
 from crossgrad_core.registry.strays import Stray, strays
@@ -139,6 +140,7 @@ __all__ = [
     "listed",
     "listened_to",
     "load_command",
+    "load_component",
     "load_entry",
     "locked",
     "merged",

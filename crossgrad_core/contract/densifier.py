@@ -55,6 +55,9 @@ class Densifier(Component):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         """The edit of this step and the new state.
 
+        An edit of a model that trains well keeps at least a tenth of its primitives: a model that
+        loses nearly all of them at once cannot be trained back.
+
         The core gathers `state.per_primitive` of *the returned state* along with the edit.
         """
 

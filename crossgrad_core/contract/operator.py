@@ -69,6 +69,9 @@ class Operator(Component):
     ) -> tuple[Aggregated, PluginState]:
         """One gradient per tensor, and the new state.
 
+        The place of a view in the step means nothing. Views are told apart by labels, losses,
+        distances or gradients; views that differ in none of these count alike.
+
         Args:
             context: The gradients of the K views and what is known about them.
             state: What this operator returned last.

@@ -21,6 +21,9 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 class PluginState:
     """The state of one plugin between steps.
 
+    Its size must not depend on the number of steps, because every checkpoint holds it: keep sums,
+    or a window of at most 1,000 steps.
+
     Attributes:
         values: Plain numbers, strings, lists and dictionaries (must survive JSON).
         tensors: Tensors of any shape.

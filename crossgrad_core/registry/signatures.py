@@ -1,6 +1,6 @@
 """Whether the methods of a component take what crossgrad calls them with."""
 
-from collections.abc import Iterator
+from functools import cache
 from inspect import Parameter, Signature, getattr_static, isfunction, signature
 from typing import Final
 
@@ -9,7 +9,8 @@ _POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
 _CONTRACT: Final = "crossgrad_core.contract."
 
 
-def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
+@cache
+def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...]:
     """Methods that cannot be called like those of the base class that they replace.
 
     Hooks are left out: they may take fewer arguments.
@@ -18,11 +19,12 @@ def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
         found: A subclass of `base`.
         base: The base class of a slot.
 
-    Yields:
-        The name, the signature of the base class and the one that was found.
+    Returns:
+        The name, the signature of the base class and the one that was found, of each.
     """
     contract = [each for each in base.__mro__ if each.__module__.startswith(_CONTRACT)]
     names = dict.fromkeys(name for each in contract for name in vars(each))
+    wrong = []
     for name in names:
         theirs, own = getattr_static(base, name), getattr_static(found, name)
         if name.startswith(("_", "crossgrad_")) or own is theirs:
@@ -31,7 +33,8 @@ def wrong_signatures(found: type, base: type) -> Iterator[tuple[str, str, str]]:
             # A decorator may pass arguments of its own: what it takes itself counts.
             expected, given = signature(theirs), signature(own, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
-                yield name, str(expected), str(given)
+                wrong.append((name, str(expected), str(given)))
+    return tuple(wrong)
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:

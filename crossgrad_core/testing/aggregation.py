@@ -1,6 +1,8 @@
 """Contract checks of operators as the training step sees them: from K gradients to one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import count
 from math import nan
 
 import numpy as np
@@ -9,7 +11,8 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.operator import STATE, Operator
+from crossgrad_core.contract.state import PluginState
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.testing.contract import (
@@ -22,6 +25,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import step_fields
+from crossgrad_core.testing.growth import require_bounded, size_of
 from crossgrad_core.training.operator_scale import OperatorScale
 
 _RATE = LearningRate(0.01)
@@ -85,7 +89,10 @@ def aggregated(
     operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> Aggregated:
     """What the operator answers at the seam; see `aggregate_context`."""
-    context = aggregate_context(gradients, summed=summed)
+    return _answer(operator, aggregate_context(gradients, summed=summed))
+
+
+def _answer(operator: Operator, context: AggregateContext) -> Aggregated:
     answer: object = operator.crossgrad_aggregate_gradients(context)
     if not isinstance(answer, Aggregated):
         require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
@@ -184,10 +191,27 @@ def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
         require(one == other, f"K = {views}: equal gradients get other weights each time")
 
 
+def states_stay_bounded(make: Make[Operator]) -> None:
+    """The state does not grow with the number of steps."""
+    operator = make()
+    views = max(admitted(operator.views)[:2])
+    states = _states(operator, aggregate_context(sample_gradients(views)))
+    require_bounded(map(size_of, states), "aggregate")
+
+
+def _states(operator: Operator, context: AggregateContext) -> Iterator[PluginState]:
+    """The operator's state after each step of a run without an end."""
+    states: Mapping[str, PluginState] = {}
+    for step in count(1):
+        states = _answer(operator, replace(context, step=step, states=states)).states
+        yield states[STATE]
+
+
 AGGREGATION_CHECKS: tuple[Check[Operator], ...] = (
     every_tensor_is_answered,
     equal_gradients_have_a_scale,
     absent_views_have_no_weight,
     gradients_stay_untouched,
     same_seed_same_aggregation,
+    states_stay_bounded,
 )

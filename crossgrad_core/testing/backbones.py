@@ -11,16 +11,30 @@ from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Parameters, primitives_of
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.defaults import REFERENCE_RASTERIZER
 from crossgrad_core.numerics.spherical import COEFFICIENTS
 from crossgrad_core.registry import entries as registry
+from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    cannot_tell,
+    global_randomness_untouched,
+    require,
+)
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_core.wording import listed
 
 #: Steps at which decoding is looked at: before the first, early, the last.
 _STEPS = (0, 1, 30_000)
+#: How far parameters are moved away from their initial values at most.
+_STEP = 0.02
+#: Difference of two renders of Gaussians whose float32 numbers are worked out in two ways: a few
+#: of them begin or end to be drawn in a pixel at its edge, where alpha is 1/255.
+_PIXEL, _MEAN = 0.02, 2e-4
 
 
 def created(backbone: Backbone, seed: int = 0) -> Parameters:
@@ -228,6 +242,44 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
     require(finite, "bake() gives Gaussians that are not finite")
 
 
+def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
+    """With `plain`, the baked Gaussians give every camera the picture that decoding gives it."""
+    backbone = make()
+    if not backbone.plain:
+        raise cannot_tell("it does not say that a standard PLY loses nothing (plain)")
+    parameters, phase = _grown(created(backbone)), sample_phase(training=False)
+    cameras = [view.camera for view in sample_scene().train_views]
+    baked = backbone.bake(parameters, phase, cameras[:1])
+    rasterizer, background = build(Rasterizer, REFERENCE_RASTERIZER, {}), torch.full((3,), 0.5)
+    for camera in cameras:
+        with torch.no_grad():
+            decoded = backbone.decode(parameters, camera, phase)
+            drawn, again = (
+                rasterizer.render(each, camera, background).image for each in (decoded, baked)
+            )
+        error = (drawn - again).abs()
+        require(
+            error.max() < _PIXEL and error.mean() < _MEAN,
+            f"plain is True, but what bake gives is drawn otherwise than what decode gives, by up "
+            f"to {float(error.max()):.2g}, {float(error.mean()):.2g} in the mean; expected at most "
+            f"{_PIXEL:g} and {_MEAN:g}: bake what decode draws, or leave plain out",
+        )
+
+
+def _grown(parameters: Parameters) -> Parameters:
+    """The parameters a little away from where they begin, so that none of them is a round number.
+
+    All of them grow: colours stay above 0, where harmonics would be clamped and colours would not.
+    """
+    rng = np.random.default_rng(5)
+
+    def grown(tensor: Tensor) -> Tensor:
+        step = torch.from_numpy(rng.uniform(0.0, _STEP, tuple(tensor.shape))).to(tensor)
+        return (tensor.detach() + step).requires_grad_()
+
+    return {name: grown(each) if each.requires_grad else each for name, each in parameters.items()}
+
+
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
     """`fitted_to` says what it left out and changes no option that the user set."""
     backbone = make()
@@ -272,5 +324,6 @@ BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (
     parameters_stay_untouched,
     passed_on_tensors_are_handed_over,
     baking_gives_plain_gaussians,
+    plain_ones_bake_what_they_draw,
     fitting_respects_the_user,
 )

@@ -1,6 +1,7 @@
 """Contract checks of densifiers, on a real backbone with made-up screen statistics."""
 
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.growth import require_bounded, size_of
 from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
 from crossgrad_core.testing.records import view_record
 from crossgrad_core.testing.renders import renders_of
@@ -37,6 +39,8 @@ from crossgrad_core.wording import listed
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
 _EDIT = 600
 _ROOM = 10_000
+#: Of the primitives that are there, the share that one edit leaves at least.
+_LEFT = 0.1
 #: Typical gradient by the projected mean, per pixel: the published threshold in NDC units is
 #: reached by 2e-5 in an image as small as the sample scene's.
 _GRADIENT = 5e-5
@@ -234,6 +238,20 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
         require(grown <= room, f"{grown} primitives were added where context.room was {room}")
 
 
+def most_primitives_survive(make: Make[Densifier]) -> None:
+    """No edit removes nearly all primitives of a sound model: it could not be trained back."""
+    run = DensifierRun.of(make())
+    for step in range(_EDIT - 4, _EDIT + 1):
+        before = run.primitives
+        edit = run.take_step(step)
+        left = before if edit.source is None else len(set(edit.source.tolist()))
+        require(
+            left >= _LEFT * before,
+            f"step {step}: the edit of densify keeps {left} of {before} primitives of a model that "
+            f"has just begun to train; expected at least {_LEFT:.0%} of them",
+        )
+
+
 def same_seed_same_edits(make: Make[Densifier]) -> None:
     """The edits depend on the arguments alone, and randomness comes from `context.rng`."""
     with global_randomness_untouched():
@@ -280,13 +298,21 @@ def inputs_stay_untouched(make: Make[Densifier]) -> None:
         run.take_step(step)
 
 
+def states_stay_bounded(make: Make[Densifier]) -> None:
+    """The state does not grow with the number of steps."""
+    run = DensifierRun.of(make())
+    require_bounded((size_of(run.state) for step in count(_EDIT) if run.take_step(step)), "densify")
+
+
 DENSIFIER_CHECKS: tuple[Check[Densifier], ...] = (
     *COMPONENT_CHECKS,
     its_needs_are_statistics,
     quiet_before_its_time,
     edits_keep_everything_aligned,
     never_outgrows_the_room,
+    most_primitives_survive,
     same_seed_same_edits,
     resumes_exactly,
     inputs_stay_untouched,
+    states_stay_bounded,
 )

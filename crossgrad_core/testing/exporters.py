@@ -10,10 +10,12 @@ from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, require
+from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import sample_gaussians
 
 _FRAME = Similarity(np.array([1.0, -2.0, 3.0]), 0.5)
+#: Of a few operations in float32, on numbers of about 1.
+_ROUNDING = 1e-5
 
 
 def has_a_suffix(make: Make[Exporter]) -> None:
@@ -40,6 +42,65 @@ def writes_one_file(make: Make[Exporter]) -> None:
         require(same, "the same Gaussians give different files")
 
 
+def appears_at_once(make: Make[Exporter]) -> None:
+    """A file that is there is replaced as a whole and never written over in place."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        make().write(_gaussians(), _FRAME, path, ())
+        before = path.stat().st_ino
+        if not before:
+            raise cannot_tell("this file system does not number its files")
+        make().write(_gaussians(), _FRAME, path, ())
+        require(
+            path.stat().st_ino != before,
+            "write() writes over the file in place, so that a full disk or a reader in between "
+            "finds half of it; expected that it appears complete or not at all: write to another "
+            "name in its folder and rename it, or use crossgrad_core.plugin.atomic_file",
+        )
+
+
+def writes_the_input_frame(make: Make[Exporter]) -> None:
+    """Where the local frame has another offset or scale, so have the coordinates of the file."""
+    exporter, given = make(), _gaussians()
+    offset = Similarity(_FRAME.offset + np.array([8.0, 16.0, -4.0]), _FRAME.scale)
+    scale = Similarity(_FRAME.offset, 4.0 * _FRAME.scale)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        exporter.write(given, _FRAME, path, ())
+        written, rounding = path.read_bytes(), exporter.rounding(given, _FRAME)
+        for similarity, what in ((offset, "offset"), (scale, "scale")):
+            exporter.write(given, similarity, path, ())
+            moved = not np.array_equal(exporter.rounding(given, similarity).offset, rounding.offset)
+            require(
+                path.read_bytes() != written or moved,
+                f"another {what} of the similarity gives the same file: write() writes the local "
+                "frame; expected the input frame: positions by similarity.to_input, lengths "
+                "divided by similarity.scale",
+            )
+
+
+def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
+    """`read` gives the positions, sizes and opacities of `stored`, up to float32 rounding."""
+    exporter = make()
+    if type(exporter).read is Exporter.read:
+        raise cannot_tell("its files are written, not read")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"a.{exporter.suffix}"
+        exporter.write(_gaussians(), _FRAME, path, ())
+        found = exporter.read(path, _FRAME)
+    stored = exporter.stored(_gaussians())
+    require(len(found) == len(stored), f"{len(stored)} Gaussians are read as {len(found)}")
+    # What is added to positions in the input frame is lost to their last bits.
+    size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
+    for name in ("means", "scales", "opacities"):
+        error = float((getattr(found, name) - getattr(stored, name)).abs().max())
+        require(
+            error <= _ROUNDING * max(1.0, size),
+            f"read() gives {name} that differ from those of stored() by up to {error:.2g}; "
+            "expected the local frame again, up to rounding",
+        )
+
+
 def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
     """`stored` gives finite Gaussians, as many as it got, and leaves its own as they are."""
     given = _gaussians()
@@ -64,5 +125,8 @@ EXPORTER_CHECKS: tuple[Check[Exporter], ...] = (
     *COMPONENT_CHECKS,
     has_a_suffix,
     writes_one_file,
+    appears_at_once,
+    writes_the_input_frame,
+    what_it_writes_is_read_again,
     the_stored_ones_can_be_drawn,
 )

@@ -1,11 +1,13 @@
 """Contract checks of observers: they survive every event and leave every seam answered."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
+from itertools import count, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -32,6 +34,7 @@ from crossgrad_core.contract.contexts import (
     Sampled,
     ScaleContext,
     Scaled,
+    StepContext,
     StepRecord,
 )
 from crossgrad_core.contract.densifier import Densifier
@@ -51,6 +54,7 @@ from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,
+    ContractError,
     Make,
     global_randomness_untouched,
     require,
@@ -58,13 +62,34 @@ from crossgrad_core.testing.contract import (
 )
 from crossgrad_core.testing.densifiers import DensifierRun, require_good
 from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.growth import require_bounded, size_of
 from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
 from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.testing.watching import time_hooks, traced_memory
+from crossgrad_core.wording import in_one_line
 
 #: The hooks of one run's manager; pluggy gives them no types.
 Hooks: TypeAlias = Any
 
 _VIEWS = (0, 4)
+#: Steps that observers are looked at in: the first ones, and more and more of a whole run.
+_STEPS = (*range(1, 17), 50, 100, 500, 600, 1_000, 7_000, 15_000, STEPS)
+
+
+#: Hooks that a step waits for.
+_ON_THE_CLOCK = {
+    "crossgrad_sample_views",
+    "crossgrad_choose_scales",
+    "crossgrad_pixel_weights",
+    "crossgrad_regularize",
+    "crossgrad_aggregate_gradients",
+    "crossgrad_densify",
+    "crossgrad_after_step",
+}
+#: Calls of each, and what the fastest of them may take: a busy machine slows some, hardly all.
+_CALLS, _SLOW = 6, 0.1
+#: Bytes that an observer may keep of each step, and steps between two looks at the memory.
+_KEPT, _BLOCK = 100_000, 4
 
 
 class _Components:
@@ -88,9 +113,16 @@ class _Components:
 
 
 @contextmanager
-def _hooks(observer: Observer) -> Iterator[Hooks]:
-    """The hooks with the observer registered; what it prints is kept off the terminal."""
+def _hooks(observer: Observer, seconds: dict[str, float] | None = None) -> Iterator[Hooks]:
+    """The hooks with the observer registered; what it prints is kept off the terminal.
+
+    Args:
+        observer: The observer.
+        seconds: Name of a hook -> wall time of its fastest call, to be filled; None takes no times.
+    """
     manager = make_manager({"components": _Components(), "observer": observer})
+    if seconds is not None:
+        time_hooks(manager, seconds)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         yield manager.hook
 
@@ -108,14 +140,16 @@ def _start(hooks: Hooks, folder: Path | None) -> None:
     )
 
 
-def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> StepRecord:
+def _record(step: int) -> StepRecord:
     counts = {"zero": 1, "cloned": 2, "pruned": 1, "reset": 0}
     names = tuple(sample_scene().train_views[view].name for view in _VIEWS)
-    record = StepRecord(step, _VIEWS, names, None, (0.2, 0.1), 40, counts, 0.01 * step)
-    hooks.crossgrad_step_end(record=record)
+    return StepRecord(step, _VIEWS, names, None, (0.2, 0.1), 40, counts, 0.01 * step)
+
+
+def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
+    hooks.crossgrad_step_end(record=_record(step))
     for answer in answers:
         _require_answer(answer, Answer)
-    return record
 
 
 def survives_every_event(make: Make[Observer]) -> None:
@@ -125,11 +159,8 @@ def survives_every_event(make: Make[Observer]) -> None:
             observer = make()
             with _hooks(observer) as hooks:
                 _start(hooks, place)
-                last = None
-                for step in (1, 2):
-                    answers = _seams(hooks, observer, step, last)
-                    last = _step_end(hooks, step, answers)
-                    hooks.crossgrad_model(model=_model(step))
+                for step in _STEPS if place else (1, 2):
+                    _require_survival(hooks, observer, step)
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
                 )
@@ -138,18 +169,40 @@ def survives_every_event(make: Make[Observer]) -> None:
                 hooks.crossgrad_run_end(status="finished")
 
 
+def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
+    """Requires that the hooks of a step raise nothing; what they answer is looked at elsewhere."""
+    try:
+        _step_end(hooks, step, _seams(hooks, observer, step))
+        hooks.crossgrad_model(model=_model(step))
+    except ContractError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ContractError(
+            f"step {step}: a hook of the observer raises {in_one_line(error)}; expected that an "
+            "observer ends no run: catch what can fail, and leave out what failed"
+        ) from error
+
+
 def the_model_stays_untouched(make: Make[Observer]) -> None:
     """Looking at the model changes none of its tensors."""
-    model, copy = _model(1), _model(1)
     with _hooks(make()) as hooks:
         _start(hooks, None)
-        _step_end(hooks, 1, [])
-        hooks.crossgrad_model(model=model)
+        for step in _STEPS:
+            model = _model(step)
+            _step_end(hooks, step, [])
+            hooks.crossgrad_model(model=model)
+            _require_new(model, step)
+
+
+def _require_new(model: Model, step: int) -> None:
+    """Requires that a model is as `_model` made it."""
+    same = _model(step).parameters
     for name, tensor in model.parameters.items():
-        same = torch.equal(tensor.detach(), copy.parameters[name].detach())
-        require(same, f"the observer changes the parameters {name}")
+        equal = torch.equal(tensor.detach(), same[name].detach())
+        require(equal, f"step {step}: crossgrad_model changes the parameters {name}")
     for name, moment in model.adam.exp_avg.items():
-        require(not moment.any(), f"the observer changes the optimizer's moments of {name}")
+        changed = bool(moment.any())
+        require(not changed, f"step {step}: crossgrad_model changes the moments of {name}")
 
 
 def survives_an_early_end(make: Make[Observer]) -> None:
@@ -161,27 +214,40 @@ def survives_an_early_end(make: Make[Observer]) -> None:
 
 
 def seams_stay_answered(make: Make[Observer]) -> None:
-    """Around each seam the observer returns an answer of the right kind and shape."""
-    observer = make()
+    """Around each seam the observer returns an answer of the right kind and shape, and finite."""
+    run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
-        sampled, scaled, aggregated, _ = _seams(hooks, observer, 1)
-    draw, scales = cast("Sampled", sampled).draw, cast("Scaled", scaled).scales
-    require(len(draw.views) == len(_VIEWS), f"{len(_VIEWS)} views became {len(draw.views)}")
+        for step in _STEPS:
+            sampled, scaled, aggregated, densified = _seams(hooks, observer, step)
+            _require_views(step, cast("Sampled", sampled), cast("Scaled", scaled))
+            _require_gradients(step, cast("Aggregated", aggregated))
+            edit = cast("Densified", densified).edit
+            require(isinstance(edit, Edit), f"step {step}: the edit is {edit!r}, not an Edit")
+            require_good(edit, run.backbone.blocks(), run.parameters)
+
+
+def _require_views(step: int, sampled: Sampled, scaled: Scaled) -> None:
+    drawn, scales = len(sampled.draw.views), scaled.scales
+    require(drawn == len(_VIEWS), f"step {step}: {len(_VIEWS)} views became {drawn}")
     good = len(scales) == len(_VIEWS) and all(0.0 < scale <= 1.0 for scale in scales)
-    require(good, f"{len(_VIEWS)} views get the scales {scales}; expected one in (0, 1] for each")
-    gradients = sample_gradients(len(_VIEWS))[0]
-    answered = cast("Aggregated", aggregated).gradients
+    wanted = "expected one in (0, 1] for each"
+    require(good, f"step {step}: {len(_VIEWS)} views get the scales {scales}; {wanted}")
+
+
+def _require_gradients(step: int, aggregated: Aggregated) -> None:
+    gradients, answered = sample_gradients(len(_VIEWS))[0], aggregated.gradients
+    what = f"step {step}: a wrapper of crossgrad_aggregate_gradients answers"
     require(
         answered.keys() == gradients.keys(),
-        f"gradients of {sorted(gradients)} became gradients of {sorted(answered)}",
+        f"{what} gradients of {sorted(answered)}; expected those of {sorted(gradients)}",
     )
     for name, gradient in answered.items():
         expected = gradients[name]
         fits = gradient is None or (expected is not None and gradient.shape == expected.shape)
-        require(fits, f"the aggregated gradient of {name} changes its shape")
+        require(fits, f"{what} a gradient of {name} of another shape")
         finite = gradient is None or gradient.isfinite().all()
-        require(finite, f"the aggregated gradient of {name} is not finite")
+        require(finite, f"{what} a gradient of {name} that is not finite, for finite ones")
 
 
 def questions_are_answered_in_kind(make: Make[Observer]) -> None:
@@ -195,8 +261,8 @@ def questions_are_answered_in_kind(make: Make[Observer]) -> None:
             good = isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
             require(good, f"crossgrad_objections answers {reasons!r}, not a list of sentences")
         _start(hooks, None)
-        for step, scale in ((1, 1.0), (2, 0.5), (600, 1.0)):
-            _require_usable(hooks, run, step, scale)
+        for step in _STEPS:
+            _require_usable(hooks, run, step, 0.5 if step == 2 else 1.0)  # noqa: PLR2004
     for name, tensor in run.parameters.items():
         same = torch.equal(tensor.detach(), kept[name])
         require(same, f"the observer changes the parameters {name} itself; answer with an edit")
@@ -259,29 +325,100 @@ def _model(step: int) -> Model:
 
 
 def _seams(
-    hooks: Hooks, observer: Observer, step: int, last: StepRecord | None = None
+    hooks: Hooks,
+    observer: Observer,
+    step: int,
+    states: Mapping[str, PluginState] = MappingProxyType({}),
 ) -> list[Answer]:
     """The answers of the seams of a step, as the training loop asks for them.
 
-    Gradients of single views are there only if the observer asks for them, and the views of the
-    first step have no labels.
+    Gradients of single views are there only if the observer asks for them. The first step has no
+    record of a step before it, and its views have no labels.
     """
-    centers = sample_scene().centers
+    centers, last = sample_scene().centers, _record(step - 1) if step > 1 else None
     sample = SampleContext(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=last
     )
     quiet = build(Densifier, NO_DENSIFIER, {})
     scale = ScaleContext(**step_fields(step), draw=Draw(_VIEWS), last=last)
     summed = not observer.needs_separate_gradients
-    aggregate = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
+    gradients = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
     if last is None:
-        aggregate = replace(aggregate, labels=None)
-    return [
-        call_seam(hooks.crossgrad_sample_views, sample, Sampled),
-        call_seam(hooks.crossgrad_choose_scales, scale, Scaled),
-        call_seam(hooks.crossgrad_aggregate_gradients, aggregate, Aggregated),
-        call_seam(hooks.crossgrad_densify, DensifierRun.of(quiet).context(step), Densified),
+        gradients = replace(gradients, labels=None)
+    asked: list[tuple[Any, StepContext, type[Answer]]] = [
+        (hooks.crossgrad_sample_views, sample, Sampled),
+        (hooks.crossgrad_choose_scales, scale, Scaled),
+        (hooks.crossgrad_aggregate_gradients, replace(gradients, step=step), Aggregated),
+        (hooks.crossgrad_densify, DensifierRun.of(quiet).context(step), Densified),
     ]
+    answers = []
+    for hook, context, kind in asked:
+        answers.append(call_seam(hook, replace(context, states=states), kind))
+        states = {**states, **answers[-1].states}
+    return answers
+
+
+def states_stay_bounded(make: Make[Observer]) -> None:
+    """What wrappers keep in states does not grow with the number of steps."""
+    observer = make()
+    with _hooks(observer) as hooks:
+        _start(hooks, None)
+        require_bounded((_size(states) for states in _states(hooks, observer)), "a wrapper")
+
+
+def _states(hooks: Hooks, observer: Observer) -> Iterator[Mapping[str, PluginState]]:
+    """All states after each step of a run without an end."""
+    states: Mapping[str, PluginState] = {}
+    for step in count(1):
+        for answer in _seams(hooks, observer, step, states):
+            states = {**states, **answer.states}
+        yield states
+
+
+def _size(states: Mapping[str, PluginState]) -> int:
+    return sum(map(size_of, states.values()))
+
+
+def nothing_piles_up(make: Make[Observer]) -> None:
+    """The memory that an observer keeps for itself does not grow by much with each step."""
+    observer, model = make(), _model(1)
+    summed = not observer.needs_separate_gradients
+    gradients = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
+    with _hooks(observer) as hooks, traced_memory() as memory:
+        _start(hooks, None)
+        kept = []
+        for step in range(1, 4 * _BLOCK + 1):
+            hooks.crossgrad_aggregate_gradients(context=replace(gradients, step=step))
+            _step_end(hooks, step, [])
+            hooks.crossgrad_model(model=model)
+            if step % _BLOCK == 0:
+                kept.append(memory())
+    # What it keeps once, such as a buffer, comes in the first steps.
+    grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
+    require(
+        grown <= _KEPT,
+        f"the observer keeps {grown / 1e6:.1f} MB more after each step (crossgrad_step_end, "
+        f"crossgrad_model, wrappers); expected at most {_KEPT / 1e6:g} MB, so that 30,000 steps "
+        "fit into memory: keep sums, or write to the run's folder",
+    )
+
+
+def steps_are_not_held_up(make: Make[Observer]) -> None:
+    """No hook that is called in every step takes long, at the fastest of several calls."""
+    run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
+    seconds: dict[str, float] = {}
+    with _hooks(observer, seconds) as hooks:
+        _start(hooks, None)
+        for step in range(1, _CALLS + 1):
+            _seams(hooks, observer, step)
+            _require_usable(hooks, run, step, 1.0)
+    for name in _ON_THE_CLOCK & seconds.keys():
+        require(
+            seconds[name] <= _SLOW,
+            f"{name} takes {seconds[name]:.2f} s at the fastest of {_CALLS} calls, with 40 "
+            f"primitives and 24 x 16 pixels; expected at most {_SLOW:g} s: do what takes long in "
+            "some steps only, or in an event, which is off the clock",
+        )
 
 
 OBSERVER_CHECKS: tuple[Check[Observer], ...] = (
@@ -291,4 +428,7 @@ OBSERVER_CHECKS: tuple[Check[Observer], ...] = (
     the_model_stays_untouched,
     seams_stay_answered,
     questions_are_answered_in_kind,
+    states_stay_bounded,
+    nothing_piles_up,
+    steps_are_not_held_up,
 )

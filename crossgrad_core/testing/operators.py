@@ -37,6 +37,8 @@ _STEPS = 4
 #: A power of two, so that scaled gradients have exactly scaled Gramians.
 _SCALE = 64.0
 _TOLERANCE = 1e-6
+#: Relative difference of two solutions of one problem, as solvers that iterate find them.
+_SOLVED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +244,45 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
             )
 
 
+def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
+    """The place of a view in the step means nothing: views that differ in nothing else count alike.
+
+    Such views have gradients of one length at one angle. With more than two views only a right
+    angle is tried, because methods may go through pairs that conflict in turn.
+    """
+    operator = _matrix_operator(make)
+    for views in admitted(operator.views):
+        for cosine in (0.0, -0.5, 0.5) if views == 2 else (0.0,):  # noqa: PLR2004
+            gramians = np.full((1, views, views), cosine)
+            gramians[0, range(views), range(views)] = 1.0
+            case = _alike(_only(operator_case(views), 0), gramians)
+            weights, others = (
+                transformed(operator, case, seed=n)[0][0].sum(axis=0) for n in (0, 1)
+            )
+            if not np.array_equal(weights, others):
+                raise cannot_tell("its weights depend on random numbers")
+            require(
+                np.ptp(weights) <= _SOLVED * np.abs(weights).max(),
+                f"K = {views}, gradients of one length with the cosine {cosine:g}, and equal "
+                f"labels, losses and distances: transform gives the views the weights "
+                f"{weights.tolist()}; expected equal ones: tell views apart by labels, losses or "
+                "Gramians, never by their place in the step",
+            )
+
+
+def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
+    """The case with Gramians of one block, and nothing else that tells the views apart."""
+    number = gramians.shape[1]
+    context = replace(
+        case.context,
+        losses=np.full(number, 0.1),
+        labels=("near",) * number,
+        distances=np.full(number, 0.5),
+        present=np.ones((1, number), dtype=np.bool_),
+    )
+    return OperatorCase(case.families, gramians, context)
+
+
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
     """`reads_labels` and `reads_gramians` are right: other labels or Gramians change nothing else.
 
@@ -277,5 +318,6 @@ OPERATOR_CHECKS: tuple[Check[Operator], ...] = (
     state_survives_a_checkpoint,
     one_view_keeps_its_direction,
     scales_with_the_gradients,
+    views_that_are_alike_count_alike,
     what_it_reads_is_declared,
 )

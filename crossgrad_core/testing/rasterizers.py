@@ -1,7 +1,6 @@
 """Contract checks of rasterizers: shapes, gradients, statistics, the common rule set."""
 
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from pydantic import ValidationError
@@ -9,45 +8,12 @@ from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render, Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.defaults import REFERENCE_RASTERIZER
-from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_camera, sample_gaussians
+from crossgrad_core.testing.reference import REFERENCE_CHECKS, device_of, moved, tensors_of
 
-#: Largest difference of a pixel from the reference: a few Gaussians at the edge of their footprint.
-_PIXEL = 0.02
-#: Largest mean difference of pixels, and relative difference of gradients, from the reference.
-_MEAN, _GRADIENT = 2e-4, 2e-2
 _ROUNDING = 1e-4
-
-
-def _device(rasterizer: Rasterizer) -> torch.device:
-    """Where the checks run.
-
-    Raises:
-        SkipTest: The rasterizer needs a device that is not there.
-    """
-    if "cpu" in rasterizer.devices:
-        return torch.device("cpu")
-    if "cuda" in rasterizer.devices and torch.cuda.is_available():
-        return torch.device("cuda")
-    raise cannot_tell(f"it needs one of the devices {sorted(rasterizer.devices)}")
-
-
-def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The tensors that are given, by name."""
-    found = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
-    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
-
-
-def _moved(gaussians: Gaussians, device: torch.device) -> Gaussians:
-    """Copies on a device, as leaves with gradients."""
-    leaves: dict[str, Any] = {
-        name: tensor.detach().clone().to(device).requires_grad_()
-        for name, tensor in _tensors(gaussians).items()
-    }
-    return replace(gaussians, **leaves)
 
 
 def _drawn(
@@ -79,7 +45,7 @@ def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
 def renders_have_the_shape(make: Make[Rasterizer]) -> None:
     """Image [H, W, 3], alpha [H, W], radii [N] int32, and each optional output that it provides."""
     rasterizer = make()
-    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    gaussians = moved(sample_gaussians(), device_of(rasterizer))
     render = _drawn(rasterizer, gaussians)
     _shape("image", render.image, HEIGHT, WIDTH, 3)
     _shape("alpha", render.alpha, HEIGHT, WIDTH)
@@ -95,7 +61,7 @@ def renders_have_the_shape(make: Make[Rasterizer]) -> None:
 def the_background_shows_through(make: Make[Rasterizer]) -> None:
     """A pixel is the blend plus (1 - alpha) times the background."""
     rasterizer = make()
-    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    gaussians = moved(sample_gaussians(), device_of(rasterizer))
     black, white = _drawn(rasterizer, gaussians), _drawn(rasterizer, gaussians, 1.0)
     error = (white.image - black.image - (1.0 - black.alpha)[..., None]).detach().abs().max()
     require(error < _ROUNDING, f"the background enters with an error of {float(error):.2g}")
@@ -106,11 +72,11 @@ def the_background_shows_through(make: Make[Rasterizer]) -> None:
 def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
     """No Gaussians, or none in front of the camera, give the background and radius 0."""
     rasterizer = make()
-    device = _device(rasterizer)
-    some = _moved(sample_gaussians(), device)
+    device = device_of(rasterizer)
+    some = moved(sample_gaussians(), device)
     behind = 2.0 * sample_camera().center.to(device).float()
     for gaussians, what in (
-        (_moved(sample_gaussians(0), device), "no Gaussians"),
+        (moved(sample_gaussians(0), device), "no Gaussians"),
         (replace(some, means=(some.means.detach() + behind).requires_grad_()), "all behind"),
     ):
         render = _drawn(rasterizer, gaussians, 0.25)
@@ -123,9 +89,9 @@ def gradients_reach_every_input(make: Make[Rasterizer]) -> None:
     """Every tensor of the Gaussians gets a finite gradient that is not all zero."""
     rasterizer = make()
     for harmonics in (False, True):
-        gaussians = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
+        gaussians = moved(sample_gaussians(harmonics=harmonics), device_of(rasterizer))
         _drawn(rasterizer, gaussians, backward=True)
-        for name, tensor in _tensors(gaussians).items():
+        for name, tensor in tensors_of(gaussians).items():
             gradient = tensor.grad
             require(gradient is not None, f"{name} gets no gradient")
             if gradient is not None:
@@ -136,7 +102,7 @@ def gradients_reach_every_input(make: Make[Rasterizer]) -> None:
 def statistics_are_filled(make: Make[Rasterizer]) -> None:
     """The backward pass fills the screen statistics that density control reads."""
     rasterizer = make()
-    gaussians = _moved(sample_gaussians(), _device(rasterizer))
+    gaussians = moved(sample_gaussians(), device_of(rasterizer))
     screen = _drawn(rasterizer, gaussians, backward=True).screen
     number = len(gaussians)
     visible = screen.radii > 0
@@ -192,37 +158,17 @@ def same_input_same_bits(make: Make[Rasterizer]) -> None:
     original = sample_gaussians(harmonics=True)
     for _ in range(2):
         rasterizer = make()
-        gaussians = _moved(original, _device(rasterizer))
+        gaussians = moved(original, device_of(rasterizer))
         render = _drawn(rasterizer, gaussians, backward=True)
-        gradients = {name: tensor.grad for name, tensor in _tensors(gaussians).items()}
+        gradients = {name: tensor.grad for name, tensor in tensors_of(gaussians).items()}
         results.append({"image": render.image.detach(), "alpha": render.alpha, **gradients})
-        for name, tensor in _tensors(gaussians).items():
-            same = torch.equal(tensor.detach().cpu(), _tensors(original)[name].detach())
+        for name, tensor in tensors_of(gaussians).items():
+            same = torch.equal(tensor.detach().cpu(), tensors_of(original)[name].detach())
             require(same, f"rendering changes the Gaussians' {name}")
     for name, one in results[0].items():
         other = results[1][name]
         same = one is not None and other is not None and torch.equal(one, other)
         require(same, f"two renders of one input differ in {name}")
-
-
-def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
-    """Image and gradients agree with rasterizer `torch`, the readable form of the rule set."""
-    rasterizer = make()
-    shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
-    reference = build(Rasterizer, REFERENCE_RASTERIZER, shared)
-    for harmonics in (False, True):
-        ours = _moved(sample_gaussians(harmonics=harmonics), _device(rasterizer))
-        theirs = _moved(sample_gaussians(harmonics=harmonics), torch.device("cpu"))
-        image = _drawn(rasterizer, ours, backward=True).image.detach().cpu()
-        expected = _drawn(reference, theirs, backward=True).image.detach()
-        error = (image - expected).abs()
-        require(
-            error.max() < _PIXEL and error.mean() < _MEAN,
-            f"pixels differ from the reference by up to {float(error.max()):.2g}, "
-            f"{float(error.mean()):.2g} in the mean",
-        )
-        for name, tensor in _tensors(theirs).items():
-            _same_gradient(name, _tensors(ours)[name].grad, tensor.grad)
 
 
 def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
@@ -232,7 +178,7 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
         wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
     except ValidationError:
         raise cannot_tell("it has one dilation and no other") from None
-    some = _moved(sample_gaussians(harmonics=False), _device(rasterizer))
+    some = moved(sample_gaussians(harmonics=False), device_of(rasterizer))
     with torch.no_grad():
         plain, own = (_drawn(each, some).image for each in (rasterizer, wider))
         wide = _drawn(rasterizer, replace(some, dilation=1.0)).image
@@ -241,23 +187,15 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
     require(error < _ROUNDING, f"it changes pixels by {error:.2g} more than its own of that size")
 
 
-def _same_gradient(name: str, ours: Tensor | None, theirs: Tensor | None) -> None:
-    if ours is None or theirs is None:
-        require(ours is theirs, f"the gradient of {name} is missing")
-        return
-    error = float((ours.cpu() - theirs).norm() / theirs.norm())
-    require(error < _GRADIENT, f"the gradient of {name} is {error:.2g} off the reference's")
-
-
 def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
     """With `by_rows`, rows that are drawn are asked for and have the gradients, to the bit."""
     rasterizer = make()
     if not rasterizer.by_rows:
         return
-    some = _moved(sample_gaussians(harmonics=True), _device(rasterizer))
+    some = moved(sample_gaussians(harmonics=True), device_of(rasterizer))
     with torch.no_grad():
         some.means[::2] = 2.0 * sample_camera().center.to(some.means)
-    late = _moved(some, some.means.device)
+    late = moved(some, some.means.device)
     tensors = {name: getattr(late, name) for name in ("sh_dc", "sh_rest")}
     asked: list[int] = []
 
@@ -304,6 +242,6 @@ RASTERIZER_CHECKS: tuple[Check[Rasterizer], ...] = (
     statistics_are_filled,
     same_input_same_bits,
     rows_on_demand_are_asked_for,
-    the_reference_draws_the_same,
+    *REFERENCE_CHECKS,
     dilations_of_gaussians_are_heeded,
 )

@@ -19,6 +19,7 @@ from crossgrad_core.testing.contract import (
     same_state,
 )
 from crossgrad_core.testing.fixtures import STEPS, sample_scene, step_fields
+from crossgrad_core.testing.growth import require_bounded, size_of
 
 #: Steps that are looked at, spread over a run of the published length.
 _STEPS = tuple(range(1, STEPS + 1, STEPS // 40))
@@ -94,6 +95,14 @@ def old_states_stay_untouched(make: Make[Resolution]) -> None:
         require(same_state(old, kept), "scales changes the state that it was given")
 
 
+def states_stay_bounded(make: Make[Resolution]) -> None:
+    """The state does not grow with the number of steps."""
+    run = _Run(make())
+    require_bounded(
+        (size_of(run.state) for step in range(1, STEPS) if run.take_step(step)), "scales"
+    )
+
+
 def pixels_add_up(make: Make[Resolution]) -> None:
     """Steps of one view render some pixels, and no more than the view has in full size."""
     resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
@@ -109,5 +118,6 @@ RESOLUTION_CHECKS: tuple[Check[Resolution], ...] = (
     same_seed_same_scales,
     resumes_exactly,
     old_states_stay_untouched,
+    states_stay_bounded,
     pixels_add_up,
 )

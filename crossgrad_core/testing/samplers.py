@@ -1,5 +1,6 @@
 """Contract checks of samplers."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,12 +14,14 @@ from crossgrad_core.testing.contract import (
     Check,
     Make,
     admitted,
+    cannot_tell,
     global_randomness_untouched,
     require,
     revived,
     same_state,
 )
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.growth import require_bounded, size_of
 from crossgrad_core.testing.posed import SamplerRun
 
 #: Steps after which a run is interrupted, and steps that follow.
@@ -82,6 +85,22 @@ def _require_good(draw: Draw, counts: frozenset[int], available: int) -> None:
     )
 
 
+def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
+    """Where the training views have groups, every draw has labels: operators may need them."""
+    sampler = make()
+    if sampler.default_grouping is not None or sampler.own_labels:
+        raise cannot_tell("it has groups of its own choice")
+    regimes = tuple(view.regime for view in sample_scene().train_views)
+    run = replace(sampler_run(sampler), groups=regimes)
+    for draw in run.draws(_AFTER):
+        require(
+            draw.labels is not None,
+            "context.groups is given, and sample answers a Draw without labels, so that no "
+            "operator can tell the groups apart; expected a label for each view, such as "
+            "context.groups[view]",
+        )
+
+
 def every_view_comes(make: Make[Sampler]) -> None:
     """Each training view is drawn sooner or later."""
     sampler = make()
@@ -128,12 +147,20 @@ def old_states_stay_untouched(make: Make[Sampler]) -> None:
         require(same_state(old, kept), "sample changes the state that it was given")
 
 
+def states_stay_bounded(make: Make[Sampler]) -> None:
+    """The state does not grow with the number of steps."""
+    run = sampler_run(make())
+    require_bounded((size_of(run.state) for _ in iter(run.draw, None)), "sample")
+
+
 SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
     *COMPONENT_CHECKS,
     usual_views_are_admitted,
     draws_are_training_views,
+    draws_hand_on_the_groups,
     every_view_comes,
     same_seed_same_draws,
     resumes_exactly,
     old_states_stay_untouched,
+    states_stay_bounded,
 )

@@ -7,7 +7,6 @@ import pytest
 import torch
 from gsply import plyread
 from gsply.formats import EXPECTED_PROPERTIES_BY_SH_DEGREE
-from support.combinations import NEEDED
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.similarity import Similarity
@@ -17,6 +16,7 @@ from crossgrad_core.run.export import export_scene
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.authoring.matrix.combinations import NEEDED
 from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
 
 OURS = sorted(e.name for e in offers("backbones") if e.distribution == "crossgrad")

@@ -8,25 +8,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import torch
-from support.combinations import (
-    SLOTS,
-    STEPS,
-    as_lines,
-    config_of,
-    every_combination,
-    from_lines,
-    refused,
-)
-from support.pairwise import pairs_of, pairwise
+from support.refusals import every_combination, from_lines, refused
 
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import load
-from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.start import first_state
+from crossgrad_core.testing.short_runs import require_repeated, require_sound, setup_of, train
+from crossgrad_plugins.authoring.matrix.combinations import SLOTS, STEPS, as_lines, config_of
+from crossgrad_plugins.authoring.matrix.pairwise import pairs_of, pairwise
 
 #: What operators count; everything else that a step counts is density control.
 AGGREGATION = {"zero", "disjoint", "dropped", "conflict"}
@@ -55,59 +44,26 @@ def _one_thread():
 
 
 @cache
-def setup_of(row):
-    return assemble(config_of(row), sample_scene(), "none")
-
-
-def trained(setup):
-    """Parameters before, after the first step and at the end, and the records."""
-    state = first_state(setup)
-    stages = [copied(state.parameters)]
-    records = [timed_step(setup, state)]
-    stages.append(copied(state.parameters))
-    records += [timed_step(setup, state) for _ in range(STEPS - 1)]
-    return *stages, copied(state.parameters), records
-
-
-def copied(parameters):
-    return {name: tensor.detach().clone() for name, tensor in parameters.items()}
+def setup(row):
+    return setup_of(config_of(row))
 
 
 def usual_densifier(backbone):
     return load("backbones", backbone).default_densifier
 
 
-def losses_of(records):
-    return [loss for record in records for loss in record.losses]
-
-
-def check(run):
-    before, early, after, records = run
-    assert all(0 <= loss < 10 for loss in losses_of(records))
-    assert all(torch.isfinite(tensor).all() for tensor in after.values())
-    assert any(not torch.equal(before[name], early[name]) for name in before)
-
-
-def check_repeats(run, repetition):
-    (*_, after, records), (*_, again, repeated) = run, repetition
-    assert losses_of(records) == losses_of(repeated)
-    assert [record.counts for record in records] == [record.counts for record in repeated]
-    assert after.keys() == again.keys()
-    assert all(torch.equal(after[name], again[name]) for name in after)
-
-
 @pytest.mark.matrix
 def test_exactly_the_written_combinations_are_refused_for_the_written_reasons():
     rows = every_combination()
     found = as_lines(refused(rows), rows)
-    assert found == WRITTEN, "python -m support.combinations writes them anew"
+    assert found == WRITTEN, "python -m support.refusals writes them anew"
 
 
 @pytest.mark.parametrize("line", WRITTEN)
 def test_a_run_is_refused_for_the_written_reason(line):
     row = next(iter(from_lines([line], every_combination())))
     with pytest.raises(IncompatibleSelectionError) as refusal:
-        setup_of(row)
+        setup(row)
     assert line.split(": ", 1)[1] in refusal.value.found
 
 
@@ -120,10 +76,9 @@ def test_every_two_components_that_can_work_together_meet():
 
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
 def test_combination_trains_and_repeats(row):
-    setup = setup_of(row)
-    run = trained(setup)
-    check(run)
-    check_repeats(run, trained(setup))
+    run = train(setup(row), STEPS)
+    require_sound(run)
+    require_repeated(run, train(setup(row), STEPS))
 
 
 @pytest.mark.parametrize("densifier", DENSIFIERS)
@@ -132,11 +87,11 @@ def test_density_control_acts_within_these_few_steps(densifier):
     # On its own backbone where there is one: others may leave it nothing to do in five steps.
     own = [row for row in rows if usual_densifier(row[SLOTS.index("backbone")]) == densifier]
     row = [*own, *rows][0]
-    *_, records = trained(setup_of(row))
+    records = train(setup(row), STEPS).records
     edits = [key for record in records for key, count in record.counts.items() if count]
     assert set(edits) - AGGREGATION
 
 
 @pytest.mark.matrix
 def test_member_of_the_full_product_trains(member):
-    check(trained(setup_of(member)))
+    require_sound(train(setup(member), STEPS))

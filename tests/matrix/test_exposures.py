@@ -7,8 +7,6 @@ from itertools import product
 
 import pytest
 import torch
-from support.combinations import NEEDED
-from support.pairwise import pairwise
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics.threads import configure_threads
@@ -18,6 +16,8 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.photo_parameters import STATE
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.authoring.matrix.combinations import NEEDED
+from crossgrad_plugins.authoring.matrix.pairwise import pairwise
 
 FEW, MANY = 3, 60
 

@@ -20,4 +20,6 @@ class LeastSeen(Sampler):
         order = np.lexsort((context.rng.random(number), seen))
         views = tuple(int(view) for view in order[: context.views_per_step])
         seen[list(views)] += 1
-        return Draw(views), PluginState({"seen": seen.tolist()})
+        groups = context.groups
+        labels = None if groups is None else tuple(groups[view] for view in views)
+        return Draw(views, labels), PluginState({"seen": seen.tolist()})

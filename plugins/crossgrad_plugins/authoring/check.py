@@ -33,7 +33,7 @@ def check_package(package: str) -> tuple[str, bool]:
     Raises:
         UserError: No such package is installed, or it offers no plugin.
     """
-    found, lost = _entries_of(package), _strays_of(package)
+    found, lost = entries_of(package), _strays_of(package)
     origins = sorted({f"{entry.distribution} {entry.version}" for entry in found})
     lines, failed = [", ".join(origins)], 0
     width = max(len(_label(entry)) for entry in found)
@@ -56,7 +56,7 @@ def _strays_of(package: str) -> list[Stray]:
     return [each for each in strays() if _normalized(each.distribution) == _normalized(package)]
 
 
-def _entries_of(package: str) -> list[Entry]:
+def entries_of(package: str) -> list[Entry]:
     """The plugins of a package by slot and name.
 
     Raises:

@@ -12,6 +12,7 @@ from crossgrad_core.commands import (
     Entry,
     GroupedCommand,
     UserError,
+    announce,
     did_you_mean,
     listed,
     offers,
@@ -31,6 +32,14 @@ app = typer.Typer(
 SlotOption = Annotated[
     str | None,
     typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(OFFERED)}."),
+]
+
+
+PackageArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PACKAGE", help="An installed package: its name for pip, or its import name."
+    ),
 ]
 
 
@@ -77,12 +86,7 @@ def show(
 
 @app.command("check", cls=GroupedCommand)
 def check(
-    package: Annotated[
-        str,
-        typer.Argument(
-            metavar="PACKAGE", help="An installed package: its name for pip, or its import name."
-        ),
-    ],
+    package: PackageArgument,
 ) -> None:
     """Run the contract checks of a package's plugins.
 
@@ -93,6 +97,41 @@ def check(
 
     report, passed = check_package(package)
     typer.echo(report)
+    if not passed:
+        raise typer.Exit(1)
+
+
+@app.command("matrix", cls=GroupedCommand)
+def matrix(
+    package: PackageArgument,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full/--pairwise",
+            help="All combinations, or as few as bring every component of the package together "
+            "with every other one.",
+        ),
+    ] = False,
+    only: Annotated[
+        str | None,
+        typer.Option("--only", metavar="COMBINATION", help="A single one, as the report shows it."),
+    ] = None,
+) -> None:
+    """Train a package's components with all others for a few steps.
+
+    Each combination of installed components trains a tiny scene twice; losses and parameters must
+    be finite, and both runs the same. A combination that is refused before training, with a
+    reason, is no failure. Exit status: 0 where all others train, 1 where one fails.
+    """
+    announce()
+    from crossgrad_plugins.authoring.matrix.report import train_matrix, train_one
+
+    if only is not None:
+        train_one(package, only)
+        typer.echo(f"trained: {only}")
+        return
+    text, passed = train_matrix(package, full=full)
+    typer.echo(text)
     if not passed:
         raise typer.Exit(1)
 

@@ -4,7 +4,9 @@ from itertools import product
 
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.combinations import as_lines, every_combination, from_lines, refused
+from support.refusals import every_combination, from_lines, refused
+
+from crossgrad_plugins.authoring.matrix.combinations import as_lines
 
 ROWS = list(product("abc", "de", "fgh", "ij", "kl"))
 REASONS = ("needs K = 2 (--views); K is 1", "has no: tensors", "is late")

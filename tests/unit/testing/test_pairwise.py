@@ -3,15 +3,17 @@
 from itertools import combinations, product
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.pairwise import pairs_of, pairwise
+
+from crossgrad_plugins.authoring.matrix.pairwise import meetings, pairs_of, pairwise
 
 
 def pairs(rows):
     return {(i, j, row[i], row[j]) for row in rows for i, j in combinations(range(len(rows[0])), 2)}
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # A busy machine is slow enough.
 @given(st.sets(st.tuples(*[st.sampled_from("abcd")] * 4), min_size=1))
 def test_every_pair_that_can_occur_occurs(admitted):
     chosen = pairwise(sorted(admitted))
@@ -40,3 +42,33 @@ def test_pairs_know_their_factors():
 
 def test_nothing_admitted_needs_no_case():
     assert pairwise([]) == []
+
+
+VALUES = (("a", "b", "c"), ("k", "l"), ("x", "y", "z", "w"))
+USUAL = ("a", "k", "x")
+
+
+def completed(given):
+    return tuple(given.get(i, value) for i, value in enumerate(USUAL))
+
+
+def test_a_value_meets_all_others_in_as_few_rows_as_there_are_values():
+    rows = list(meetings(0, "b", VALUES, completed, lambda _: True))
+    assert len(rows) == 4
+    assert all(row[0] == "b" for row in rows)
+    assert {value for row in rows for value in enumerate(row)} >= {(1, "l"), (2, "w"), (2, "z")}
+
+
+def test_a_pair_that_is_refused_in_turn_is_tried_with_usual_values_and_one_change():
+    def admits(row):
+        return not (row[2] == "w" and row[1] != "k")
+
+    rows = list(meetings(0, "c", VALUES, completed, admits))
+    assert ("c", "k", "w") in rows
+    assert all(map(admits, rows))
+
+
+def test_a_pair_that_nothing_admits_is_left_out():
+    rows = list(meetings(0, "b", VALUES, completed, lambda row: row[2] != "z"))
+    assert not [row for row in rows if row[2] == "z"]
+    assert {row[2] for row in rows} == {"x", "y", "w"}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from support.combinations import NEEDED, every_combination, refused
+from support.refusals import every_combination, refused
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics.threads import configure_threads
@@ -12,6 +12,7 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.authoring.matrix.combinations import NEEDED
 
 STEPS = 60
 #: Density control edits in steps 20 and 40.

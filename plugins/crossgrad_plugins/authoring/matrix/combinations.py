@@ -1,0 +1,154 @@
+"""Combinations of components, and the short run that trains one.
+
+Components of five slots meet in every combination. The components of further slots (losses,
+exposures, starts, resolutions, groupings, observers) are put into such combinations one at a time.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations, product
+from typing import Any, Final, TypeAlias
+
+from crossgrad_core.commands import (
+    ComponentChoice,
+    RunConfig,
+    UserError,
+    build,
+    entries,
+    load_component,
+    plural,
+)
+from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
+from crossgrad_plugins.authoring.matrix.pairwise import Row
+
+SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
+FURTHER: Final = ("loss", "exposure", "start", "resolution", "grouping", "observer")
+#: Options without which a component has nothing to do in so few steps.
+NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
+    ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
+    # Anchors are judged at once, and find free cells near by.
+    ("backbone", "scaffold"): {"voxel_size": 1e-5},
+    ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
+    ("densifier", "octree"): {"success_threshold": 0},
+    # In so small a scene no primitive is blended in many pixels.
+    ("densifier", "multiview"): {"importance": 0},
+    ("densifier", "multiview-gate"): {"importance": 0},
+}
+#: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
+STEPS: Final = 5
+_WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
+_TIMES: Final = {"events": "steps", "reset_every": 4, **_WINDOW}
+
+#: Row -> reasons; rows that work are not there.
+Refused: TypeAlias = Mapping[Row, Collection[str]]
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Combinations of the components of some slots.
+
+    Attributes:
+        slots: The slots, in the order of the names in a row.
+        rows: The combinations.
+    """
+
+    slots: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+
+def every_row(names: Mapping[str, Iterable[str]]) -> tuple[Row, ...]:
+    """One name per slot of `SLOTS`, all that there are, in alphabetical order."""
+    return tuple(product(*(sorted(names[slot]) for slot in SLOTS)))
+
+
+def usual_row(given: Mapping[str, str], slots: Sequence[str]) -> Row:
+    """A combination with what a run takes by default in the slots that are not given."""
+    backbone = given.get("backbone", _default("backbone"))
+    usual = {"densifier": load_component(Backbone, backbone).default_densifier, **given}
+    return tuple(usual.get(slot) or _default(slot) for slot in slots)
+
+
+def _default(slot: str) -> str:
+    """The name that a run takes where it names none; of rasterizers the fastest on the CPU."""
+    if slot == "rasterizer":
+        return max(entries("rasterizers"), key=_speed)
+    config = RunConfig.model_validate({})
+    choice = config.operators[0] if slot == "operator" else getattr(config, slot)
+    return str(choice.name)
+
+
+def _speed(rasterizer: str) -> float:
+    try:
+        return load_component(Rasterizer, rasterizer).speed("cpu")
+    except UserError:
+        return 0.0
+
+
+def device_of(rasterizer: str) -> str:
+    """The device on which a rasterizer is tried: the CPU where it runs there."""
+    return "cpu" if "cpu" in load_component(Rasterizer, rasterizer).devices else "cuda"
+
+
+def config_of(row: Row, slots: Sequence[str] = SLOTS) -> RunConfig:
+    """A short run of one combination whose density control acts."""
+    choices = {
+        slot: ComponentChoice.model_validate({"name": name, **NEEDED.get((slot, name), {})})
+        for slot, name in zip(slots, row, strict=True)
+    }
+    settings: dict[str, Any] = {
+        "steps": 100,
+        "views": _several_views(choices["sampler"], choices["operator"]),
+        "metrics": [{"name": "psnr"}],
+        "start": {"name": "sfm"},
+        "device": device_of(choices["rasterizer"].name),
+    }
+    for slot, choice in choices.items():
+        settings |= {plural(slot): (choice,)} if slot == "observer" else {slot: choice}
+    return RunConfig.model_validate({**settings, **_TIMES})
+
+
+@cache
+def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int | None:
+    """The smallest K above 1 that both admit, so that operators have something to do."""
+    counts = (
+        build(Sampler, sampler.name, sampler.options).view_counts,
+        build(Operator, operator.name, operator.options).views,
+    )
+    both = (k for k in range(2, 7) if all(each.admits(k) for each in counts))
+    return next(both, None)
+
+
+def named(row: Row, slots: Sequence[str] = SLOTS) -> str:
+    """A combination as `slot=name slot=name`."""
+    return " ".join(f"{slot}={name}" for slot, name in zip(slots, row, strict=True))
+
+
+def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOTS) -> list[str]:
+    """The refusals among `rows` as sorted lines `slot=name slot=name: reason`.
+
+    A line speaks for all rows with these names; together the lines say neither more nor less than
+    the refusals.
+    """
+    by_reason: dict[str, set[Row]] = {}
+    for row, reasons in refusals.items():
+        for reason in reasons:
+            by_reason.setdefault(reason, set()).add(row)
+    lines = []
+    for reason, concerned in by_reason.items():
+        places = _slots_that_decide(concerned, rows)
+        deciding = [slots[i] for i in places]
+        names = {tuple(row[i] for i in places) for row in concerned}
+        lines += [f"{named(each, deciding)}: {reason}" for each in names]
+    return sorted(lines)
+
+
+def _slots_that_decide(concerned: set[Row], rows: Sequence[Row]) -> tuple[int, ...]:
+    """The fewest slots whose names tell the rows that are concerned from all others."""
+    everything = range(len(rows[0]))
+    for count in everything:
+        for places in combinations(everything, count):
+            names = {tuple(row[i] for i in places) for row in concerned}
+            if all(row in concerned for row in rows if tuple(row[i] for i in places) in names):
+                return places
+    return tuple(everything)

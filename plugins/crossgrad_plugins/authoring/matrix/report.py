@@ -1,0 +1,169 @@
+"""`crossgrad plugins matrix`: trains the combinations of a package and says what came of them."""
+
+import traceback
+from dataclasses import dataclass, field
+from textwrap import fill
+
+from crossgrad_core.commands import Progress, UserError, count, listed
+from crossgrad_core.testing.short_runs import reasons_to_refuse, try_out
+from crossgrad_plugins.authoring.matrix.combinations import (
+    FURTHER,
+    SLOTS,
+    STEPS,
+    Refused,
+    as_lines,
+    config_of,
+    named,
+)
+from crossgrad_plugins.authoring.matrix.members import Members, combinations_of, members_of
+from crossgrad_plugins.authoring.matrix.pairwise import Row
+
+_WIDTH = 80
+#: Seconds between two lines of progress.
+_PAUSE = 5.0
+
+
+@dataclass
+class Tally:
+    """The combinations that trained, were refused or failed.
+
+    Attributes:
+        members: What takes part.
+        trained: (slot, name) of each component that was trained, by combination.
+        refused: Slots -> combination with a component of the package -> reasons.
+        failed: Combination in words -> why it failed.
+    """
+
+    members: Members
+    trained: list[frozenset[tuple[str, str]]] = field(default_factory=list)
+    refused: dict[tuple[str, ...], dict[Row, tuple[str, ...]]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def admits(self, row: Row, slots: tuple[str, ...]) -> bool:
+        """Whether a run of the combination can begin; takes note of reasons why not.
+
+        An error other than a refusal is found again when it is trained.
+        """
+        try:
+            reasons = reasons_to_refuse(config_of(row, slots))
+        except (Exception, SystemExit):
+            return True
+        if reasons and self.members.own.intersection(zip(slots, row, strict=True)):
+            self.refused.setdefault(slots, {})[row] = reasons
+        return not reasons
+
+    def train(self, row: Row, slots: tuple[str, ...]) -> None:
+        """Trains a combination and takes note of what came of it."""
+        try:
+            try_out(config_of(row, slots), STEPS)
+        except (Exception, SystemExit) as error:
+            self.failed[named(row, slots)] = reason_of(error)
+        self.trained.append(frozenset(zip(slots, row, strict=True)))
+
+    @property
+    def never_trained(self) -> list[str]:
+        """Components of the package that every combination with them refuses."""
+        met = frozenset().union(*self.trained)
+        return [f"{slot} {name}" for slot, name in sorted(self.members.own - met)]
+
+
+def reason_of(error: BaseException) -> str:
+    """An error in one line, and the line of the source that raised it."""
+    text = f"{error.what}: {error.found}" if isinstance(error, UserError) else str(error)
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__}: {' '.join(text.split())}{place}"
+
+
+def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
+    """Trains a package's components with all others.
+
+    Args:
+        package: Name of a distribution, or of an import package that holds plugins.
+        full: All combinations instead of a pairwise design.
+
+    Returns:
+        The report in 80 columns, and whether everything trained that was not refused.
+
+    Raises:
+        UserError: See `members_of`.
+    """
+    tally = Tally(members_of(package))
+    progress = Progress(_PAUSE)
+    progress.tell("choosing combinations")
+    designs = tuple(combinations_of(tally.members, tally.admits, full=full))
+    total = sum(len(each.rows) for each in designs)
+    done = 0
+    for each in designs:
+        for row in each.rows:
+            done += 1
+            progress.tell(f"combination {done} of {total}")
+            if not full or tally.admits(row, each.slots):
+                tally.train(row, each.slots)
+    return report(tally, package), not tally.failed and not tally.never_trained
+
+
+def train_one(package: str, combination: str) -> None:
+    """Trains a single combination; whatever it raises comes through.
+
+    Args:
+        package: Name of the package.
+        combination: `slot=name slot=name`, as the report shows it.
+
+    Raises:
+        UserError: It is not written so, or names something that is not installed.
+    """
+    members = members_of(package)
+    pairs = [tuple(part.split("=", 1)) for part in combination.split()]
+    slots = tuple(pair[0] for pair in pairs)
+    known = all(len(pair) == 2 and pair[1] in members.names.get(pair[0], ()) for pair in pairs)  # noqa: PLR2004
+    if not known or slots[: len(SLOTS)] != SLOTS or not set(slots[len(SLOTS) :]) <= {*FURTHER}:
+        raise UserError(
+            "this is no combination",
+            where="--only",
+            expected=f"{' '.join(f'{slot}=NAME' for slot in SLOTS)}, as the report shows it",
+            found=combination,
+            todo="copy one from the report of the matrix",
+        )
+    try_out(config_of(tuple(pair[1] for pair in pairs), slots), STEPS)
+
+
+def report(tally: Tally, package: str) -> str:
+    """What was trained, refused and failed, in 80 columns."""
+    members, own = tally.members, tally.members.own
+    heading = f"{members.package}: {listed(f'{slot} {name}' for slot, name in sorted(own))}"
+    numbers = count(len(tally.trained) - len(tally.failed), "combination")
+    lines = [_filled(heading, ""), f"{numbers} trained for {STEPS} steps, twice with the same bits"]
+    lines += [_filled(f"left out: {reason}", "  ") for reason in members.left_out]
+    refused = sum(map(len, tally.refused.values()))
+    lines.append(f"{count(refused, 'combination')} refused before training, with the reason")
+    for slots, rows in tally.refused.items():
+        lines += [_filled(line, "  ") for line in _refusals(rows, slots, tally)]
+    lines += [
+        f"FAIL  {name} was trained in no combination: each one was refused"
+        for name in tally.never_trained
+    ]
+    lines.append(f"{count(len(tally.failed), 'combination')} failed")
+    for combination, reason in tally.failed.items():
+        lines += [f"  {combination}", _filled(reason, "    ")]
+        lines.append(f"    crossgrad plugins matrix {package} --only '{combination}'")
+    return "\n".join(lines)
+
+
+def _refusals(rows: Refused, slots: tuple[str, ...], tally: Tally) -> list[str]:
+    """The refusals in few lines: together they say no more than what was refused or trained."""
+    known = set(slots)
+    trained = [each for each in tally.trained if {slot for slot, _ in each} == known]
+    names = [dict(each) for each in trained]
+    return as_lines(rows, [*rows, *(tuple(each[slot] for slot in slots) for each in names)], slots)
+
+
+def _filled(text: str, indent: str) -> str:
+    return fill(
+        text,
+        _WIDTH,
+        initial_indent=indent,
+        subsequent_indent=f"{indent}  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
