@@ -1,7 +1,8 @@
 """Points that stand in another frame than the cameras are refused."""
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final, TypeAlias
 
 import numpy as np
 import torch
@@ -15,6 +16,35 @@ from crossgrad_core.scene.raw import RawView
 #: Points and photos that are tried, and the share of points that some photo has to show.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
+#: The share of points that photos show after a change of the poses which is the likely cause.
+_REPAIRED: Final = 0.5
+
+_Change: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] the inverse of a rigid pose."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+#: Turns the axes of a camera from OpenGL to OpenCV, and back.
+_FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+#: Mistakes in poses that put all points behind the cameras or beside the photos.
+_MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
+    ("cameras have the other axes (OpenGL: y up, z backward)", lambda pose: _FLIP @ pose),
+    ("poses are inverse (camera to world, or world to camera)", _inverse),
+    (
+        "poses are inverse (camera to world, or world to camera)",
+        lambda pose: _FLIP @ _inverse(_FLIP @ pose),
+    ),
+    (
+        "poses are inverse, and cameras have the other axes (OpenGL: y up, z backward)",
+        lambda pose: _inverse(_FLIP @ pose),
+    ),
+)
 
 
 def check_seen(
@@ -35,18 +65,44 @@ def check_seen(
     tried = finite[:: max(1, len(finite) // _TRIED)]
     if not len(tried) or not views:
         return
-    shown = np.zeros(len(tried), dtype=np.bool_)
+    shown = _shown_by(tried, views, lambda pose: pose).any(axis=0)
+    if shown.mean() >= _FEWEST:
+        return
+    cause = _likely_cause(tried, views)
+    raise UserError(
+        "the points lie in no photo: "
+        + (f"the {cause}" if cause else "they stand in another frame than the cameras"),
+        where=where,
+        expected="points in the coordinates of the cameras",
+        found=f"{int(shown.sum())} of {len(shown)} points in a photo ({points.source})",
+        todo="correct the poses: after that change the photos show the points"
+        if cause
+        else f"export points and cameras in one frame; or {todo} and start from random points "
+        "(--init random)",
+    )
+
+
+def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str | None:
+    """The mistake in the poses after whose repair most photos show points, and most points."""
+    best, cause = _REPAIRED, None
+    for text, change in _MISTAKES:
+        shown = _shown_by(points, views, change)
+        share = float(shown.any(axis=0).mean())
+        if share > best and np.median(shown.mean(axis=1)) >= _FEWEST:
+            best, cause = share, text
+    return cause
+
+
+def _shown_by(
+    points: NDArray[np.float64], views: Sequence[RawView], change: _Change
+) -> NDArray[np.bool_]:
+    """[V, N] whether a point lies in a photo after a change of the poses."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for view in views[:: max(1, len(views) // _TRIED)]:
-            shown |= _shown(tried, view)
-    if shown.mean() < _FEWEST:
-        raise UserError(
-            "the points lie in no photo: they stand in another frame than the cameras",
-            where=where,
-            expected="points in the coordinates of the cameras",
-            found=f"{int(shown.sum())} of {len(shown)} points in a photo ({points.source})",
-            todo=f"export points and cameras in one frame; or {todo} and start from random points "
-            "(--init random)",
+        return np.stack(
+            [
+                _shown(points, replace(view, world_to_camera=change(view.world_to_camera)))
+                for view in views[:: max(1, len(views) // _TRIED)]
+            ]
         )
 
 
