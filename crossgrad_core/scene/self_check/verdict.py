@@ -42,9 +42,8 @@ _FITS: Final = 0.7
 _FEW: Final = 2
 #: Points in frame of a photo that is compared with others, or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
+#: Points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
-_FEW_TESTED: Final = 40_000
 #: The better photos: the upper quartile.
 _BETTER: Final = 0.75
 #: Photos that agree by less are also tried with the likely changes of all cameras.
@@ -114,14 +113,11 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
         return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    tracked, others = rows[has_tracks], rows[~has_tracks]
-    if not len(tracked):
-        return _Group.of(tested(scene, others, _MOST_TESTED), others).verdict()
-    verdict = _Group.of(observed(scene, tracked), tracked).verdict()
-    if len(others) and verdict.all_wrong is None:
-        held = _Group.of(tested(scene, others, _FEW_TESTED), others).suspects()
-        verdict = replace(verdict, some_wrong=(*verdict.some_wrong, *held))
-    return verdict
+    # Beside photos with tracks, points that may be hidden say too little about single photos.
+    if has_tracks.any():
+        rows = rows[has_tracks]
+        return _Group.of(observed(scene, rows), rows).verdict()
+    return _Group.of(tested(scene, rows, _MOST_TESTED), rows).verdict()
 
 
 @dataclass(frozen=True, eq=False)
