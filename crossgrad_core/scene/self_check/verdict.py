@@ -25,7 +25,7 @@ _LEAST: Final = 0.35
 _MOST_BAD: Final = 0.6
 #: A photo disagrees below this share of the correlation of the better photos, if its points also
 #: have this many times the usual deviation from the colours that the photo predicts.
-_BAD: Final = 0.45
+_BAD: Final = 0.33
 _NOISY: Final = 1.5
 #: Share of observed points in frame below which the pose of a photo is wrong.
 _IN_FRAME: Final = 0.5
@@ -170,7 +170,8 @@ class _Group:
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
         usual = float(np.median(noise[good])) if good.any() else 0.0
-        unlike = low & (np.nan_to_num(noise) > _NOISY * usual)
+        # Colours that a few other photos show say too little about a single photo.
+        unlike = low & (np.nan_to_num(noise) > _NOISY * usual) & (not self.recolored)
         return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
 
     def verdict(self) -> Verdict:
@@ -186,7 +187,7 @@ class _Group:
             else (),
         )
         if not self.told.any():
-            if self.evidence.colored:
+            if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
         bad = self.bad()
@@ -226,7 +227,7 @@ class _Group:
         if found.repairs and found.trial is not None:
             return replace(verdict, all_wrong=self._cause(found.trial))
         chosen = some(cameras)
-        if 2 * len(self._fitting_others(chosen)) >= len(chosen):
+        if not self.recolored and 2 * len(self._fitting_others(chosen)) >= len(chosen):
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
         return self._unexplained(verdict)
 
@@ -248,6 +249,9 @@ class _Group:
     def suspects(self) -> tuple[Cause, ...]:
         """Why single photos disagree."""
         bad, correlation = self.bad(), self.agreement.correlation
+        if self.recolored:
+            rows = np.flatnonzero(bad)
+            return (Cause(self._named(rows), *_STRANGE),) if len(rows) else ()
         tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
         if not self.evidence.tracked:
             tried &= self.agreement.inside >= _FEWEST_TESTED
