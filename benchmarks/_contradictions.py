@@ -170,7 +170,9 @@ def camera_to_world(model: Model, _: np.random.Generator) -> Wrong:
 
 def exchanged(model: Model, rng: np.random.Generator) -> Wrong:
     """Pairs of photos exchanged."""
-    views = rng.permutation(len(model.photos))[: 2 * int(rng.integers(1, len(model.photos) // 5))]
+    views = rng.permutation(len(model.photos))[
+        : 2 * int(rng.integers(1, max(2, len(model.photos) // 5)))
+    ]
     photos = list(model.photos)
     for a, b in views.reshape(-1, 2):
         photos[a], photos[b] = photos[b], photos[a]

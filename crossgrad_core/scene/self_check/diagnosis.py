@@ -1,7 +1,7 @@
 """The cause of a disagreement, found by trial."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -84,7 +84,12 @@ class Bench:
 
     def is_off(self) -> bool:
         """Whether a small change makes the photos agree better."""
-        return any(self.tried(probe) > self.before + _PROBED for probe in probes())
+        evidence = self._evidence
+        rigs = [probe.change(evidence.rig) for probe in probes()]
+        rows = np.tile(evidence.rows, (len(rigs) + 1, 1))
+        agreement = replace(evidence, rows=rows).agreement(evidence.rig.joined(rigs))
+        each = scores(agreement, tracked=evidence.tracked).reshape(len(rigs) + 1, -1).mean(axis=1)
+        return bool(each[1:].max() > each[0] + _PROBED)
 
     def diagnosis(self) -> Diagnosis:
         """The change that makes the photos agree best; the likely ones are tried first."""

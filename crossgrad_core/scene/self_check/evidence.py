@@ -14,9 +14,9 @@ from crossgrad_core.scene.self_check.rig import Floats, Integers, Rig
 #: Observations below which a correlation says nothing.
 FEWEST: Final = 8
 #: The same for colours of points that other photos show.
-FEWEST_OF_PHOTOS: Final = 48
+FEWEST_OF_PHOTOS: Final = 24
 #: Observed points of a photo that are looked at.
-MOST_OBSERVED: Final = 96
+MOST_OBSERVED: Final = 64
 #: Points of a camera that trials look at.
 MOST_TRIED: Final = 2_000
 #: Points that are tested for each photo without tracks, at least.

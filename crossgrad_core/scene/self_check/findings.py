@@ -7,20 +7,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene import Scene, centers_of
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.scene.frame import camera_centers
+from crossgrad_core.scene.self_check.rig import Floats
 from crossgrad_core.scene.wording import count, name_some
 
-#: Poses are equal below these differences: local units, and entries of the rotation.
-_SAME_PLACE: Final = 1e-9
-_SAME_ROTATION: Final = 1e-9
+#: Poses are equal below this difference of their numbers, local units.
+_SAME_POSE: Final = 1e-9
 #: Points beyond this many times the median distance from the cameras are as good as at infinity.
 _INFINITE: Final = 1e4
 #: Pixels of the small photo that photos are compared by, in either direction.
 _SMALL: Final = 16
 #: Mean difference in levels of 255 below which two photos are almost equal.
 _ALMOST: Final = 0.5
-#: Rows of a photo that sharpness is measured in: each so many.
-_ROWS: Final = 16
+#: Rows of a photo that sharpness is measured in.
+_ROWS: Final = 6
 #: A photo is blurred below this share of the usual sharpness, and dark or bright beyond so many
 #: stops from the usual brightness.
 _BLURRED: Final = 0.15
@@ -52,8 +53,8 @@ def sketch_of(image: NDArray[np.uint8]) -> Sketch:
     down = (np.arange(_SMALL) + 0.5) * height / _SMALL
     right = (np.arange(_SMALL) + 0.5) * width / _SMALL
     small = image[down.astype(np.int64)[:, None], right.astype(np.int64)].astype(np.float32)
-    rows = image[:: max(1, height // _ROWS), :, 1].astype(np.float32)
-    near = np.abs(np.diff(rows, axis=1)).mean()
+    rows = image[:: max(1, height // _ROWS), :, 1].astype(np.int16)
+    near = np.abs(rows[:, 1:] - rows[:, :-1]).mean()
     far = np.abs(rows[:, _APART:] - rows[:, :-_APART]).mean() if width > 2 * _APART else 0.0
     return Sketch(small, float(near / far) if far > 1.0 else np.nan, float(small.mean()))
 
@@ -66,31 +67,26 @@ def findings_of(scene: Scene, sketches: Sequence[Sketch], names: Sequence[str]) 
         sketches: Photos that were looked at.
         names: Their names.
     """
-    yield from _equal_poses(scene)
-    yield from _far_points(scene)
+    poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
+    yield from _equal_poses(poses, [view.name for view in scene.views])
+    yield from _far_points(scene.points, camera_centers(poses))
     if len(sketches) >= _FEWEST_PHOTOS:
         yield from _unusual(sketches, names)
     yield from _almost_equal(sketches, names)
 
 
-def _equal_poses(scene: Scene) -> Iterator[str]:
-    poses = np.stack([view.camera.world_to_camera[:3, :3].numpy().ravel() for view in scene.views])
-    rounded = np.hstack(
-        [
-            np.rint(centers_of(scene.views) / _SAME_PLACE),
-            np.rint(poses / _SAME_ROTATION),
-        ]
-    )
-    names = _repeated(rounded, [view.name for view in scene.views])
-    if names:
-        photos = count(len(names), "photo")
-        yield f"check: {photos} with the pose of another one: {name_some(names)}"
+def _equal_poses(poses: Floats, names: Sequence[str]) -> Iterator[str]:
+    rounded = np.rint(poses[:, :3].reshape(len(poses), -1) / _SAME_POSE)
+    equal = _repeated(rounded, names)
+    if equal:
+        photos = count(len(equal), "photo")
+        yield f"check: {photos} with the pose of another one: {name_some(equal)}"
 
 
-def _far_points(scene: Scene) -> Iterator[str]:
-    if not len(scene.points):
+def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
+    if not len(points):
         return
-    away = np.linalg.norm(scene.points - np.median(centers_of(scene.views), axis=0), axis=1)
+    away = np.linalg.norm(points - np.median(centers, axis=0), axis=1)
     far = int((away > _INFINITE * np.median(away)).sum())
     if far:
         yield f"check: {count(far, 'point')} practically at infinity"

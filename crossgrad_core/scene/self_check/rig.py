@@ -46,8 +46,9 @@ class Rig:
     def of(cls, scene: Scene) -> "Rig":
         """The rig of a scene."""
         cameras = [view.camera for view in scene.views]
-        centers = scene.similarity.to_input(np.stack([each.center.numpy() for each in cameras]))
-        rotations = np.stack([each.world_to_camera[:3, :3].numpy() for each in cameras])
+        poses = np.stack([each.world_to_camera.numpy() for each in cameras])
+        rotations = poses[:, :3, :3]
+        centers = scene.similarity.to_input(-np.einsum("vji,vj->vi", rotations, poses[:, :3, 3]))
         return cls(
             rotations=rotations,
             translations=-np.einsum("vij,vj->vi", rotations, centers),
@@ -71,6 +72,19 @@ class Rig:
             principal=self.principal[rows],
             sizes=self.sizes[rows],
             photos=self.photos[rows],
+        )
+
+    def joined(self, others: Sequence["Rig"]) -> "Rig":
+        """The cameras of this rig and of others with the same points, in one rig."""
+        rigs = (self, *others)
+        return replace(
+            self,
+            rotations=np.concatenate([each.rotations for each in rigs]),
+            translations=np.concatenate([each.translations for each in rigs]),
+            focal=np.concatenate([each.focal for each in rigs]),
+            principal=np.concatenate([each.principal for each in rigs]),
+            sizes=np.concatenate([each.sizes for each in rigs]),
+            photos=np.concatenate([each.photos for each in rigs]),
         )
 
     @property

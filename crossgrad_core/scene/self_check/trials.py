@@ -250,7 +250,8 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and poses have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        lambda rig: replace(rig, points=rig.points * factor),
+        # The same picture as of scaled points, and each camera may have its own factor.
+        lambda rig: replace(rig, translations=rig.translations / factor),
     )
 
 

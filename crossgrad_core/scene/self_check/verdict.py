@@ -25,7 +25,7 @@ _LEAST: Final = 0.35
 _MOST_BAD: Final = 0.6
 #: A photo disagrees below this share of the correlation of the better photos, if its points also
 #: have this many times the usual deviation from the colours that the photo predicts.
-_BAD: Final = 0.45
+_BAD: Final = 0.33
 _NOISY: Final = 1.5
 #: Share of observed points in frame below which the pose of a photo is wrong.
 _IN_FRAME: Final = 0.5
@@ -42,9 +42,8 @@ _FITS: Final = 0.7
 _FEW: Final = 2
 #: Points in frame of a photo that is compared with others, or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: Points that are tested in all photos without tracks: without any tracks, and with others' tracks.
+#: Points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
-_FEW_TESTED: Final = 40_000
 #: The better photos: the upper quartile.
 _BETTER: Final = 0.75
 #: Photos that agree by less are also tried with the likely changes of all cameras.
@@ -114,14 +113,11 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
         return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    tracked, others = rows[has_tracks], rows[~has_tracks]
-    if not len(tracked):
-        return _Group.of(tested(scene, others, _MOST_TESTED), others).verdict()
-    verdict = _Group.of(observed(scene, tracked), tracked).verdict()
-    if len(others) and verdict.all_wrong is None:
-        held = _Group.of(tested(scene, others, _FEW_TESTED), others).suspects()
-        verdict = replace(verdict, some_wrong=(*verdict.some_wrong, *held))
-    return verdict
+    # Beside photos with tracks, points that may be hidden say too little about single photos.
+    if has_tracks.any():
+        rows = rows[has_tracks]
+        return _Group.of(observed(scene, rows), rows).verdict()
+    return _Group.of(tested(scene, rows, _MOST_TESTED), rows).verdict()
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +170,8 @@ class _Group:
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
         usual = float(np.median(noise[good])) if good.any() else 0.0
-        unlike = low & (np.nan_to_num(noise) > _NOISY * usual)
+        # Colours that a few other photos show say too little about a single photo.
+        unlike = low & (np.nan_to_num(noise) > _NOISY * usual) & (not self.recolored)
         return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
 
     def verdict(self) -> Verdict:
@@ -190,7 +187,7 @@ class _Group:
             else (),
         )
         if not self.told.any():
-            if self.evidence.colored:
+            if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
         bad = self.bad()
@@ -230,7 +227,7 @@ class _Group:
         if found.repairs and found.trial is not None:
             return replace(verdict, all_wrong=self._cause(found.trial))
         chosen = some(cameras)
-        if 2 * len(self._fitting_others(chosen)) >= len(chosen):
+        if not self.recolored and 2 * len(self._fitting_others(chosen)) >= len(chosen):
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
         return self._unexplained(verdict)
 
@@ -252,6 +249,9 @@ class _Group:
     def suspects(self) -> tuple[Cause, ...]:
         """Why single photos disagree."""
         bad, correlation = self.bad(), self.agreement.correlation
+        if self.recolored:
+            rows = np.flatnonzero(bad)
+            return (Cause(self._named(rows), *_STRANGE),) if len(rows) else ()
         tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
         if not self.evidence.tracked:
             tried &= self.agreement.inside >= _FEWEST_TESTED
