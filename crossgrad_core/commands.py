@@ -113,6 +113,7 @@ __all__ = [
     "available_memory",
     "begin",
     "build",
+    "changed_files",
     "check_file",
     "check_folder",
     "check_new",

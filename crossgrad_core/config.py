@@ -97,8 +97,7 @@ class RunConfig(BaseModel):
     exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS, common=True)] = Field(
         None,
         description="What cameras do to light between render and photo. "
-        f"Default: {defaults.EXPOSURE}, a brightness for each photo if the photos differ in "
-        f"exposure; {defaults.NO_EXPOSURE} with --preset inria.",
+        f"Default: {defaults.EXPOSURE}.",
     )
     exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
         None,

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from crossgrad_core.registry.slots import OFFERED, PLANNERS
+from crossgrad_core.registry.slots import OFFERED, PLANNERS, QUICK
 from crossgrad_core.wording import plural
 
-_KNOWN: Final = (*OFFERED.values(), f"crossgrad.{PLANNERS}")
+_KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"
 #: How alike a group has to be that does not begin with `crossgrad`.
 _ALIKE: Final = 0.85

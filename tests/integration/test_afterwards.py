@@ -45,7 +45,9 @@ def finished(trained, tmp_path):
 
 
 def content(folder: Path) -> dict[str, bytes]:
+    # The list of checksums follows each file that is added.
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    files = (path for path in files if path.name != "SHA256SUMS")
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 

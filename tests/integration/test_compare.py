@@ -34,7 +34,9 @@ def test_runs_as_they_are_written(tmp_path, capsys):
     assert all(row["length"] == "4 steps" for row in rows.values())
     # Photo, and render and error of both arms, of each of the two held-out views.
     assert (folder / "index.html").read_text().count("data:image/jpeg;base64,") == 2 * 5
-    assert (folder / "figures" / "phases.pdf").is_file()
+    # Equal steps are compared, so that no figure shows seconds.
+    figures = {path.name for path in (folder / "figures").iterdir()}
+    assert figures and "phases.pdf" not in figures
     assert "views.csv" in {path.name for path in folder.iterdir()}
 
 

@@ -135,7 +135,7 @@ def test_points_that_no_photo_shows_are_refused(scene, tmp_path):
         point.xyz = hidden
     model.write(away / "sparse" / "0")
     settings = {"scene": str(away), "out": str(tmp_path / "run"), "steps": 2}
-    with pytest.raises(UserError, match="no training photo shows any"):
+    with pytest.raises(UserError, match="the scene contradicts itself"):
         app.run(settings, verbosity=-1)
     assert not (tmp_path / "run").exists()
 

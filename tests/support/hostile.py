@@ -70,7 +70,7 @@ HOSTILE: Mapping[str, Hostile] = {
     "table": Hostile(lambda: _filled(b"\n"), lambda path: read_rows(path, "the table", "mend it")),
     "cells": Hostile(lambda: _filled(b"a,"), lambda path: read_rows(path, "the table", "mend it")),
     "returns": Hostile(lambda: _filled(b"\r"), lambda path: read_rows(path, "the table", "mend")),
-    "list of views": Hostile(lambda: _filled(b"a\n"), read_list),
+    "list of views": Hostile(lambda: _filled(b"a\n"), lambda path: read_list(path, ())),
     "settings": Hostile(lambda: _filled(b"[a,"), lambda path: read_mapping(path, "it", "mend it")),
     "attributes": Hostile(lambda: _filled(b' a=""', head=b"<d"), _xml.read_xml),
     "vertices": Hostile(

@@ -91,7 +91,8 @@ class OneThenTwo(Sampler):
     def sample(self, context, state):
         count = context.views_per_step if context.step % 2 == 0 else 1
         drawn = context.rng.choice(len(context.centers), count, replace=False)
-        return Draw(tuple(int(view) for view in drawn)), state
+        labels = None if context.groups is None else tuple(context.groups[view] for view in drawn)
+        return Draw(tuple(int(view) for view in drawn), labels), state
 
 
 class BrightnessError(Metric):

@@ -8,11 +8,11 @@ from pathlib import Path
 from time import perf_counter
 from typing import Final
 
-from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photo_check import fits
-from crossgrad_core.scene.self_check.findings import findings_of, sketch_of
+from crossgrad_core.scene.self_check.findings import Sketch, findings_of, sketch_of
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
@@ -31,13 +31,14 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
         accept: Go on although the scene disagrees as a whole.
 
     Raises:
-        UserError: The scene disagrees as a whole, or a photo cannot be decoded.
+        UserError: The scene disagrees as a whole.
     """
     begun = perf_counter()
     views = _looked_at(scene, cache_mib)
     _LOG.info("checking points, poses and photos against each other")
+    sketched = {view: sketch for view in views if (sketch := _sketch(scene.views[view]))}
+    views, sketches = [*sketched], [*sketched.values()]
     names = [scene.views[view].name for view in views]
-    sketches = [sketch_of(scene.views[view].photo.image().numpy()) for view in views]
     verdict = verdict_of(scene, views)
     if verdict.all_wrong is not None and not accept:
         raise _refusal(verdict, verdict.all_wrong, path)
@@ -54,6 +55,14 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
         ],
     }
     return replace(scene, notes=(*scene.notes, *notes), check=figures)
+
+
+def _sketch(view: View) -> Sketch | None:
+    """The sketch of a photo; None if it cannot be decoded, which is reported when it is needed."""
+    try:
+        return sketch_of(view.photo.image().numpy())
+    except UserError:
+        return None
 
 
 def _looked_at(scene: Scene, cache_mib: int) -> Sequence[int]:

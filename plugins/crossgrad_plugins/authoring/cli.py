@@ -52,7 +52,7 @@ def plugins(context: typer.Context) -> None:
 
 @app.command("list", cls=GroupedCommand)
 def list_plugins(slot: SlotOption = None) -> None:
-    """Show the installed plugins by slot, and the commands that they add."""
+    """Show the installed plugins by slot, and the commands they add."""
     for each in _slots(slot):
         typer.echo(each)
         typer.echo("\n".join(_rows(offers(each))) or "  none installed")

@@ -25,7 +25,6 @@ from crossgrad_plugins.readers._colmap_model import model_files, read_model
 from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._place import by_code, by_file, by_gps
-from crossgrad_plugins.readers._points import find_points
 
 #: The place on Earth, beside a model or in the scene's folder.
 _GEOREF = "georef.json"
@@ -130,6 +129,8 @@ def _beside(
     scene: Path, model: Path, views: tuple[RawView, ...], options: SceneOptions
 ) -> PointCloud:
     """The points of a PLY in the folder of the model, or in a folder above it within the scene."""
+    from crossgrad_plugins.readers._points import find_points
+
     inside, base = Inside(scene), Path(os.path.relpath(model, scene))
     places = [base, *base.parents] if ".." not in base.parts else []
     for folder in places:

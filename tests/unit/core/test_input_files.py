@@ -68,7 +68,7 @@ def test_it_is_none_and_is_not_opened(odd):
 def test_no_list_of_views_and_no_mark_of_the_scene_is_read_from_a_pipe(tmp_path):
     for name in ("train_list.txt", "scene.json"):
         os.mkfifo(tmp_path / name)
-    assert read_list(tmp_path / "train_list.txt") is None
+    assert read_list(tmp_path / "train_list.txt", ()) is None
     assert read_scene_file(tmp_path) is None
 
 

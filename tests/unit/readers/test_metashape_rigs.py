@@ -12,8 +12,8 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.file_names import FileNames
 from crossgrad_plugins.readers._equal_labels import Labelled, paired
-from crossgrad_plugins.readers._photos import PhotoNames
 from crossgrad_plugins.readers.metashape import MetashapeReader
 
 SIZE = (24, 16)
@@ -149,12 +149,7 @@ def test_an_offset_that_is_no_rotation_is_refused(path):
 
 def pairs(cameras, names, folder=Path("none")):
     """The photos of cameras (label, group, sensor) among these names."""
-    short = {}
-    for name in names:
-        for spelling in {Path(name).name, Path(name).stem}:
-            short.setdefault(spelling, set()).add(name)
-    photos = PhotoNames(frozenset(names), {key: frozenset(each) for key, each in short.items()})
-    return paired([Labelled(*camera, SIZE) for camera in cameras], photos, folder)
+    return paired([Labelled(*camera, SIZE) for camera in cameras], FileNames(names), folder)
 
 
 @pytest.fixture

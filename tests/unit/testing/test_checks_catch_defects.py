@@ -1022,8 +1022,8 @@ RAISING = [
     (observers.seams_stay_answered, Swallows, api.UserError),
     (observers.questions_are_answered_in_kind, CopiesTheParameters, AttributeError),
     (observers.seams_stay_answered, LooksAtSingleViews, TypeError),
-    (observers.survives_every_event, RemembersNoLabels, TypeError),
-    (observers.survives_every_event, LooksBackAtStepsAsTuples, TypeError),
+    (observers.survives_every_event, RemembersNoLabels, ContractError),
+    (observers.survives_every_event, LooksBackAtStepsAsTuples, ContractError),
     (aggregation.every_tensor_is_answered, CountsSingleViews, TypeError),
 ]
 

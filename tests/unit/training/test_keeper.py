@@ -173,7 +173,7 @@ def test_a_plugin_that_raises_leaves_a_good_state(hook, method, kept):
     state = first_state(setup)
     with pytest.raises(BrokenError) as told:
         train(setup, state, Results(), Stopper())
-    assert told.value.__notes__ == [f"in step {FAILS_IN}"]
+    assert told.value.__notes__[-1] == f"in step {FAILS_IN}"
     assert state.step == kept
     assert all(tensor.grad is None for tensor in state.parameters.values())
     assert_same(state, trained_until(kept))

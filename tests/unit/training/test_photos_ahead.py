@@ -84,6 +84,7 @@ def test_a_photo_that_cannot_be_decoded_is_left_to_who_asks_for_it():
 
 def test_kernels_are_loaded_meanwhile():
     asked = []
-    setup = assemble(RunConfig(steps=4), watched(asked), "none")
+    config = RunConfig(steps=4, exposure={"name": "none"})
+    setup = assemble(config, watched(asked), "none")
     warm_up(setup)
     assert asked[0] == setup.scene.test_views[0].name

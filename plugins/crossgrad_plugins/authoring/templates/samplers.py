@@ -16,4 +16,5 @@ class Template(Sampler):
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
         views = context.rng.integers(len(context.scene.train), size=context.views_per_step)
-        return Draw(tuple(int(view) for view in views)), state
+        labels = None if context.groups is None else tuple(context.groups[view] for view in views)
+        return Draw(tuple(int(view) for view in views), labels), state
