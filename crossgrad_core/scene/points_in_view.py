@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.errors import UserError
+from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
@@ -26,7 +27,7 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """[4, 4] the inverse of a rigid pose."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    inverse[:3, 3] = camera_centers(pose[None])[0]
     return inverse
 
 
@@ -65,7 +66,7 @@ def check_seen(
     tried = finite[:: max(1, len(finite) // _TRIED)]
     if not len(tried) or not views:
         return
-    shown = _shown_by(tried, views, lambda pose: pose).any(axis=0)
+    shown = np.asarray(_shown_by(tried, views, lambda pose: pose).any(axis=0))
     if shown.mean() >= _FEWEST:
         return
     cause = _likely_cause(tried, views)

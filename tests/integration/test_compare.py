@@ -34,9 +34,8 @@ def test_runs_as_they_are_written(tmp_path, capsys):
     assert all(row["length"] == "4 steps" for row in rows.values())
     # Photo, and render and error of both arms, of each of the two held-out views.
     assert (folder / "index.html").read_text().count("data:image/jpeg;base64,") == 2 * 5
-    # Equal steps are compared, so that no figure shows seconds.
-    figures = {path.name for path in (folder / "figures").iterdir()}
-    assert figures and "phases.pdf" not in figures
+    # Figures of seconds are left out if the machine was busy.
+    assert (folder / "figures" / "curves_steps.pdf").is_file()
     assert "views.csv" in {path.name for path in folder.iterdir()}
 
 

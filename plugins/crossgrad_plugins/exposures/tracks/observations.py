@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Scene, View
+from crossgrad_core.plugin import Scene, UserError, View
 from crossgrad_plugins.exposures.tracks.light import light_at
 
 #: Observations that are looked at; of more, every so many points are left out.
@@ -42,10 +42,8 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     """The observations of the scene's points in the photos of some views.
 
     A photo is looked at where its pose puts the points that it observed, 3 x 3 pixels for each.
-    Photos without such points are not decoded.
-
-    Raises:
-        UserError: A photo cannot be decoded.
+    Photos without such points are not decoded. A photo that cannot be decoded has no observations:
+    the run reports it when it needs the photo.
     """
     shared = _shared_points(scene, views)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -80,7 +78,10 @@ def _observed(
     seen = view.seen[shared[view.seen]]
     if not len(seen):
         return seen, np.zeros(0)
-    photo = view.photo
-    found = light_at(photo.image(), photo.mask(), view.camera, scene.points[seen])
+    try:
+        image, mask = view.photo.image(), view.photo.mask()
+    except UserError:
+        return seen[:0], np.zeros(0)
+    found = light_at(image, mask, view.camera, scene.points[seen])
     rows = found.rows[found.usable]
     return seen[rows], np.log2(found.brightness[found.usable])
