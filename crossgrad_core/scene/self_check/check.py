@@ -118,7 +118,7 @@ def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
         "the scene contradicts itself",
         where=path,
         expected="photos that show the points where their poses put them",
-        found=f"{cause.what} ({', '.join(found)})",
+        found=f"{cause.what} ({', '.join(found)})" if found else cause.what,
         todo=f"{cause.todo}; or go on with the scene as it is: --accept-scene, or "
         "reading.accept_scene: true in a file of settings",
     )
