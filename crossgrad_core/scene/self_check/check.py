@@ -102,7 +102,7 @@ def _warnings(scene: Scene, verdict: Verdict) -> list[str]:
     for cause in verdict.some_wrong:
         names = [scene.views[view].name for view in cause.views]
         told.append(
-            f"check: {count(len(names), 'photo')} disagree with the points: {name_some(names)}; "
+            f"check: {count(len(names), 'photo')} at odds with the points: {name_some(names)}; "
             f"{cause.what}: {cause.todo}"
         )
     return told
