@@ -78,8 +78,9 @@ def _observed(
     seen = view.seen[shared[view.seen]]
     if not len(seen):
         return seen, np.zeros(0)
+    photo = view.photo
     try:
-        image, mask = view.photo.image(), view.photo.mask()
+        image, mask = photo.image(), photo.mask()
     except UserError:
         return seen[:0], np.zeros(0)
     found = light_at(image, mask, view.camera, scene.points[seen])
