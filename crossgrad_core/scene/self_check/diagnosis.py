@@ -60,9 +60,9 @@ def scores(agreement: Agreement, *, tracked: bool) -> Floats:
     return np.where(agreement.inside >= _FEWEST_UNTRACKED, correlation, 0.0)
 
 
-def some(cameras: Integers) -> Integers:
-    """At most as many cameras as trials are made with, evenly spread."""
-    every = np.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS))
+def some(cameras: Integers, most: int = MOST_CAMERAS) -> Integers:
+    """At most so many cameras, evenly spread."""
+    every = np.linspace(0, len(cameras) - 1, min(len(cameras), most))
     return cameras[every.round().astype(np.int64)]
 
 

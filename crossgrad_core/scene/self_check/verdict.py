@@ -33,7 +33,7 @@ _IN_FRAME: Final = 0.5
 #: fits its pose if it correlates by so much more.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
-#: Photos that a suspect is compared with, and suspects.
+#: Photos that photos are compared with if most disagree, and suspects that are tried.
 _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
 #: Share of the correlation of the better photos that a photo reaches which fits.
@@ -227,7 +227,8 @@ class _Group:
         if found.repairs and found.trial is not None:
             return replace(verdict, all_wrong=self._cause(found.trial))
         chosen = some(cameras)
-        if not self.recolored and 2 * len(self._fitting_others(chosen)) >= len(chosen):
+        others = some(cameras, _MOST_COMPARED)
+        if not self.recolored and 2 * len(self._fitting_others(chosen, others)) >= len(chosen):
             return replace(verdict, all_wrong=Cause(self._named(cameras), *_EXCHANGED))
         return self._unexplained(verdict)
 
@@ -259,7 +260,8 @@ class _Group:
         if not len(rows):
             return ()
         causes = []
-        exchanged = self._fitting_others(rows)
+        # A photo that belongs to another pose leaves its own pose with a wrong photo.
+        exchanged = self._fitting_others(rows, rows)
         if len(exchanged):
             causes.append(Cause(self._named(exchanged), *_EXCHANGED))
         left = np.setdiff1d(rows, exchanged)
@@ -309,10 +311,9 @@ class _Group:
         """The score of a photo that fits."""
         return max(_FITS * self.better, REPAIRED)
 
-    def _fitting_others(self, rows: Integers) -> Integers:
-        """Those of some cameras that fit another photo."""
-        others = self.views[:: -(-len(self.views) // _MOST_COMPARED)]
-        others = np.union1d(others, self.views[rows])
+    def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:
+        """Those of some cameras that fit the photo of another one, of some candidates."""
+        others = self.views[candidates]
         fitting = []
         for row in rows:
             evidence = self.evidence.chosen(np.full(len(others), row))
