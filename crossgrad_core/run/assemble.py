@@ -83,7 +83,7 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
         accept: Go on although the scene contradicts itself, as the configuration may also say.
 
     Raises:
-        UserError: As `read_scene`, the scene contradicts itself, or a photo cannot be decoded.
+        UserError: As `read_scene`, or the scene contradicts itself.
     """
     scene, name = read_scene(config, path)
     reading = config.reading

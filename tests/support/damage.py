@@ -33,7 +33,7 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files below a folder, as paths below it; what holds nothing cannot be damaged."""
+    """The files below a folder that are not empty, as paths relative to it."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
     return sorted(path.relative_to(folder) for path in files)
 

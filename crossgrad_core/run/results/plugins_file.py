@@ -140,7 +140,7 @@ def refuse_missing(
 
 
 def changes(packages: Packages | None) -> dict[str, str]:
-    """Package and version that trained a run last -> what is there in its place, if another."""
+    """Return the packages with another version than that which trained last: then -> now."""
     found = {}
     for name, package in (packages or {}).items():
         was = f"{name} {package.versions[-1]}"

@@ -40,9 +40,6 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     Args:
         scene: The scene.
         start: `tracks` or `exif` alone, `auto` both, tracks first; `none` starts from 0.
-
-    Raises:
-        UserError: A photo cannot be decoded.
     """
     names = [view.name for view in scene.train_views]
     if len(names) == 1:

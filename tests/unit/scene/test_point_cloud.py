@@ -157,7 +157,7 @@ def test_gaussians_as_points_and_points_as_gaussians_name_the_other_option(scene
 
 def test_a_dense_cloud_is_thinned_evenly_with_a_note(scene):
     rng = np.random.default_rng(0)
-    # Ten times denser on the left, as near the place of a scanner.
+    # The left half has ten times as many points, as it has close to a laser scanner.
     left, right = rng.uniform(-1.0, 0.0, (20_000, 1)), rng.uniform(0.0, 1.0, (2_000, 1))
     x = np.concatenate([left, right])
     xyz = np.concatenate([x, rng.uniform(-1.0, 1.0, x.shape), np.zeros(x.shape)], axis=1)

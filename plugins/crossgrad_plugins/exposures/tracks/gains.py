@@ -89,11 +89,7 @@ class TrackGains:
 
 
 def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
-    """The gains of the photos of some views.
-
-    Raises:
-        UserError: A photo cannot be decoded.
-    """
+    """The gains of the photos of some views."""
     observations = observations_of(scene, views)
     fit = fitted(observations, len(views))
     counts = np.bincount(observations.photos, minlength=len(views))
@@ -103,11 +99,7 @@ def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
 
 
 def training_gains(scene: Scene) -> TrackGains:
-    """The gains of all training photos, worked out once for a scene.
-
-    Raises:
-        UserError: A photo cannot be decoded.
-    """
+    """The gains of all training photos, worked out once for a scene."""
     found = _OF_TRAINING.get(scene)
     if found is None:
         found = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
@@ -115,11 +107,7 @@ def training_gains(scene: Scene) -> TrackGains:
 
 
 def deciding_gains(scene: Scene) -> TrackGains:
-    """The gains that decide whether the training photos differ, worked out once for a scene.
-
-    Raises:
-        UserError: A photo cannot be decoded.
-    """
+    """The gains that decide whether the training photos differ, worked out once for a scene."""
     views = scene.train_views
     if len(views) <= MOST_DECIDING:
         return training_gains(scene)
