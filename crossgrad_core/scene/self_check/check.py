@@ -37,12 +37,13 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
     views = _looked_at(scene, cache_mib)
     _LOG.info("checking points, poses and photos against each other")
     sketched = {view: sketch for view in views if (sketch := _sketch(scene.views[view]))}
+    undecoded = [scene.views[view].name for view in views if view not in sketched]
     views, sketches = [*sketched], [*sketched.values()]
     names = [scene.views[view].name for view in views]
     verdict = verdict_of(scene, views)
     if verdict.all_wrong is not None and not accept:
         raise _refusal(verdict, verdict.all_wrong, path)
-    warnings = tuple(_warnings(scene, verdict))
+    warnings = tuple(_warnings(scene, verdict, undecoded))
     for warning in warnings:
         _LOG.warning("%s", warning)
     notes = (*warnings, *findings_of(scene, sketches, names))
@@ -95,8 +96,11 @@ def _word(verdict: Verdict) -> str:
     return "agrees" if isfinite(verdict.correlation) else "cannot be told"
 
 
-def _warnings(scene: Scene, verdict: Verdict) -> list[str]:
+def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[str]:
     told = []
+    if undecoded:
+        names = f"{count(len(undecoded), 'photo')} ({name_some(undecoded)})"
+        told.append(f"check: {names} left out of the check: the files cannot be decoded")
     if verdict.all_wrong is not None:
         told.append(f"check: the scene contradicts itself, accepted: {verdict.all_wrong.what}")
     for cause in verdict.some_wrong:

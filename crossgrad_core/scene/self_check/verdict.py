@@ -111,6 +111,8 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
     """
     if len(scene.points) < FEWEST:
         return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
+    if not views:
+        return replace(_UNKNOWN, notes=("there are no photos to compare the points with",))
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
     # Beside photos with tracks, points that may be hidden say too little about single photos.

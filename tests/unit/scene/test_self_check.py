@@ -170,6 +170,21 @@ def test_photos_that_disagree_are_named_in_a_note_and_in_the_figures(tmp_path, c
     assert scene.check["disagreeing"] == ["0003.png", "0007.png"]
 
 
+@pytest.mark.parametrize("damaged", [1, 6])
+def test_photos_that_cannot_be_decoded_are_named_and_left_out(tmp_path, damaged):
+    folder = write_tiny_scene(tmp_path / "s", views=6)
+    names = sorted(path.name for path in (folder / "images").iterdir())[:damaged]
+    for name in names:
+        content = bytearray((folder / "images" / name).read_bytes())
+        start, end = content.index(b"IDAT") + 4, content.rindex(b"IEND") - 8
+        content[start:end] = bytes(end - start)
+        (folder / "images" / name).write_bytes(content)
+    scene, _ = read_and_check(configured({"scene": str(folder), "threads": 1}), folder)
+    assert scene.check["compared"] <= 6 - damaged
+    (warning,) = scene.check["warnings"]
+    assert names[0] in warning and "cannot be decoded" in warning
+
+
 def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(contradictions, model):
     wrong = contradictions.KINDS["OpenGL axes"](model, np.random.default_rng(0)).model.scene()
     with pytest.raises(UserError, match="the scene contradicts itself") as error:
