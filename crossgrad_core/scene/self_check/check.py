@@ -99,8 +99,10 @@ def _word(verdict: Verdict) -> str:
 def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[str]:
     told = []
     if undecoded:
-        names = f"{count(len(undecoded), 'photo')} ({name_some(undecoded)})"
-        told.append(f"check: {names} left out of the check: the files cannot be decoded")
+        told.append(
+            f"check: {count(len(undecoded), 'photo')} left out, because the files cannot be "
+            f"decoded: {name_some(undecoded)}"
+        )
     if verdict.all_wrong is not None:
         told.append(f"check: the scene contradicts itself, accepted: {verdict.all_wrong.what}")
     for cause in verdict.some_wrong:
